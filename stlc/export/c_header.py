@@ -154,7 +154,8 @@ def weights(network: PlanNetwork) -> str:
 def forward(network: PlanNetwork) -> list[str]:
     """C statements of the network: from the observation `seen` (double) to the output `raw` (float).
 
-    The C arrays `h0` and `h1` hold the values of alternate layers.
+    The layers use two C arrays in turn: layer 0 reads `h0` and writes `h1`, layer 1 reads `h1` and writes
+    `h0`, and so on. The last layer writes `raw`.
     """
     layers = list(_layers(network))
     lines = [
@@ -184,7 +185,7 @@ def _row(values: Tensor) -> str:
 
 
 def _float(value: float) -> str:
-    """A float32 as C text that reads back bit for bit."""
+    """C text of a float32, with enough digits that a compiler restores exactly this number."""
     text = f"{value:.9g}"
     return f"{text}f" if any(mark in text for mark in ".en") else f"{text}.0f"
 
@@ -364,10 +365,11 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
 
 
 def _changes(network: PlanNetwork) -> dict[str, object]:
-    """Texts for the header about the network's changes of plans: placeholder -> number or C text.
+    """Texts for the header about the changed copies of plans: placeholder -> number or C text.
 
-    Each change is that of a single control. Without changes, the arrays hold one row of zeros, as C has no
-    empty arrays.
+    If a plan violates the specification, the policy also tries copies of it in which one control is changed.
+    The network stores these changes. The C arrays hold one row per change; without changes they hold one row
+    of zeros, as C has no empty arrays.
     """
     changes = (
         network.changes if len(network.changes) else network.changes.new_zeros(1, *network.changes.shape[1:])
@@ -437,10 +439,10 @@ def _block(lines: Sequence[str]) -> str:
 
 
 def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequirement]) -> list[str]:
-    """C statements that lower `least` to the least weighted robustness of the requirements `rules`.
+    """C statements that compute the least weighted robustness of the requirements `rules`.
 
-    The C variable `least` is a running minimum. Entry i of the C array `each` is the robustness of the
-    requirement `among[i]`; `among` contains `rules`.
+    The result is left in the C variable `least`, which must be initialised before. Entry i of the C array
+    `each` is the robustness of the requirement `among[i]`; `among` contains `rules`.
     """
     names = [rule.name for rule in among]
     return [
@@ -452,8 +454,8 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 def _falling(motion: Motion, plan: Plan) -> list[str]:
     """C function `fall`: robustness of the safety requirements on the first steps of a trajectory.
 
-    The function reads the states and one further signal, which follows the states (index STATES). This signal
-    is positive at the samples after the first steps.
+    The later steps count as harmless. They are marked by an additional signal, which is positive at the
+    samples after the first steps. Its index is STATES, that is, it follows the states.
     """
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

@@ -1,4 +1,7 @@
-"""Parts of a controller as expressions of the IR, from which the C header and the ONNX graphs are made."""
+"""Parts of a controller as expressions of the IR (the compiler's intermediate representation).
+
+The C header and the ONNX graphs are made from these expressions.
+"""
 
 from __future__ import annotations
 
@@ -54,18 +57,19 @@ def control_images(task: Task) -> dict[str, ir.Num]:
 
 @dataclass(frozen=True, slots=True)
 class CostTerm:
-    """Summand of a plan's cost: an expression, averaged or maximized over samples.
+    """Summand of a plan's cost: an expression, averaged or maximised over samples.
 
-    The expressions use two special signals. `MARGIN` is the robustness of `goal` at a sample. `REDUCED` is
-    the mean or the maximum of `number` over the samples.
+    The expression `number` is evaluated at each sample. The mean or maximum of its values is called
+    `REDUCED`. The summand is the expression `value`, which may use `REDUCED`.
 
     Attributes:
-        number: expression that is evaluated at each sample. It may read the states, the states at the first
-            sample (name with suffix `START`), the sample `k`, the time `t`, the robustness `rho`, the flag
-            `sat` (always 1), and `MARGIN`. If `samples` is the horizon, it may also read the controls.
+        number: expression that is evaluated at each sample. It may use the states, the states at the first
+            sample (name with suffix `START`), the index `k` and time `t` of the sample, the robustness `rho`
+            of the plan, the flag `sat` (1: the plan counts as satisfying), and `MARGIN`. If `samples` is the
+            horizon, it may also use the controls.
         samples: number of samples, from the first on.
         greatest: True if `REDUCED` is the maximum of `number` over the samples, False if it is the mean.
-        goal: formula to which `MARGIN` refers.
+        goal: formula whose robustness at a sample is called `MARGIN`; None if `MARGIN` is not used.
         value: the summand, an expression of `REDUCED`.
         condition: condition on the states at the first sample; if it is false, the summand is 0.
     """

@@ -76,7 +76,10 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
 
 
 def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
-    """ONNX graph of the nodes on which `outputs` depend; the outputs get their public names."""
+    """ONNX graph called `name`, with those nodes of `sheet` on which `outputs` depend.
+
+    `outputs`: public name -> value, as pairs.
+    """
     from onnx import helper, numpy_helper
 
     shown = list(outputs)
@@ -131,8 +134,8 @@ class Latency:
 def write_onnx(run: Run, folder: Path) -> None:
     """Write `decide.onnx`, `follow.onnx`, `judge.onnx` and `controller.json`, and up to two more files.
 
-    `fall.onnx` is written if the specification has safety requirements, `continue.onnx` if the policy tries
-    changed copies of its plans.
+    `fall.onnx` is written if the specification has safety requirements. `continue.onnx` is written if the
+    policy tries changed copies of a plan that violates the specification.
 
     Raises:
         UsageError: U101, a part of the task has no ONNX form.

@@ -58,7 +58,10 @@ class Deciding(nn.Module):
         return plan, rho, safe, each
 
     def proposed(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the best of the network's own plans and its verdict; see `Policy.continuation`."""
+        """Return the best of the network's own plans and its verdict, without trying changed copies of plans.
+
+        The plan is that of `Policy.continuation`.
+        """
         return self._best(x, self.network(x).to(x.dtype))
 
     def _best(self, x: Tensor, plans: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -75,7 +78,7 @@ class Deciding(nn.Module):
 
 
 def judged_by_torch(task: Task, x: Tensor, plans: Tensor) -> PlanVerdicts:
-    """Evaluate plans as `Task.judge` does, but with torch operations only, which torch can export."""
+    """Evaluate plans as `Task.judge` does, but only with operations that torch can export."""
     columns = task.system.rollout_columns(x, plans)
     each = task.graph.per_requirement_columns(columns, ops=TORCH)
     names = [rule.name for rule in task.rules]
@@ -187,12 +190,12 @@ class Guarding(nn.Module):
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans that the guard tries with the prefixes `prefixes`, and their verdicts.
+        """All plans that the guard tries with `prefixes`, (choices, T0, m), and their verdicts.
 
-        A prefix consists of the first T0 controls of a plan; all prefixes here are equally long. In the first
-        plan, the prefix comes from the policy's own plan `own`. The later controls come from the policy, for
-        the state reached after T0 steps from `x`. With `falls`, the robustness of the safety requirements on
-        every first part of each plan is computed as well.
+        A prefix consists of the first T0 actions of a plan. The policy plans the later actions, from the
+        state that the prefix reaches when it starts in `x`. One more plan is tried first: its prefix is that
+        of the policy's own plan `own`. If `falls` is True, the robustness of the safety requirements on every
+        first part of each plan is computed, too.
         """
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
@@ -202,11 +205,13 @@ class Guarding(nn.Module):
         return _Tried(plans, rho, safe, each, cost, columns[5] if falls else None)
 
     def _finished(self, x: Tensor, heads: Tensor, *, falls: bool) -> list[Tensor]:
-        """Plans that begin with the controls `heads` and continue by the policy, and their verdicts.
+        """Complete the prefixes `heads` to plans, and judge the plans.
 
-        `heads` is (B, C, L, m): for each state C sequences of L controls. Returns plans, rho, safe,
-        requirements, cost, and with `falls` the robustness of the safety requirements on every first part of
-        each plan: (B, C, …) each.
+        `heads` is (B, C, L, m): for each of B states, C prefixes of L actions. The policy plans the later
+        actions.
+
+        Returns plans, rho, safe, requirements and cost, (B, C, …) each. If `falls` is True, a last entry
+        follows: the robustness of the safety requirements on every first part of each plan.
         """
         count, length = heads.shape[1:3]
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
@@ -243,10 +248,10 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Select results state by state: those in `before` where `decided` is True, else those in `here`.
+    """Select, for each state, the results for shorter prefixes (`before`) or the present ones (`here`).
 
-    `decided` marks the states for which a plan with a shorter prefix was found. `before` holds the results of
-    the plans with shorter prefixes, `here` those of the plans with the present ones.
+    `decided` is True for states in which a plan with a shorter prefix was accepted. For these states the
+    entries of `before` are returned, for the other states those of `here`.
     """
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)

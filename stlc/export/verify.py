@@ -39,9 +39,10 @@ class Agreement:
 
     Attributes:
         states: number of random states.
-        plan: greatest difference of a control, as a share of its range, where the same plan was chosen.
+        plan: greatest difference of a control, as a share of its range, over the states in which export and
+            run chose the same plan.
         rho: greatest difference of a robustness from that of the exact monitor.
-        ties: number of states in which another plan of the same rank was chosen.
+        ties: number of states in which the export chose another plan than the run, of the same rank.
     """
 
     states: int
@@ -161,8 +162,8 @@ def _answer(judged: JudgedPlans) -> Answer:
 def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
     """Compare the decisions of the ONNX graphs with those of the guard, given a previous plan.
 
-    The guard first decides in random states and takes one step. The rest of its plan is the previous plan
-    with which the graphs and the guard then decide.
+    The previous plan is made as follows: in random states, the guard decides and one step is taken. In the
+    states reached, both the guard and the graphs get the rest of the guard's plan, and decide again.
 
     Raises:
         RunError: R105, they disagree.

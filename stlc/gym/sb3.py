@@ -28,8 +28,9 @@ Indices: TypeAlias = Iterable[int] | int | None
 class SB3VecEnv(VecEnv):  # type: ignore[misc]
     """Adapter from `SpecVectorEnv` to the class `VecEnv` of Stable-Baselines3.
 
-    At the end of an episode the info of an environment holds `terminal_observation`, the return and length of
-    the episode (`episode`, which the logs of learners show), `rho`, `satisfied`, and `state`.
+    At the end of an episode the info of an environment holds `terminal_observation`; `episode`, the return
+    and length of the episode, which the logs of learners show; `rho`, the robustness of the specification;
+    `satisfied`; and `state`.
 
     Args:
         env: environments that are reset in the step that ends an episode (`AutoresetMode.SAME_STEP`).
@@ -77,9 +78,9 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
         return seen, reward.astype(np.float32), done, told
 
     def _told(self, info: dict[str, Any]) -> list[dict[str, Any]]:
-        """Info dictionaries of the environments at the end of their episodes, one per environment.
+        """One info dictionary per environment, at the end of all episodes.
 
-        `info`: info that the vector environment returned for all of them.
+        `info`: the single dictionary that the vector environment returned for all environments.
         """
         end = info["final_info"]
         rows = zip(info["final_obs"], self._earned, end["rho"], end["satisfied"], end["state"], strict=True)

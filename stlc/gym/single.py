@@ -36,23 +36,23 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     The agent moves on the model of a system, or in its world (the closed-loop simulation, with disturbances
     and further agents if the system file declares them).
 
-    An observation, (k,) float32, is what the policy observes. If the episode terminates at its end, its
-    elapsed share is added as the last value, because the remaining return depends on it. Observations are
-    clipped to finite bounds. The bounds are the nominal ranges of the states and the ranges that random plans
-    reach, widened by half. An action is the actuator command, (m,) float32, in physical units, clipped to the
-    actuator's range. `info` holds `state`, (n,) float64. After the last step, and with the reward `dense`
-    after each step, it also holds `robustness` per requirement, `rho` of the whole specification, and
-    `satisfied`. Robustness is computed from the last T steps of the episode, where T is the number of steps
-    of a plan, and clipped to ±10. While the episode is shorter than T steps, windows of the formulas end at
-    its last sample.
+    An observation, (k,) float32, is what the policy observes. If an episode ends by termination (not by
+    truncation), by default its elapsed share is the last observed value, because the remaining return depends
+    on it. Observations are clipped to finite bounds: the nominal ranges of the states and the ranges that
+    random plans reach, widened by half. An action is the actuator command, (m,) float32, in physical units,
+    clipped to the actuator's range. `info` holds `state`, (n,) float64. After the last step, and with the
+    reward `dense` after each step, it also holds `robustness` per requirement, `rho` of the whole
+    specification, and `satisfied`. Robustness is computed from the last T steps of the episode, where T is
+    the number of steps of a plan, and clipped to ±10. While the episode is shorter than T steps, the time
+    windows of formulas are cut off at its last sample.
 
     Args:
         task: specification and system.
         steps: number of steps of an episode; by default the horizon of a plan, after which the episode is
             *terminated*. A longer episode continues in the world of the system and is *truncated*.
-        reward: `robustness` or `accuracy` of the episode (0 or 100), given with the last step; `task`, the
-            reward of each step that the system file declares; or `dense`, the increase of the robustness in
-            each step.
+        reward: `robustness` of the episode, or `accuracy` (100 if the episode satisfies the specification,
+            else 0), given with the last step; `task`, the reward of each step that the system file declares;
+            or `dense`, the increase of the robustness in each step.
         normalised: whether observations and actions are scaled to [-1, 1], which most learners expect.
         time: whether the elapsed share of the episode is observed; None: only if the episode terminates.
         world: whether the agent moves in the world of the system; None: only in longer episodes.
@@ -158,8 +158,8 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     def _told(self, *, judged: bool) -> dict[str, Any]:
         """Info after a step: the state and, if `judged`, the robustness of the last T steps.
 
-        While the episode has fewer steps than the horizon T of a plan, windows of the formulas end at its
-        last sample.
+        T is the number of steps of a plan. While the episode is shorter, the time windows of formulas are cut
+        off at its last sample.
         """
         state = {"state": self._driven[-1][0].numpy(force=True).copy()}
         if not judged:

@@ -38,8 +38,9 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     Args:
         task: specification and system.
         num_envs: number of environments, N.
-        reward: `robustness` or `accuracy` of the episode (0 or 100), given with the last step, or `task`, the
-            reward of each step that the system file declares.
+        reward: `robustness` of the episode, or `accuracy` (100 if the episode satisfies the specification,
+            else 0), given with the last step; or `task`, the reward of each step that the system file
+            declares.
         normalised: whether observations and actions are scaled to [-1, 1], which most learners expect.
         time: whether the elapsed share of the episode is observed.
         autoreset: when the next episodes begin. By default (`SAME_STEP`) the last step of an episode returns
@@ -150,9 +151,9 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self.task.system.planned(self._episodes.states, held)
 
     def _shown(self, seen: Tensor) -> Floats:
-        """Clip and scale observations for the agent, (N, k).
+        """Clip the observations `seen` to their bounds and, if requested, normalise them: (N, k).
 
-        The last entry of `seen` is the elapsed share of the episode. It is kept only if `time` is True.
+        The last entry of `seen` is the elapsed share of the episode. It is dropped if `time` is False.
         """
         values = seen.numpy() if self.time else seen[:, :-1].numpy()
         return self._bounds.shown(values, unit=self.normalised)
@@ -175,7 +176,10 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return self._marked(end)
 
     def _marked(self, values: Info) -> Info:
-        """Info with the boolean arrays `_NAME` that gymnasium adds for every key `NAME`."""
+        """Add the boolean arrays that gymnasium expects to `values`, and return the result.
+
+        For every key `NAME`, the array `_NAME`, (N,), marks the environments for which `NAME` has a value.
+        """
         return values | {f"_{name}": self._all for name in values}
 
 

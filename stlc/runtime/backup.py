@@ -107,9 +107,10 @@ def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
 
 
 def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
-    """Index of the best of the allowed choices, by the `keys`, (choices,) each, where larger is better.
+    """Index of the best of the allowed choices.
 
-    A later key decides between choices that are equal in all earlier ones, up to `TOLERANCE`. NaN is the
+    `allowed`: mask of the choices, (choices,). `keys`: arrays of values, (choices,) each; larger is better. A
+    later key decides between choices that are equal in all earlier ones, up to `TOLERANCE`. NaN is the
     smallest value.
     """
     for key in keys:

@@ -29,7 +29,7 @@ class ControllerQuantity:
     Attributes:
         name: name in the system file.
         unit: unit of its values; "" if dimensionless.
-        low: lower end of its range, which is nominal for states; None without a range.
+        low: lower end of its range; None without a range. A state may leave its range, which is nominal.
         high: upper end of its range.
         added: "parameter" or "timer" for a state that the specification adds, else "".
         initial: value of a timer at the start of a mission.

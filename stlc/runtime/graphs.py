@@ -75,9 +75,10 @@ class Graphs:
         return _judged(found["plan"], found), found
 
     def continued(self, x: Numbers) -> Numbers:
-        """Plans that continue prefixes from the states `x` that these reach: (rows, n) -> (rows, T, m).
+        """The policy's plans from the states `x` in which a prefix ends: (rows, n) -> (rows, T, m).
 
-        They are the best of the network's own plans, without the changes that `decided` may add.
+        A prefix is a sequence of first actions that the backup policy tries. The plans are the best ones of
+        the network itself. Changed copies, as `decided` may try, are not among them.
         """
         return _run(self._continue, {"state": x})["plan"]
 
@@ -100,12 +101,12 @@ class Graphs:
         return _judged(plans, found), found
 
     def falls(self, x: Numbers, plans: Numbers) -> Numbers:
-        """Upper bound on the robustness of the safety requirements, given the samples 0 to k of the states.
-
-        The bound holds for all continuations of these samples.
+        """Robustness that the safety requirements can still reach after the first samples of each plan.
 
         Returns:
-            (rows, T + 1), for k = 0, …, T; +inf if there are no safety requirements.
+            (rows, T + 1). Entry k is an upper bound on their robustness, given the predicted states at the
+            samples 0 to k; it holds for all continuations. All entries are +inf if there are no safety
+            requirements.
         """
         if self._fall is None:
             return np.full((len(x), self.facts.horizon + 1), np.inf)

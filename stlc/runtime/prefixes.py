@@ -53,10 +53,7 @@ class PrefixGrid:
         return int(prod(len(values) for values in self.values) ** length)
 
     def count(self, length: int) -> int:
-        """Number of prefixes of `length` steps that are tried.
-
-        These are all combinations of the values of the controls, but at most `samples`.
-        """
+        """Number of prefixes of `length` steps that are tried: all of them, but at most `samples`."""
         return min(self.size(length), self.samples)
 
     def prefixes(self, length: int) -> NDArray[np.float64]:
@@ -102,8 +99,9 @@ def words(sampling: Sampling, count: int, dims: int) -> NDArray[np.uint64]:
 
 
 def below(word: NDArray[np.uint64], bounds: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Map numbers in [0, 1), in units of 2^-64, to integers from 0 to `bounds` - 1, proportionally.
+    """Map numbers u in [0, 1), given in units of 2^-64, to integers: u times the bound, rounded down.
 
-    `word`: (…, dims). `bounds`: (dims,), less than 2^32.
+    `word`: the numbers, (…, dims); only their upper 32 bits are used. `bounds`: (dims,), less than 2^32. The
+    results lie between 0 and the bound minus 1.
     """
     return (((word >> np.uint64(32)) * bounds) >> np.uint64(32)).astype(np.int64)

@@ -1,1 +1,1 @@
-"""Closed-loop simulation: worlds, disturbances, exogenous events, live monitoring."""
+"""Closed-loop simulation: worlds (true environments), disturbances, exogenous events, live monitoring."""

@@ -48,8 +48,9 @@ class Setting:
         steps: number of steps.
         replan: replanning period in steps.
         limit: time limit of a decision of the guard "full", in seconds per agent; None: no limit.
-        ceiling: number of visited states, over all seeds, whose feasibility is estimated. A state counts as
-            feasible if the followed plan satisfies the specification, or if a search finds a plan that does.
+        ceiling: number of visited states, over all seeds, for which feasibility is checked. A state counts as
+            feasible if the followed plan satisfies the specification, or if a search finds another plan that
+            satisfies it.
         margin: name of a safety requirement -> robustness margin by which a plan must satisfy it to be
             accepted by a guard.
         paper_limit: time limit of a decision of the guard "paper", in seconds per agent; None: no limit.
@@ -90,16 +91,17 @@ class Worlds:
         self._scene: dict[str, NDArray[Any]] | None = None
 
     def reset(self) -> Tensor:
-        """Return the initial states, (rows, n).
+        """Return the initial states of a new deployment, (rows, n).
 
-        Parameters of the specification are drawn at random; timers start at their initial values. The system
-        file may require that a plan is known from each initial state (`test: {starts: …}`). Then the world
-        draws an initial state again if no plan is known from it; the attribute `redrawn` counts these draws.
+        Parameters of the specification are drawn at random; timers start at their initial values. By default
+        any initial state is accepted. With `test: {starts: savable}` in the system file, a search must find a
+        safe plan from each initial state; with `feasible`, a plan that satisfies the specification. If the
+        search finds none, the world draws this initial state again. The attribute `redrawn` counts the
+        repeated draws.
 
         Raises:
             SystemFileError: S211, a world cannot redraw the initial state of an agent.
-            RunError: R405, after the maximum number of draws, there is an agent whose initial state has no
-                known plan.
+            RunError: R405, after the maximum number of draws, there is still an initial state without a plan.
         """
         given = []
         for world in self.worlds:
@@ -115,14 +117,19 @@ class Worlds:
         )
 
     def _with_plans(self, world: object, seed: int, x: Tensor) -> Tensor:
-        """Redraw those initial states `x` of a seed from which no plan is known, until none of these is left.
+        """Redraw initial states of one seed until a plan is found from each of them.
+
+        Args:
+            world: the world of the seed; it draws the initial states.
+            seed: the seed, for the error message.
+            x: initial states, (agents, n). States from which a search finds a plan are retained.
 
         Returns:
-            All initial states of the seed, (agents, n).
+            The final initial states of the seed, (agents, n).
 
         Raises:
             SystemFileError: S211, the world cannot redraw an initial state.
-            RunError: R405, no plan is known after the maximum number of draws.
+            RunError: R405, after the maximum number of draws, there is still an initial state without a plan.
         """
         known = viable if self.task.system.decl.test.starts == "savable" else solvable
         good = known(self.task, x)
@@ -143,12 +150,16 @@ class Worlds:
         raise _hopeless(self.task.system.decl.test.starts, seed, int((~good).sum()))
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
-        """Advance all worlds by step number `step`: states (rows, n), actions (rows, m) -> (rows, n).
+        """Simulate step number `step` in all worlds and return the next states, (rows, n).
+
+        `x`: present states, (rows, n). `action`: actions, (rows, m).
 
         A world computes the states of the system only. The parameters and timers that the specification adds
-        to them are computed here: parameters stay constant, and timers are updated from the true states. Sets
-        `eventless`, (rows,): True where no exogenous event occurred, that is, where the next state in the
-        world equals the state that the true dynamics give.
+        to these states are computed here: parameters stay constant, and timers are updated from the true
+        states.
+
+        The method also stores the attribute `eventless`, (rows,). An entry is True if no exogenous event
+        occurred, that is, if the world's next state equals the one that the true dynamics give.
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []

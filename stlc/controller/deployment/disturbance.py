@@ -208,7 +208,8 @@ class _Event:
         The method also stores, for each agent, whether the event's condition holds now. The next call needs
         this for an event that occurs when its condition becomes true or becomes false.
 
-        `columns`: name of a state, or `t` for the time in seconds -> values, (agents,).
+        `columns`: name -> values, (agents,); the names are those of the states, and `t` for the time in
+        seconds.
         """
         like = next(iter(columns.values()))
         due = self.decl.at == step if self.decl.at is not None else True
@@ -249,8 +250,8 @@ class Events:
         `generator`: source of the random numbers in the events.
 
         Returns:
-            The states afterwards, (agents, n), and for each event that has a condition, the number of agents
-            for which it occurred.
+            The states after the events, (agents, n); and for each event with a condition, the event's name ->
+            number of agents for which it occurred.
         """
         columns = dict(zip(self._names, x.unbind(1), strict=True))
         counts: dict[str, int] = {}

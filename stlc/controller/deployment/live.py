@@ -1,4 +1,4 @@
-"""Live monitor of a deployment: robustness margins of the requirements, and sources of the followed plans."""
+"""Live monitor of a deployment: robustness margins of the requirements, and origins of the plans."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LiveMonitor:
-    """Online monitor of all agents of a deployment, for the requirements that `stlc check` judges.
+    """Online monitor of all agents of a deployment; it evaluates the same requirements as `stlc check`.
 
     `push` only stores the states; the robustness margins are computed when `margins` is read.
 
@@ -44,7 +44,7 @@ class LiveMonitor:
 
     @property
     def margins(self) -> dict[str, Margin]:
-        """Bounds on the robustness of every requirement, given the samples up to the latest one."""
+        """Lower and upper bounds on the robustness of every requirement, given the samples until now."""
         return self._margins.evaluate()
 
     @property
@@ -53,7 +53,7 @@ class LiveMonitor:
         return (self.moment.step if self.moment else 0) * self.task.system.dt
 
     def decided(self, row: int) -> str | None:
-        """Source of the plan that the agent in row `row` follows; None after the last step.
+        """Name of the method that made the plan of the agent in row `row`; None after the last step.
 
         Examples: `policy`; `backup T0=2`, a plan of the backup policy with a prefix of 2 actions.
         """

@@ -97,12 +97,18 @@ class Recorder:
     redrawn: int = 0
 
     def start(self, x: Tensor, frame: Frame) -> None:
-        """Record the initial states `x`, (rows, n), ordered by seed, then by agent, and a picture frame."""
+        """Record the initial states `x`, (rows, n), which are ordered by seed, then by agent.
+
+        `frame`: the arrays from which the first picture is drawn, name -> array.
+        """
         self.states.append(x)
         self.frames.append(frame)
 
     def step(self, decision: GuardDecision, action: Tensor, x: Tensor, frame: Frame) -> None:
-        """Record one step: decision, actions (rows, m), next states `x` (rows, n), and a picture frame."""
+        """Record one step: `decision`, executed actions (rows, m), and next states `x` (rows, n).
+
+        `frame`: the arrays from which the picture after the step is drawn, name -> array.
+        """
         self.decisions.append(decision)
         self.actions.append(action)
         self.start(x, frame)
@@ -189,12 +195,15 @@ class _Pilot:
     def due(self, x: Tensor, seen: Tensor, step: int) -> Tensor:
         """Indices of the rows (one per agent and seed) that replan at this step, (k,).
 
-        All rows replan every `replan` steps. At other steps a row replans for one of two reasons: an
-        exogenous signal has changed in its true state `x`, or the rest of its plan violates a safety
-        requirement. The second reason applies only with the guard "full", which predicts the rest of the plan
-        from the measured state `seen`. If a plan ends before the next regular replanning, the prediction
-        holds its last action. The last sample of a plan is not checked: a `sweep` predicate is evaluated
-        between a sample and the next one, and the plan has no next sample.
+        All rows replan every `replan` steps. At other steps a row replans for one of two reasons:
+
+        - An exogenous signal has changed in its true state `x`.
+        - The rest of its plan is predicted to violate a safety requirement. Only the guard "full" predicts
+          this, from the measured state `seen`.
+
+        If a plan ends before the next regular replanning, the prediction repeats the plan's last action. The
+        last sample of a plan is not checked, because a `sweep` predicate judges the motion between two
+        samples, and no sample follows the last one.
         """
         if self.decision is None or step % self.replan == 0:
             return torch.arange(len(x))
@@ -234,9 +243,10 @@ class _Pilot:
     def _previous(self, due: Tensor, seen: Tensor) -> GuardDecision | None:
         """Remainders of the previous plans of the rows in `due`; None at the first step.
 
-        A remainder lacks the actions already executed. If `replan` > 1, the policy appends as many new ones,
-        for which the measured states `seen`, (rows, n), are needed. If the last action were repeated instead,
-        the plan might violate the specification, and the guard would hardly ever retain a previous plan.
+        The actions already executed are removed from a plan. If `replan` > 1, the policy appends new actions,
+        so that the plan has T actions again. To do so, it needs the measured states `seen`, (rows, n). A
+        repetition of the last action instead might violate the specification, and the guard would hardly ever
+        retain a previous plan.
         """
         if self.decision is None:
             return None

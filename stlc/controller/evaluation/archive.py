@@ -39,8 +39,9 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
     Besides the states, a trace contains these arrays of shape (traces, steps):
 
     - `action.NAME`: the actuator command of control NAME.
-    - `decision`: the source of the followed plan (0 policy, 1 backup, 2 safest, 3 polished).
-    - `t0`: the prefix length of the followed plan if it is a plan of the backup policy, else 0.
+    - `decision`: the source of the followed plan. 0: policy. 1: backup policy. 2: plan that stays safe
+      longest. 3: plan found by another search.
+    - `t0`: the number of first actions that the backup policy chose; 0 for other plans.
     - `plan_rho`: the robustness of the followed plan.
     - `policy_rho`: the robustness of the policy's plan.
     - `foreseen`: 1 if the true next state equals the model's prediction, else 0.
@@ -70,7 +71,11 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
 
 def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """Actuator commands, (rows, steps, m), for the recorded actions; equal to them without feedback."""
+    """Actuator commands that belong to the recorded actions, (rows, steps, m).
+
+    With a feedback law around plans, a command is the action plus a correction. Without it, the command is
+    the action.
+    """
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
     return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
@@ -84,7 +89,7 @@ def save_trace_of(
     *,
     rules: Rules | None = None,
 ) -> list[Path]:
-    """Write the trace of a deployment into the run folder, and to the path `also`; return the paths.
+    """Write the trace of a deployment into the run folder, and also to the path `also`; return all paths.
 
     `rules`: specification of closed-loop runs; it is stored in the trace and used when the trace is checked
     later.
@@ -152,9 +157,10 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
 
 
 def _set_in(spec: str, run: Run) -> dict[str, str]:
-    """Changed constants of the specification text `spec`: name -> value as a text.
+    """Values that replaced those written in the specification text `spec`: constant -> value as a text.
 
-    They were changed when the run was trained, by the scenario, or on the command line of the deployment.
+    A constant can be replaced when the run is trained, by the scenario, or on the command line of the
+    deployment.
     """
     own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
     changed = run.task.system.decl.overrides.items()

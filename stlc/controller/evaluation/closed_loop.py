@@ -264,8 +264,9 @@ class _Trial:
         """Guard to simulate next; None if the time is used up or no further runs are needed.
 
         At first, guards are simulated once each, from the cheapest one up to the first guard under which all
-        runs satisfy the mission. After that, only the guards whose share of satisfying runs may
-        still be the best are considered. Of these, the guard with the widest confidence interval is returned.
+        runs satisfy the mission. After that, a guard is left out if its confidence interval lies below the
+        best share of satisfying runs. Of the other guards, the one with the widest confidence interval is
+        returned.
         """
         if self.left() <= 0.0:
             return None
@@ -322,8 +323,8 @@ class _Trial:
         """Simulate `seeds` with `agents` agents each under the guard `mode` and return the recording.
 
         Raises:
-            _LateError: the simulation takes more than the share `share` of the remaining time, or will
-                clearly take longer than the remaining time.
+            _LateError: the simulation has used the fraction `share` of the remaining time, or will clearly
+                take longer than the remaining time.
         """
         setting = Setting(tuple(seeds), agents, self.test.steps, self.test.replan)
         guard = Guard(self.task, self.policy, mode, limits=Limits(seconds=setting.limit))
@@ -341,9 +342,9 @@ class _Trial:
         return recording
 
     def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Return a mask of the runs that satisfy the mission, and one of those that satisfy its safety part.
+        """Return two masks of runs, (rows,) each: those that satisfy the mission, and those that are safe.
 
-        The masks are (rows,). The safety part consists of the requirements tagged `@safety`. If there are
+        A run is safe if it satisfies the requirements of the mission that are tagged `@safety`. If there are
         none, the second mask is None.
         """
         rows = len(recording.states)

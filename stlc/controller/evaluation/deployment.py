@@ -168,9 +168,12 @@ def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
 def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> NDArray[np.float64]:
     """Determine the feasibility of `count` visited states, evenly spread over the recording.
 
+    A state is feasible if the followed plan satisfies the specification, or if a search finds a plan that
+    does.
+
     Returns:
-        (rows, steps): NaN for all states except the `count` chosen ones. Of these, an entry is 1 if the
-        followed plan satisfies the specification or a search found a plan that does, else 0.
+        (rows, steps): 1 for a feasible state, 0 for a state without a known plan, and NaN for a state that
+        was not among the `count` chosen ones.
     """
     known = np.full(recording.rho.shape, math.nan)
     if count:
@@ -181,7 +184,7 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
 
 
 def decided(recording: DeploymentRecording) -> dict[str, float]:
-    """Source of the followed plan -> share of the decisions.
+    """Method that made the followed plan, such as "policy" -> share of the decisions.
 
     "backup" counts all plans of the backup policy, "backup T0=1" those with a prefix of 1 action.
     """

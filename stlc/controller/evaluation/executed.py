@@ -37,14 +37,14 @@ class Executed:
     once, from the first sample.
 
     Attributes:
-        rules: requirement -> whether it holds, (starts, rows). There is a single start for a requirement
-            that does not mention T.
+        rules: requirement -> whether it holds, (starts, rows). There is a single start for a requirement that
+            does not mention T.
         safety: names of the requirements that are tagged `@safety`.
         consistent: (starts, rows), whether the model predicts every step in the planning window from the
             start instant, up to rounding errors.
-        eventless: (starts, rows), whether no exogenous event occurs in the planning window. If none occurs,
-            all steps in the window follow the true dynamics, from which the model may differ. None if events
-            were not recorded.
+        eventless: (starts, rows), whether no exogenous event occurs in the planning window. Then all steps in
+            the window follow the true dynamics. They may still differ from the model. None if events were not
+            recorded.
         viable: (rows,), whether the trajectory is safe, or a safe plan from its first state is known.
     """
 
@@ -62,7 +62,8 @@ class Executed:
     def starts(self, names: Sequence[str]) -> Mask:
         """Mask of the start instants at which all requirements in `names` hold, (starts, rows).
 
-        A requirement that does not mention T has a single verdict, which counts for every start instant.
+        A requirement that does not mention the horizon T has a single verdict, which counts for every start
+        instant.
         """
         held = np.ones_like(self.consistent)
         for name in names:
@@ -92,11 +93,12 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
 
 
 def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
-    """Form of a requirement for trajectories whose first sample is the start of the mission.
+    """Return a requirement in the form in which it is judged on a recorded trajectory.
 
-    The interval of an absolute operator (`always@[a, b]`) counts from the start of the mission. In the
-    returned form it counts from the first sample, so the requirement is judged only once per trajectory. A
-    requirement without absolute operators is returned unchanged.
+    The first sample of such a trajectory is the start of the mission. An absolute operator (`always@[a, b]`)
+    counts its interval from the start of the mission. In the returned form the interval counts from the first
+    sample, and the requirement is judged only once per trajectory. A requirement without absolute operators
+    is returned unchanged.
     """
     if not rule.absolute:
         return rule
@@ -108,7 +110,7 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
 def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
     """Verdicts on one requirement, (starts, rows) booleans.
 
-    `columns`: state -> samples, (time, rows). `horizon`: steps of a planning window.
+    `columns`: state -> samples, (time, rows). `horizon`: number of steps of a planning window.
     """
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:

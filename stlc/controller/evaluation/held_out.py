@@ -58,7 +58,7 @@ class Score:
         each: robustness per requirement, (n, requirements).
         known: mask of the states with a known satisfying plan, (n,).
         searched: mask of the states that the policy solved or that were searched, (n,).
-        endless: for a mission without end, the simulated duration in seconds; else None.
+        endless: if the mission has no end, the time in seconds for which it was simulated; else None.
     """
 
     accuracy: float
@@ -185,11 +185,17 @@ def _judged(
 
 
 def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
-    """Search by exploration from a few failing states, and mark the solved states in `known`.
+    """Search for satisfying plans from a few failing states by exploration, and update `known`.
 
-    Exploration builds plans step by step from prefixes. `failing`: indices of the states at which the
-    policy's plan fails, (k,). Of these, states at the start of a mission are explored first. The search ends
-    early once `enough` returns True.
+    Exploration builds plans step by step, by extending partial plans; it does not use the policy. States at
+    the start of a mission come first. The search ends early once `enough` returns True.
+
+    Args:
+        task: specification and system.
+        states: all states, (n, dim).
+        failing: indices of the states at which the policy's plan fails, (k,).
+        known: mask of the states with a known satisfying plan, (n,); changed in place.
+        enough: function that returns True to end the search.
     """
     clocks = [task.system.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
     age = states[failing][:, clocks].sum(1)
@@ -202,9 +208,13 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
     """Estimated share of the states from which a satisfying plan exists.
 
-    `known`: mask of the states with a known satisfying plan. `searched`: mask of the states that the policy
-    solved or that were searched. `failing`: indices of the states at which the policy's plan fails. Only some
-    of the failing states were searched. The share of solved states among these is assumed for the others.
+    Only some of the failing states were searched. The share that was solved among these is assumed for the
+    other failing states.
+
+    Args:
+        known: mask of the states with a known satisfying plan, (n,).
+        searched: mask of the states that the policy solved or that were searched, (n,).
+        failing: indices of the states at which the policy's plan fails, (k,).
     """
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried

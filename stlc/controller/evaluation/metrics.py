@@ -231,14 +231,14 @@ HOLDS = "holds."
 
 
 def is_progress(key: str) -> bool:
-    """True if `key` names progress that a world reports, not a metric of `METRICS` or `holds.NAME`."""
+    """True if `key` names progress that a world reports; False for a metric and for `holds.NAME`."""
     return key not in METRICS and not key.startswith(HOLDS)
 
 
 def measure(
     recording: DeploymentRecording, executed: Executed, feasible: NDArray[np.float64] | None = None
 ) -> dict[str, MeanInterval]:
-    """Compute means over seeds: of every metric, of the share per requirement, of the world's progress.
+    """Compute means over seeds: of the metrics, the share per requirement, and the worlds' progress.
 
     The result maps the key of each value to its mean. If a metric is undefined for a seed, this seed is left
     out of the mean.

@@ -200,9 +200,11 @@ def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
 def rules_of(run: Run) -> Rules | None:
     """Rules for the closed-loop runs of a trained run; None if the specification of the plans judges them.
 
-    Training copies the rules that the system file names into the run folder, and they are read from there.
-    Rules that are named later (by the scenario or with `--set test.judge=…`) are read from their own file. If
-    the run was trained before `test.judge` existed, the present system file names the rules.
+    Training copies the rules that the system file names into the run folder. Normally this copy is read.
+    There are two exceptions:
+
+    - Rules that are named later, by the scenario or with `--set test.judge=…`, are read from their own file.
+    - Old run folders have no copies. For these, the present system file names the rules.
 
     Raises:
         RunError: R101, the index of the copies in the run folder is damaged.
@@ -236,9 +238,10 @@ def _copied(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Ru
 
 
 def _named_since(folder: RunDir, decl: SystemDecl) -> JudgeRef | None:
-    """Reference to the rules that the present system file of a run names for the chosen scenario.
+    """Reference to the rules that a run's system file names today, for the chosen scenario.
 
-    None if it names none, does not exist or is invalid, or if `test.judge` is overridden.
+    None if the system file names no rules, does not exist or is invalid. Also None if `test.judge` is
+    overridden.
     """
     path = Path(str(folder.record().get("system_path") or ""))
     if "test.judge" in decl.overrides or not path.is_file():
@@ -257,7 +260,7 @@ def _library_of(name: str) -> str:
 
 
 def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
-    """The entries of `overrides` that name constants of the specification."""
+    """The entries of `overrides` whose names are constants of the specification `spec`."""
     own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
     return {name: text for name, text in overrides.items() if name in own}
 
@@ -414,15 +417,20 @@ def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, floa
 
 
 def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str, Any]:
-    """Return the entry `drives` of a guard in `eval/simulate.json`.
+    """Return verdicts on the closed-loop runs under one guard: entry `drives` of `simulate.json`.
 
-    `count`: number of runs. `obeyed`: number of runs that satisfy every rule. `undecided`: number of
-    inconclusive runs. `lost`: number of runs that could not obey the rules (see `RunVerdicts.viable`).
-    `told`: number of the lost runs in which a good plan was known until an exogenous event; in the other lost
-    runs, none was known even at the start. `rules`: for each rule, the numbers of obeyed, broken and
-    undecided runs. `broken`: one entry per run that broke rules. Its `rules` are the times of the violations
-    in seconds from the start (null if unknown). Its `cause` says since when no good plan was known, and why
-    (see `Lost`).
+    The entries are:
+
+    - `count`: number of runs.
+    - `obeyed`: number of runs that satisfy every rule.
+    - `undecided`: number of inconclusive runs.
+    - `lost`: number of runs that could not obey the rules (see `RunVerdicts.viable`).
+    - `told`: number of the lost runs in which a good plan was known until an exogenous event. In the other
+      lost runs, no good plan was known even at the start.
+    - `rules`: for each rule, the numbers of obeyed, broken and undecided runs.
+    - `broken`: one entry per run that broke rules. Its `rules` are the times of the violations in seconds
+      from the start (null if unknown). Its `cause` says since when no good plan was known, and why (see
+      `Lost`).
     """
     obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
     return {

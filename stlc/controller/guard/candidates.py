@@ -1,4 +1,7 @@
-"""Candidate plans with their verdicts, and the order in which guards prefer them."""
+"""Candidate plans with their verdicts, and the order in which guards prefer them.
+
+A guard judges each plan of the policy at run time. If it rejects a plan, it chooses another candidate.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +46,9 @@ class Candidates:
         safe: robustness of phi_safe (the requirements tagged `@safety`), (…); +inf where no requirement is
             tagged `@safety`.
         cost: performance cost of the objective, (…); 0 where not computed.
-        source: index into `SOURCES`, (…) int64.
-        prefix_length: T0, the number of first actions that come from a sampled prefix, (…) int64; 0 for plans
-            without such a prefix.
+        source: method that made the plan, an index into `SOURCES`, (…) int64; negative for plans not judged.
+        prefix_length: T0, the length of the plan's prefix, (…) int64. The prefix consists of the first
+            actions of a plan, which a guard chose from fixed control values; 0 without prefix.
     """
 
     plans: Tensor
@@ -141,14 +144,15 @@ _FIELDS = tuple(each.name for each in fields(Candidates))
 def rank(plans: Candidates) -> Tensor:
     """Rank of plans, (…); larger is better.
 
-    The order, from best to worst:
+    A plan is safe if it satisfies phi_safe (the requirements tagged `@safety`). The order, from best to
+    worst:
 
-    1. plans that satisfy phi, by robustness
-    2. safe plans that consist of a sampled prefix and the policy's continuation: they return to states on
-       which the policy was trained
+    1. plans that satisfy phi; among these, a higher robustness is better
+    2. safe plans that begin with actions tried by the guard (a prefix) and that the policy continues: they
+       lead back to states on which the policy was trained
     3. other safe plans
-    4. plans chosen for the longest safe prefix
-    5. other plans, by the smaller of the robustness of phi and that of phi_safe
+    4. unsafe plans that a guard chose because they stay safe for the longest time
+    5. other unsafe plans, by the smaller of the robustness of phi and that of phi_safe
     6. plans that were not judged
     """
     good, safe = plans.satisfies, plans.is_safe
@@ -184,9 +188,9 @@ def finite(plan: Tensor, task: Task) -> Tensor:
 
 
 class Deadline:
-    """Time by which a decision for `agents` agents must be made.
+    """Deadline for a decision that is made for `agents` agents together.
 
-    `seconds`: time per agent, counted from now; None: no time limit.
+    It lies `agents` times `seconds` in the future; without `seconds` there is no deadline.
     """
 
     def __init__(self, seconds: float | None = None, agents: int = 1) -> None:
@@ -202,10 +206,12 @@ class Deadline:
 class Limits:
     """Computational limits of a decision.
 
-    The guard "paper" searches for plans as Meng and Fan (2023) do; the guard "full" uses more methods.
+    The guard "paper" searches for plans as Meng and Fan (2023) do. The guard "full" uses more search methods.
+    Each method is called a stage. A prefix is a sequence of first actions that a stage tries; the policy
+    plans the rest.
 
     Attributes:
-        seconds: time limit of the guard "full" per agent; the best plan found until then is taken. None: no
+        seconds: time limit of the guard "full" per agent, after which the best plan found is taken. None: no
             limit.
         tries: number of plans that a local search in the guard "full" judges per starting plan.
         prefixes: maximum number of prefixes of one length in the stage "prefix shooting" of the guard "full";
@@ -213,10 +219,12 @@ class Limits:
             plan.
         drawn: maximum number of prefixes of one length in the stage "sampled shooting"; if there are more, a
             random sample is used.
-        places: number of plans from which local searches start after sampled shooting: its best ones.
+        places: number of plans of the stage "sampled shooting", the best ones, from which local searches
+            start.
         again: number of plans that each of these local searches judges.
-        rescue: whether to search for a plan that satisfies only phi_safe, without use of the policy, if no
-            other stage found a safe plan.
+        rescue: whether the guard "full" also searches for a safe plan without the policy. It does so only if
+            no earlier stage found a safe plan; the search ignores all requirements that are not tagged
+            `@safety`.
         margin: name of a safety requirement -> robustness margin in the unit of the requirement. Both guards
             accept a plan only if it satisfies the requirement by this margin.
         paper: time limit of the guard "paper" in seconds per agent; None: no limit.
@@ -236,8 +244,9 @@ class Limits:
 def grid_of(task: Task) -> PrefixGrid:
     """Prefixes that the backup policy tries, as the system file declares them.
 
-    They are given by the values of each control, and by their lengths. Without `levels` in the file, the
-    values of a control are evenly spaced over its range.
+    A prefix is a sequence of actions with which a plan begins; the policy plans the rest. The prefixes are
+    given by their lengths, and by the values that each control takes in them. If the system file does not
+    list the values (`levels`), they are evenly spaced over the range of the control.
     """
     decl = task.system.decl
     values = tuple(

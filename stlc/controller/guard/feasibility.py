@@ -1,4 +1,4 @@
-"""Feasibility: search for any satisfying plan, or any safe one, from each state."""
+"""Feasibility of states: search for a plan that satisfies the specification, or one that is only safe."""
 
 from __future__ import annotations
 
@@ -42,15 +42,16 @@ def solve(
 ) -> SearchResult:
     """Search for a satisfying plan from each state; equal arguments give equal plans.
 
-    The first pass of local search starts from the plans `start`. Each later pass starts from random plans of
-    `library` and is made only for the states without a satisfying plan. The returned robustness is exact. If
-    no satisfying plan is found from a state, there may still be one.
+    The search consists of passes of a local search, which changes plans at random. The first pass starts from
+    the plans `start`. Each later pass starts from random plans of `library`, and is made only for the states
+    without a satisfying plan. The returned robustness is exact. If no satisfying plan is found from a state,
+    there may still be one.
 
     Args:
         task: specification and system.
         x0: states, (B, n).
         start: starting plans, (B, T, m). None: plans that hold each control at the middle of its range.
-        library: plans for later passes, (k, T, m); the search also copies parts of them into other plans.
+        library: plans for later passes, (k, T, m); the search also copies parts of these plans into others.
             None: plans of 3 constant pieces at the ends and middles of the control ranges (see `extremes`).
         passes: maximum number of passes.
         tries: number of plans judged per pass and state.

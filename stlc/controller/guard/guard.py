@@ -31,7 +31,7 @@ class GuardDecision:
     Attributes:
         action: (agents, m) float64, physical units.
         plan: (agents, T, m), the followed plan.
-        source: (agents,) int64, an index into `SOURCES`.
+        source: (agents,) int64, the method that made `plan`, an index into `SOURCES`.
         t0: (agents,) int64, prefix length of `plan`: number of its first actions that come from the guard's
             sampled prefixes; 0 for the policy's own plan.
         rho: (agents,) float64, robustness of `plan`.
@@ -50,10 +50,10 @@ class GuardDecision:
     proposed: Tensor
 
     def later(self, steps: int | Tensor = 1) -> GuardDecision:
-        """Decision for the instant `steps` steps later: the remainders of the plans.
+        """The decision as it stands `steps` steps later: each plan without its first `steps` actions.
 
-        `steps`: one number for all agents, or (agents,). A remainder is extended to T steps by repeating its
-        last action.
+        `steps`: one number for all agents, or one per agent, (agents,). Every shortened plan is extended to T
+        steps again by repeating its last action.
         """
         agents, length, controls = self.plan.shape
         ahead = torch.as_tensor(steps).expand(agents)[:, None] + torch.arange(length)
@@ -66,7 +66,10 @@ class GuardDecision:
         return GuardDecision(*(getattr(self, name)[rows] for name in _FIELDS))
 
     def with_new(self, rows: Tensor, new: GuardDecision) -> GuardDecision:
-        """The decision in which the agents with indices `rows`, (k,), have the entries of `new`."""
+        """Return this decision with the entries of some agents replaced by those of `new`.
+
+        `rows`: indices of these agents, (k,). `new`: decision for these agents only.
+        """
         pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
         return GuardDecision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
 
@@ -143,7 +146,7 @@ class Guard:
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
 
     def _plainly(self, decision: GuardDecision, x: Tensor, fresh: Tensor) -> GuardDecision:
-        """The same decision, with robustness and verdicts computed without robustness margins.
+        """Return `decision` with its robustness and verdicts recomputed without robustness margins.
 
         `x`: states, (agents, n). `fresh`: the policy's plans, (agents, T, m).
         """
@@ -242,8 +245,8 @@ class Guard:
     def _deepened(self, rest: PlanVerdicts) -> Tensor:
         """Mask of the agents whose previous plan increases the margin of a goal in its next step, (agents,).
 
-        A goal counts only if the present state satisfies it, but with a smaller margin than plans are to
-        reach. `rest`: verdicts on the remainders of the previous plans.
+        The margin is the robustness of the goal. A goal counts only if it holds in the present state with a
+        smaller margin than plans should reach. `rest`: verdicts on the remainders of the previous plans.
         """
         if not self.task.pending_goals.items:
             return torch.zeros_like(rest.rho, dtype=torch.bool)

@@ -1,9 +1,9 @@
-"""Robustness margins of guards: requests on the command line, calibration, tightened tasks.
+"""Robustness margins of guards: how they are requested, calibrated and added to a task.
 
 A guard accepts a plan that is safe according to the model. When the plan is executed, it loses robustness,
 because the true dynamics and the true initial state differ from those of the model. If the plan was accepted
-with a margin larger than this loss, its rest is still safe when the guard judges it. So a safe plan is known
-then.
+with a margin larger than this loss, its rest is still safe when the guard judges again. The guard then knows
+at least one safe plan.
 
 Calibration measures the loss of the policy's plans from training states. The first steps of each plan, until
 the guard judges again, are simulated with the scenario's true dynamics, and the other steps with the model.
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 def with_margins(task: Task, margin: RobustnessMargins) -> Task:
     """Return the task with tightened safety requirements: the robustness of each is reduced by its margin.
 
-    Predicates that read only time and constants are unchanged. They decide whether a formula holds, but the
-    robustness of the formula never depends on their values.
+    Predicates that read only time and constants (such as `t <= 5`) are unchanged. They influence whether a
+    formula holds, but their values never enter its robustness.
     """
     if not any(margin.values()):
         return task
@@ -97,7 +97,10 @@ def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float 
 
 
 def _followed(task: Task, disturbance: Disturbance, x: Tensor, plan: Tensor, steps: int) -> Tensor:
-    """States (B, T+1, n) under plans: `steps` steps of the true dynamics, then the rest by the model."""
+    """States, (B, T+1, n), reached from `x` under `plan`.
+
+    The first `steps` steps are simulated with the true dynamics, the other steps with the model.
+    """
     (truth,) = disturbance.truths(task.plain.truth)
     count, states = len(task.plain.names), [x]
     for step in range(steps):

@@ -1,4 +1,7 @@
-"""Upper bounds on the robustness of plan prefixes, over all plans that continue a prefix."""
+"""Upper bounds on the robustness of plans of which only the first steps (a prefix) are known.
+
+The bound holds for every continuation. If it is negative, each plan with this prefix violates the formula.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,13 @@ BEYOND = "#beyond"
 
 
 def open_ended(formula: ir.Formula) -> ir.Formula:
-    """Return a formula whose robustness bounds that of `formula` over all continuations of known samples.
+    """Return a formula for the best robustness that `formula` can reach, given only its first samples.
 
-    The bound is an upper bound. At the samples after the known ones every predicate counts as true. The
-    caller supplies a column named `BEYOND`, which is positive at these samples and negative at the known
-    ones. `formula` must be in negation normal form, so that its robustness never decreases when a predicate
-    becomes true. The bound is negative exactly if the known samples already violate `formula`.
+    The robustness of the returned formula is an upper bound on that of `formula`, for all values of the later
+    samples. At these samples, every predicate counts as true. The signals must contain a column named
+    `BEYOND`, which is negative at the known samples and positive at the later ones. `formula` must be in
+    negation normal form, so that its robustness never decreases when a predicate becomes true. The bound is
+    negative exactly if the known samples already violate `formula`.
     """
     if isinstance(formula, ir.Predicate):
         return ir.BoolOp("or", (formula, ir.Predicate(ir.Signal(BEYOND), strict=True, guard=True)))
@@ -30,10 +34,10 @@ def open_ended(formula: ir.Formula) -> ir.Formula:
 
 
 def anchored(formula: ir.Formula) -> ir.Formula:
-    """Return a formula in which predicates on the initial state only count as true or false.
+    """Return a formula in which predicates on the initial state count as true or false, without a degree.
 
-    Example: in `a -> always b`, let `a` depend on the initial state alone. It is then the same for all plans.
-    So plans that violate the formula are compared by the robustness of `b`, not by that of `a`.
+    Example: in `a -> always b`, let `a` depend on the initial state alone. Then `a` is the same for all
+    plans. Plans that violate the formula are therefore compared by the robustness of `b`, not by that of `a`.
     """
     match formula:
         case ir.Predicate():
@@ -47,9 +51,9 @@ def anchored(formula: ir.Formula) -> ir.Formula:
 def robustness_until(
     formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor], last: int | Tensor
 ) -> Tensor:
-    """Upper bound on the robustness of formulas given the samples 0 to `last`, (batch,).
+    """Upper bound on the least robustness of `formulas`, if only the samples 0 to `last` are known: (batch,).
 
-    The bound holds for all continuations of these samples. The minimum over the formulas is returned.
+    The bound holds for all continuations of these samples.
 
     Args:
         formulas: formulas in negation normal form.
@@ -64,16 +68,16 @@ def robustness_until(
 
 
 def prefix_robustness(formulas: Sequence[ir.Formula], columns: Mapping[str, Tensor]) -> Tensor:
-    """Upper bound on the robustness of formulas given each prefix of a trace; the minimum over the formulas.
+    """Upper bound on the least robustness of `formulas`, given only the first samples of a trace.
 
     Args:
         formulas: the safety requirements.
         columns: name -> samples, (time, batch).
 
     Returns:
-        (time, batch). Entry k is the bound over all continuations of the samples 0 to k. So entries do not
-        increase over time. Predicates on the initial state decide whether a formula holds, but their values
-        do not enter the bound. Without formulas, all entries are +inf.
+        (time, batch). Entry k is the bound over all continuations of the samples 0 to k. So entries never
+        increase over time. A predicate on the initial state counts as true or false; its value does not enter
+        the bound. Without formulas, all entries are +inf.
     """
     like = next(iter(columns.values()))
     steps, batch = like.shape

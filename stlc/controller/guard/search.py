@@ -78,9 +78,9 @@ class StagedSearch:
 class RelaxedSearch:
     """Search of the guard "full" with robustness margins of safety requirements.
 
-    If no plan keeps the required margins, the safe plan with the largest margin is taken. Example: a rover
-    that is already too close to a wall may stay there. A plan that keeps the full margin for some steps and
-    then becomes unsafe would be worse.
+    If no plan keeps the required margins, the safe plan with the largest margin is taken. Example: a rover is
+    already closer to a wall than the margin allows. It may continue at this distance. A plan that keeps the
+    full margin for some steps and then becomes unsafe would be worse.
 
     Args:
         task: specification without margins, and system.
@@ -113,8 +113,9 @@ class RelaxedSearch:
 
         Returns:
             One plan per agent: the best plan of the stages if it keeps the margin, else the safe plan with
-            the largest margin found. If the present state itself lacks the margin, no plan can keep it. The
-            stages then search without margin, and a search for the largest margin starts from their plans.
+            the largest margin found. If the present state itself is nearer to a violation than the margin, no
+            plan can keep the margin. Then the stages (search methods) ignore the margin, and a search for the
+            largest margin starts from their plans.
         """
         plan = finite(plan.to(x.dtype), self.task)
         previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
@@ -139,13 +140,18 @@ class RelaxedSearch:
         return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
-        """Run the stages without margins for the agents whose present state lacks the margin.
+        """Run the stages (search methods) without margins for the agents in `lacking`.
 
-        A search for the largest margin then starts from the safe plans found. `lacking`: mask of the agents
-        whose present state lacks the margin, (agents,).
+        A search for the largest margin then starts from the safe plans found.
+
+        Args:
+            x: states, (agents, n).
+            plan: the policy's plans, (agents, T, m).
+            previous: remainders of the previous plans, (agents, T, m).
+            lacking: mask of the agents whose present state has less than the required margin, (agents,).
 
         Returns:
-            One plan per agent; the other agents get unjudged plans.
+            One plan per agent. Agents that are not in `lacking` get unjudged plans.
         """
         found = Candidates.unjudged(plan)
         rows = lacking.nonzero()[:, 0]
@@ -163,7 +169,7 @@ class RelaxedSearch:
 
         Args:
             found: plans of all agents; changed in place.
-            rows: indices of the agents to treat, (k,).
+            rows: indices of the agents for which to search, (k,).
             x: states of all agents, (agents, n).
             start: starting plans, (k, T, m).
 

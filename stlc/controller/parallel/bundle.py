@@ -192,9 +192,10 @@ def _ran(
 
 
 def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, str]:
-    """Wait for a process to end and return its standard output and standard error.
+    """Wait for `process` to end, and return its standard output and standard error.
 
-    It is polled in short steps, so that an interrupt by Ray is noticed.
+    The function checks at short intervals whether the process has ended, so that it notices an interrupt by
+    Ray.
 
     Raises:
         KeyboardInterrupt: the file `probe` has been deleted.
@@ -210,7 +211,7 @@ def _awaited(process: subprocess.Popen[str], probe: Path | None) -> tuple[str, s
 def claimed(count: int) -> Iterator[frozenset[int]]:
     """Context that reserves `count` cores that no other job on this machine uses; yields their numbers.
 
-    If fewer cores are free, the numbers of all cores are yielded.
+    If fewer cores are free, the numbers of all cores are yielded, and jobs share cores.
     """
     everything = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     try:
@@ -250,7 +251,11 @@ def mirrored(root: Path, path: str) -> Path:
 
 
 def pack(entries: dict[str, Path]) -> bytes:
-    """Pack files and folders into a compressed archive: name in the archive -> path. Links are followed."""
+    """Pack files and folders into a compressed archive, and return its bytes.
+
+    `entries`: name in the archive -> path of the file or folder. Symbolic links are replaced by their
+    targets.
+    """
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz", dereference=True, compresslevel=1) as archive:
         for name, path in entries.items():

@@ -82,7 +82,7 @@ class Ranks:
         return [total / self.size for total in self._reduced(values, dist.ReduceOp.SUM)]
 
     def any(self, flag: bool) -> bool:
-        """True on every rank if the flag is set on any rank."""
+        """True on every rank if `flag` is True on at least one rank."""
         return self._reduced([flag], dist.ReduceOp.MAX)[0] > 0.0
 
     def agree(self, value: float) -> float:

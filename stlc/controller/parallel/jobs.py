@@ -1,4 +1,4 @@
-"""Training runs in parallel, each in a process of its own; the failure of one does not affect the others."""
+"""Training runs in parallel, each in a process of its own; a run that fails does not affect the others."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Job:
     """A training job.
 
     Attributes:
-        name: identifies the job.
+        name: name by which the caller recognises the job.
         arguments: arguments of `stlc train`, without `--json`.
         inputs: input files and folders; they are sent to workers that do not share the file system.
         runs: folder on this machine in which the run is stored, even if another machine trains; None: the

@@ -1,8 +1,9 @@
-"""Gauss-Newton steps towards plans whose states meet conditions at given samples.
+"""Gauss-Newton steps that change a plan so that its states meet conditions at given samples.
 
-Each step linearises the predicted states of a plan and the conditions on them. Then it makes the smallest
-change of the controls for which the linearised conditions hold (a damped least-squares problem with bounds).
-The derivatives of the conditions are approximated by differences.
+Example: the condition `x > 1` at sample 5. Each step linearises the predicted states of a plan and the
+conditions on them. Then it makes the smallest change of the controls for which the linearised conditions hold
+(a damped least-squares problem with bounds). The derivatives of the conditions are approximated by
+differences.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ PROJECTIONS = 10
 class GaussNewton:
     """Gauss-Newton steps for plans of one task.
 
-    The distance of a state from a condition is measured to the boundary of the linearised condition. Each
-    state component is first divided by its `spread`, so that distances have no unit.
+    Each condition is linearised at each state. The distance of a state from a condition is the distance to
+    the nearest state at which the linearised condition just holds. Each state component is first divided by
+    its `spread`, so that distances have no unit.
 
     Attributes:
         spread: typical range of each state, (n,).
@@ -90,8 +92,8 @@ class GaussNewton:
             needed: True where a condition must hold at a sample, (B, conditions, T + 1).
 
         Returns:
-            The changed plans, (B, T, m); and for each plan before the change, the sum of the distances by
-            which its states missed the needed conditions, (B,).
+            The changed plans, (B, T, m); and the sum of the distances by which the states under each plan
+            missed the needed conditions before the change, (B,).
         """
         states = self.task.rollout(x0, plans)
         values, slopes = self._linear(states)
@@ -161,9 +163,10 @@ class GaussNewton:
         return self._pull(*each, columns).view(batch, count, -1)
 
     def _change(self, plans: Tensor, effect: Tensor, missing: Tensor) -> Tensor:
-        """Smallest change of plans, within the control bounds, after which each plan meets K conditions.
+        """Smallest change of each plan after which K linearised conditions hold, within the control bounds.
 
-        Controls that would leave their bounds are set to them; the other controls then make up for the rest.
+        A control that would leave its bounds is set to the nearest bound. The change of the other controls is
+        then computed again, to compensate for this.
 
         Args:
             plans: plans, (B, T, m).
@@ -202,11 +205,12 @@ def values_of(task: Task, conditions: Sequence[ir.Formula], states: Tensor) -> T
 
 
 def state_gradient(system: System) -> Pull:
-    """Return a function that differentiates weighted sums of predicted states with respect to plans.
+    """Return a function that computes the derivative of a weighted sum of predicted states.
 
-    The arguments of this function are initial states (B, n), plans (B, T, m), and the weight of every state
-    at every sample, (n, T + 1, B), all float64. It returns the derivative of the B weighted sums with respect
-    to the controls, (B, T, m). It runs in C if a compiler is installed.
+    The derivative is taken with respect to the controls of the plan. The arguments of the returned function,
+    all float64, are B initial states (B, n), B plans (B, T, m), and the weight of every state at every
+    sample, (n, T + 1, B). It returns one derivative per plan, (B, T, m). It runs in C if a compiler is
+    installed.
     """
     try:
         fixed = [timer.name for timer in system.timers]

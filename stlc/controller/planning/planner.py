@@ -309,7 +309,10 @@ class PlannerPolicy(Policy):
         return self._searched(x0, self._prepared[1], self._budget)
 
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans found by a short local search; the policy's planner is not used: (B, n) -> (B, T, m)."""
+        """Plans found by a short local search from each state: (B, n) -> (B, T, m).
+
+        The planner of this policy is not used here, because it would take too long.
+        """
         if self._short is None or self._short[0] is not self.task:
             self._short = self.task, planner_named("search", tries=SHORT).prepare(self.task)
         return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]

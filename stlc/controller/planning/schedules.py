@@ -1,8 +1,8 @@
-"""Schedules: random choices of the samples at which the parts of a formula shall hold.
+"""Schedules: random choices of the samples at which the parts of a formula must hold.
 
 A schedule selects one sample for every `eventually` and `until` of a specification, and one operand of every
-`or` of temporal formulas. Conditions on states remain, which must hold at known samples. A trajectory that
-meets them satisfies the specification.
+`or` of temporal formulas. After these choices, only conditions on the states at known samples are left. A
+trajectory that meets these conditions satisfies the specification.
 
 Example: for `eventually@[0 s, 9 s] x > 1`, one schedule is "x > 1 at 4 s".
 """
@@ -30,9 +30,9 @@ class GoalScheduler:
     """Generator of random schedules for given formulas.
 
     A formula that only compares the states of one sample is called a condition. Schedules leave out some
-    parts of the formulas: past operators, `freeze`, an `always` over a long window whose operand needs
-    choices, and comparisons that read other signals than states. Therefore a trajectory may meet a schedule
-    and still violate the formulas.
+    parts of the formulas: past operators; `freeze`; an `always` over a long window if it contains other
+    temporal operators; and comparisons that read signals other than states. Therefore a trajectory may meet a
+    schedule and still violate the formulas.
 
     Attributes:
         conditions: the conditions in the formulas. A conjunction is split into its parts.
@@ -81,7 +81,7 @@ class GoalScheduler:
         return self._opposed.get(self._numbers.get(condition, -1))
 
     def depth(self, formula: ir.Formula) -> int:
-        """Greatest number of nested operators in a formula for which a schedule chooses a sample.
+        """Greatest nesting depth of the operators in `formula` for which a schedule chooses a sample.
 
         Example: 2 for `eventually (p and eventually q)`.
         """
@@ -114,9 +114,9 @@ class GoalScheduler:
             yield formula
 
     def present(self, formula: ir.Formula) -> Iterator[ir.Formula]:
-        """Yield the conditions that must hold at a sample if a formula is to hold at the same sample.
+        """Yield the conditions that must hold at a sample if `formula` is to hold at this sample.
 
-        Conditions inside temporal operators, such as `eventually`, are not included.
+        Conditions at other samples, such as those inside `eventually`, are not included.
         """
         match formula:
             case ir.BoolOp("and", items):
@@ -214,18 +214,18 @@ class _Drawing:
                 self._always(right, first, np.where(released, chosen, last), on)
 
     def _chosen(self, formula: ir.Formula, allowed: Flags, on: Flags) -> tuple[Instants, Flags]:
-        """Choose for each schedule `on` one of its allowed samples at random.
+        """Choose at random, in each schedule selected by `on`, one of the allowed samples.
 
         If further choices are nested in the formula, early samples are more likely, so that time is left for
-        these choices: with n nested choices, the earliest of n + 1 random samples is taken.
+        these choices: with n choices in total, including this one, the earliest of n random samples is taken.
 
         Args:
             formula: formula for which the sample is chosen.
             allowed: True at the allowed samples, (schedules, T + 1).
-            on: schedules in which a sample is to be chosen, (schedules,).
+            on: True for the schedules in which a sample is to be chosen, (schedules,).
 
         Returns:
-            The samples, (schedules,); and True for the schedules `on` that have an allowed sample,
+            The chosen samples, (schedules,); and a mask of the schedules in `on` that had an allowed sample,
             (schedules,).
         """
         count = allowed.sum(1)
@@ -236,10 +236,10 @@ class _Drawing:
         return chosen, on & (count > 0)
 
     def _free(self, formula: ir.Formula) -> Flags:
-        """Mask of the samples at which a formula may hold, (schedules, T + 1).
+        """Mask of the samples at which `formula` can hold in each schedule, (schedules, T + 1).
 
-        A sample is excluded if the schedule already needs, at this sample, the negation of a condition that
-        the formula needs.
+        A sample is excluded if it would lead to a contradiction: the schedule already demands, at this
+        sample, the negation of a condition that `formula` needs.
         """
         free = np.ones((len(self.needed), self._last + 1), np.bool_)
         for part in self._scheduler.present(formula):
@@ -258,7 +258,10 @@ class _Drawing:
                 self.need(formula, first + k, on & (first + k <= last))
 
     def _hold(self, formula: ir.Formula, first: Instants, last: Instants, on: Flags) -> None:
-        """Make the schedules `on` demand that a condition holds from sample `first` to sample `last`."""
+        """Make the schedules selected by `on` demand that `formula` holds from `first` to `last`.
+
+        `formula`: a condition. `first`, `last`: indices of samples, one per schedule, (schedules,).
+        """
         within = (self._samples >= first[:, None]) & (self._samples <= last[:, None]) & on[:, None]
         for part in self._scheduler.parts(formula):
             if isinstance(part, ir.Truth):

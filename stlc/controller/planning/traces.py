@@ -1,4 +1,4 @@
-"""Initial states of plans from texts and traces, and plans as traces.
+"""Reading of initial states from texts and trace files, and conversion of plans to traces.
 
 A trace of plans holds predicted states and actions, with the specification that they were planned for.
 """

@@ -1,9 +1,9 @@
-"""Stages of guards, one per file; each declares to which guards it belongs and its position in their order.
+"""Stages of guards: methods to find a better plan, one method per file.
 
-A stage is one method to find a better plan. A guard runs its stages in order. Each stage proposes plans for
-the agents whose plan it may still improve. Of all plans of an agent, the highest-ranked one is kept
-(`stlc.controller.guard.candidates.rank`). A file holds a class `STAGE`; files whose names begin with `_` hold
-shared code.
+A guard runs its stages in order. Each stage declares the guards to which it belongs, and its position in the
+order. Each stage proposes plans for the agents whose plan it may still improve. Of all plans of an agent, the
+highest-ranked one is kept (`stlc.controller.guard.candidates.rank`). A file holds a class `STAGE`; files
+whose names begin with `_` hold shared code.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Tried:
     """Judged plans of a group of agents.
 
     Attributes:
-        rows: indices of the agents among the rejected ones, (k,).
+        rows: indices of these agents in `Rejected`, (k,).
         candidates: the plans with their verdicts, (k, choices).
     """
 

@@ -236,17 +236,17 @@ class GradientAscent:
         return each.detach().clone().numpy(), pull
 
     def _changed(self, plans: Numbers) -> Numbers:
-        """Plans (agents, k, T, m) and random perturbations of them, together (agents, NEAR, T, m)."""
+        """Return `plans`, (agents, k, T, m), and random perturbations of them: (agents, NEAR, T, m)."""
         agents, places, *shape = plans.shape
         changed = plans[:, :, None] + self._changes[: NEAR // places]
         changed[:, :, 1:] = self._bounded(changed[:, :, 1:])
         return changed.reshape(agents, -1, *shape)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Numbers:
-        """Random perturbations of plans, (count, T, m).
+        """Random perturbations that can be added to plans, (count, T, m).
 
-        Each changes its plan in a random interval of time, either by a constant or by white noise. The first
-        perturbation is zero.
+        A perturbation is nonzero only in a random interval of time. There it is either constant or white
+        noise. The first perturbation is zero.
         """
         steps, controls = self.task.horizon, len(self._low)
         begin = torch.randint(0, steps, (count, 1, controls), generator=generator).numpy()

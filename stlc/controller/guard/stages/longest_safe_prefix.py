@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 class LongestSafePrefix(GuardStage):
     """Guard stage: the plan with the longest safe prefix.
 
-    The safe prefix of a plan is the first part of its trajectory, before the first sample at which a
-    safety requirement (tagged `@safety`) is violated.
+    The safe prefix of a plan is the first part of its trajectory, before the first sample at which a safety
+    requirement (tagged `@safety`) is violated.
 
     Of plans with equally long safe prefixes, the plan with the highest robustness of the specification is
-    taken. Remaining ties are decided by the violation of the safety requirements, averaged over time: the
-    smaller one is better. The last criterion is the performance cost.
+    taken. If plans are still equal, the one with the smaller violation of the safety requirements, averaged
+    over time, is taken; then the one with the smaller performance cost.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}
@@ -41,14 +41,21 @@ class LongestSafePrefix(GuardStage):
         return ~best.is_safe
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """Return, for each agent in `rows`, the plan of prefix shooting with the longest safe prefix."""
+        """Return, for each agent in `rows`, the plan with the longest safe prefix.
+
+        The plans are those that the stage "prefix shooting" has judged; see `PrefixShooting`.
+        """
         found = Candidates.unjudged(rejected.best.plans)
         for tried in self._tried(rejected, rows, deadline):
             found.put(tried.rows, self._safest(rejected.x[tried.rows], tried.candidates))
         return found.of(rows)
 
     def _tried(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Iterator[Tried]:
-        """Plans of prefix shooting for the agents `rows`; plans that were not stored are computed again."""
+        """Yield the plans of the stage "prefix shooting" for the agents `rows`, group by group.
+
+        That stage stores its judged plans in `rejected.tried`. For agents whose plans it did not store, the
+        plans are computed and judged again.
+        """
         missing = torch.zeros(len(rejected.x), dtype=torch.bool, device=rows.device)
         missing[rows] = True
         for tried in rejected.tried:

@@ -32,9 +32,10 @@ class PrefixShooting(GuardStage):
     """Guard stage: the plan with the shortest prefix after which the policy can satisfy the specification.
 
     If no plan with a prefix of some length satisfies the specification, a safe plan with such a prefix is
-    accepted. Plans with prefixes of equal length are ordered by robustness, then by the performance cost of
-    the objective, then by closeness to the policy's plan. The cost matters if a deadline of the specification
-    cannot be met: then all plans have the same robustness.
+    accepted. Of the plans with prefixes of equal length, the one with the highest robustness is taken, then
+    the one with the least performance cost. If plans are equal in both, the plan with the policy's own first
+    actions is preferred. The cost matters if a deadline of the specification cannot be met: then all plans
+    have the same robustness.
     """
 
     turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}
@@ -81,9 +82,15 @@ class PrefixShooting(GuardStage):
     def candidates(
         self, rejected: Rejected, rows: Tensor, todo: Tensor, length: int, deadline: Deadline
     ) -> Iterator[tuple[Tensor, Candidates]]:
-        """Candidate plans with prefixes of `length` actions for the agents `rows[todo]`, group by group.
+        """Yield candidate plans with prefixes of `length` actions, for one group of agents at a time.
 
-        `rows`: indices of agents among the rejected ones. `todo`: indices of entries of `rows`.
+        Args:
+            rejected: agents whose plans the guard rejected.
+            rows: indices of agents in `rejected`.
+            todo: the entries of `rows` that need candidate plans, as indices into `rows`.
+            length: number of first actions (a prefix) that come from fixed control values; the policy plans
+                the rest.
+            deadline: once it is over, no further prefixes are tried.
 
         Yields:
             The part of `todo` that forms the group, (k,), and the candidate plans of its agents, (k,

@@ -49,11 +49,10 @@ class SampledPrefixes:
         self._most = max(grid.batch // max(len(self.heads), 1), 1)
 
     def finished(self, x: Tensor) -> Candidates:
-        """Let the policy plan from the states that the prefixes lead to, and judge the plans: (agents, k).
+        """Complete all prefixes to plans, and judge the plans: (agents, prefixes).
 
-        `x`: states in which the prefixes begin, (agents, n) float64.
-
-        The plans are computed in batches of at most `grid.batch` trajectories.
+        A prefix is applied from a state in `x`, (agents, n) float64; the policy plans from the state that the
+        prefix leads to. At most `grid.batch` trajectories are computed at a time.
         """
         return Candidates.concatenated([self._finished(part) for part in torch.split(x, self._most)])
 
