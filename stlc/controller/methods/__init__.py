@@ -1,8 +1,9 @@
-"""Training methods and planners, one per file, named as in `--method` and `train: {method: …}`.
+"""Training methods, one per file; for example, the file `guided.py` defines `--method guided`.
 
-A file holds an object `METHOD` of a subclass of `Method`; `stlc.registry.METHODS` finds it. The schema of
-system files, the command line and tables of options read the names from there, without loading torch. Code
-shared by several methods lies in files whose names begin with `_`.
+In a system file, `train: {method: guided}` selects the same method. Every file defines an object `METHOD`,
+an instance of a subclass of `Method`. `stlc.registry.METHODS` finds the files. It lists their names without
+loading torch, for the command line, the schema of system files and tables of options. Code shared by several
+methods lies in files whose names begin with `_`. The folder `planners` holds the planners.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 class Method(ABC):
     """Interface of a training method, or of planning without training.
 
-    It determines ("resolves") the options of a run from the command line, the system file and defaults. It
-    makes the learner (the state of a training run), and loads the policy of a run.
+    A method determines ("resolves") the options of a run from the command line, the system file and defaults.
+    It makes the learner (the state of a training run), and loads the policy of a run.
 
     Attributes:
         options: class of the resolved options. A method with options of its own declares a subclass of
@@ -57,8 +58,8 @@ class Method(ABC):
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:
         """Determine the options of a run, and return them.
 
-        The value of an option is the one that the user gave; if there is none, the one in the system file; if
-        there is none either, the default of the method.
+        A value that the user gave is taken first, then the value in the system file, then the default of the
+        method.
         """
         return base_config(task, config, kind=self.options)
 
@@ -99,10 +100,9 @@ class Validation:
             last search; None if no search has ended.
         failing: number of states from which the last search started; 0 without a search.
         repaired: number of states for which the last search found a satisfying plan.
-        explored: number of plans that exploration has found since the previous validation. Exploration is a
-            search that extends plan prefixes step by step. Of each plan found, the remainders after its first
-            steps are also tried as plans, from the states then reached; those that satisfy the specification
-            are counted too.
+        explored: number of satisfying plans that exploration has found since the previous validation.
+            Exploration is a search that builds plans by extending prefixes (first actions of plans). If the
+            remainder of a plan found satisfies the specification from a later state, it is counted too.
     """
 
     accuracy: float
@@ -114,12 +114,12 @@ class Validation:
 
     @classmethod
     def of(cls, judged: PlanVerdicts) -> Validation:
-        """Return a validation with the shares of satisfying plans in `judged`; there was no search."""
+        """Make the result of a validation without search, from the verdicts `judged` on the plans."""
         shares = satisfied(judged.requirements).double().mean(0)
         return cls(float(satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares))
 
     def mean(self, ranks: Ranks) -> Validation:
-        """Combine the validations of all ranks: shares are averaged, counts are added.
+        """Combine the results of all ranks: shares are averaged, counts are summed.
 
         All ranks (processes that train together) must call this at the same time.
         """
@@ -140,7 +140,7 @@ class Learner(ABC):
     """State of a training run; the training loop advances, validates and saves it step by step.
 
     A subclass supplies the steps, the policy and the contents of a checkpoint. Some subclasses also search
-    for better plans, concurrently with the steps, or explore (extend plan prefixes step by step). This class
+    for better plans, concurrently with the steps, or build plans by exploration (see `explore`). This class
     does neither.
 
     Attributes:
@@ -154,9 +154,9 @@ class Learner(ABC):
         generator: source of all random numbers of this rank (process).
         margin: robustness that training aims at (gamma of the objective).
         loss: loss of the last step; NaN before the first.
-        searches: whether a search for better plans runs concurrently with the steps.
-        searching: whether this search is running now.
-        solved: whether a search has found a satisfying plan.
+        searches: whether the learner searches for better plans, concurrently with the steps.
+        searching: whether such a search is running now.
+        solved: whether any search has found a satisfying plan.
         exhausted: whether exploration has found no plan, even with its largest effort.
     """
 
@@ -177,9 +177,9 @@ class Learner(ABC):
 
     @abstractmethod
     def advance(self) -> float:
-        """Make one step and return its loss.
+        """Make one training step and return its loss.
 
-        If the loss or its gradient is not finite, the step is not counted and NaN is returned.
+        If the loss or its gradient is not finite, NaN is returned, and `step` does not count the step.
         """
 
     @property
@@ -207,38 +207,39 @@ class Learner(ABC):
         return {"generator": self.generator.get_state()}
 
     def facts(self) -> dict[str, float | int]:
-        """Numbers that a checkpoint stores in addition to `tensors`."""
+        """Numbers that a checkpoint stores in addition to `tensors`, by name."""
         last = {"loss": self.loss} if math.isfinite(self.loss) else {}
         facts = {"step": self.step, "steps": self.steps, "margin": self.margin}
         return last | facts | {"next_look": self.next_validation}
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
+        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         self.step, self.steps = int(facts["step"]), int(facts["steps"])
         self.margin, self.next_validation = float(facts["margin"]), int(facts["next_look"])
         self.loss = float(facts.get("loss", math.nan))
         self.generator.set_state(tensors["generator"].cpu())
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Find the cause of a step whose loss or gradient was not finite on any of the ranks (processes).
+        """Find the cause of a step whose loss or gradient was not finite on at least one rank (process).
 
         Returns:
-            The error that describes the cause; and True if the weights before the step gave finite plans.
+            The error that describes the cause; and whether the weights before the step gave finite plans.
         """
         message = f"training diverged: the loss or its gradient is not finite at step {self.step}"
         return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), True
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Parts of the training, and for each the reason why it runs in torch; "" if it runs in C.
+        """For each part of the training, the reason why this part runs in torch; "" if it runs in C.
 
-        The parts are `verdicts` (of plans), `search` (for better plans), and `gradient` (of robustness).
+        The keys of the mapping are `verdicts` (on plans), `search` (for better plans), and `gradient` (of the
+        robustness).
         """
         return self.task.torch_reasons(self.device.type, searches=False, smooth=True)
 
     def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
         """Search for satisfying plans by exploration, if the last search found too few.
 
-        Exploration extends plan prefixes step by step. The method of this class does nothing.
+        Exploration builds plans by extending prefixes (first actions of plans). By default nothing is done.
 
         Returns:
             False if `stop` ended the exploration early, else True.
@@ -246,7 +247,7 @@ class Learner(ABC):
         return True
 
     def wait(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Wait for the end of the concurrent search; return False if `stop` ended the wait early."""
+        """Wait for the end of the concurrent search; return False if `stop` ended the wait, else True."""
         return True
 
     def close(self) -> None:  # noqa: B027

@@ -1,7 +1,6 @@
-"""Policies of actors (networks that choose one action per step).
+"""Policies that take their plans from an actor, a network that chooses one action per step.
 
-The plan of such a policy is the sequence of controls that the actor chooses in closed loop on the model of
-the system.
+The actor runs in closed loop on the model of the system. The sequence of its controls is the plan.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class ActorPolicy(Policy):
     Args:
         task: specification and system.
         actor: network from observations (B, k) float32 to controls (B, m) in physical units. The function
-            `observe` computes the observations.
+            `stlc.controller.problem.environments.observe` computes the observations.
     """
 
     def __init__(self, task: Task, actor: Callable[[Tensor], Tensor]) -> None:
@@ -56,7 +55,7 @@ class ActorPolicy(Policy):
 
     @torch.no_grad()
     def candidates(self, x0: Tensor) -> Tensor:
-        """One plan per state, (B, n) -> (B, 1, T, m) float64; the closed loop runs in C where possible."""
+        """One plan per state: (B, n) -> (B, 1, T, m) float64. The closed loop runs in C if possible."""
         system, x, actions = self.task.system, x0.double(), []
         low, high = system.control_low.to(x), system.control_high.to(x)
         native = self._native(system) if x0.device.type == "cpu" else None
@@ -81,7 +80,11 @@ class ActorLearner(Learner):
     """Reinforcement learning of an actor (a network that chooses one action per step)."""
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Mapping with the single key `verdicts`: the reason why plans are judged in torch; "" if in C."""
+        """Reason why plans are judged in torch; "" if they are judged in C.
+
+        Returns:
+            A mapping from `verdicts`, its only key, to the reason.
+        """
         reasons = super().torch_reasons()
         return {"verdicts": reasons["verdicts"]}
 
@@ -95,7 +98,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str
 def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
     """Restore an optimiser from the tensors that `optimizer_tensors` returned.
 
-    The names in `tensors` lack the prefix that `optimizer_tensors` added.
+    The caller has removed the prefix from the names: `adam.0.step` has become `0.step`, for example.
     """
     layout = optimizer.state_dict()
     for key, value in tensors.items():

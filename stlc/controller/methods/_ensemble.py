@@ -95,7 +95,7 @@ class Fit:
 
 
 class Ensemble(nn.Module):
-    """Ensemble of networks that predict the change of a state in one step, each as a Gaussian.
+    """Ensemble of networks; each predicts the change of a state in one step, as a Gaussian distribution.
 
     Inputs are states and controls; targets are the changes of the states in one step. The networks learn from
     different bootstrap samples. Inputs and targets are normalised, since the components of a state have
@@ -210,7 +210,8 @@ class Ensemble(nn.Module):
     def predictor(self) -> Predictor:
         """Make a predictor, which draws samples of the change of the state, without gradient.
 
-        It gets a copy of the present weights of the elites (networks with the least validation error).
+        The predictor holds a copy of the elites (networks with the least validation error): further training
+        of the ensemble does not change it.
         """
         return Predictor(self)
 
@@ -350,7 +351,7 @@ class _Best:
             errors: present validation errors, (E,).
 
         Returns:
-            Number of calls since a network last improved.
+            Number of calls of this method since any network last improved; 0 if one has improved now.
         """
         assert self._errors is not None
         better = errors < (1.0 - GAIN) * self._errors

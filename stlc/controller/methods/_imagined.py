@@ -39,7 +39,7 @@ class ModelConfig(ActorConfig):
 
     Attributes:
         networks: number of networks of the ensemble.
-        elites: number of networks, those with the least validation error, that are used for predictions.
+        elites: number of networks used for predictions: those with the least validation error.
         width: number of units per hidden layer.
         layers: number of hidden layers.
         model_lr: learning rate of the networks.
@@ -49,8 +49,8 @@ class ModelConfig(ActorConfig):
         model_patience: number of passes without improvement after which training of the networks ends; 0: all
             passes are made.
         model_held: share of the samples held out for validation of the networks.
-        growth: share by which the number of episodes has to grow before the networks are trained again (0.5:
-            by 50 %). 0: the networks are trained in every training step.
+        growth: share by which the number of episodes has to grow before the networks are trained again; 0.5
+            means 50 %, and 0 means that the networks are trained in every training step.
         first: number of episodes with random controls before the networks are trained for the first time.
         capacity: number of episodes that are stored; new ones replace the oldest.
     """
@@ -116,7 +116,7 @@ def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
 
 
 def step_rewards(task: Task, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
-    """Reward `task` (the one that the system file declares) of single steps, one number per step.
+    """Rewards of single steps, (…,), as the system file declares them (reward `task`).
 
     `…` in the shapes stands for any leading dimensions, which the result has too.
 
@@ -152,7 +152,7 @@ class Episodes:
     def add(self, states: Tensor, actions: Tensor, earned: Tensor) -> None:
         """Store episodes: `states` (N, T+1, n), `actions` (N, T, m), and their rewards `earned` (N, T).
 
-        If the memory is full, they replace the oldest episodes.
+        If the memory is full, the new episodes replace the oldest ones.
         """
         at = (self.total + torch.arange(len(states))) % len(self.states)
         self.states[at], self.actions[at], self.rewards[at] = states, actions, earned
@@ -180,9 +180,9 @@ class Episodes:
         return found | {"episodes.total": torch.tensor(self.total)}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the episodes from `tensors`, a result of the method of the same name.
+        """Restore the episodes from `tensors`, which the method of this name returned.
 
-        The names of the tensors here lack the prefix `episodes.`.
+        The caller has removed the prefix `episodes.` from the names of the tensors.
         """
         self.total, self.count = int(tensors["total"]), len(tensors["states"])
         for name in ("states", "actions", "rewards"):
@@ -345,7 +345,7 @@ class ModelLearner(Learner):
         return super().facts() | own | error
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
+        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         self.episodes.restore(below(tensors, "episodes"))
         self.ensemble.load_state_dict(below(tensors, "ensemble"))

@@ -71,7 +71,11 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
         return self.observed()
 
     def observed(self) -> np.ndarray[Any, Any]:
-        """Normalised observations of the present states, (N, k); correct only when the episodes begin."""
+        """Normalised observations of the present states at the beginning of the episodes, (N, k).
+
+        Later they would be wrong, since an observation contains the elapsed share of the episode, which is
+        taken as 0 here.
+        """
         return self._seen(self.environments.observe(self.environments.states, 0))
 
     def step_async(self, actions: np.ndarray[Any, Any]) -> None:
@@ -83,8 +87,8 @@ class EpisodesEnv(VecEnv):  # type: ignore[misc]
 
         Returns:
             Normalised observations (N, k); rewards (N,); flags (N,), True for episodes that ended; and one
-            dictionary per episode. It is empty, unless the episode ended: then `terminal_observation`, (k,),
-            is the last observation before the restart.
+            dictionary per episode. The dictionary of an episode that ended has the entry
+            `terminal_observation`, (k,): the last observation before the restart. The others are empty.
         """
         result = self.environments.step(self._actor.controls(self._actions))
         done = result.done.numpy()
@@ -156,7 +160,7 @@ class RandomState:
         return {"torch": self.torch, "numpy": torch.tensor([*keys.tolist(), position])}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore both states from `tensors`, a result of the method of the same name."""
+        """Restore both states from `tensors`, which the method of this name returned."""
         *keys, position = tensors["numpy"].tolist()
         self.torch = tensors["torch"]
         self.numpy = ("MT19937", np.array(keys, np.uint32), position, 0, 0.0)
@@ -291,7 +295,7 @@ class SacLearner(ActorLearner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
+        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         model, buffer = self.model, self.model.replay_buffer
         self.actor.load_state_dict(below(tensors, "policy"))

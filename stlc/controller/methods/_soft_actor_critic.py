@@ -192,7 +192,7 @@ class SoftActorCritic(nn.Module):
         return torch.tanh(raw), (normal - squashed).sum(-1)
 
     def _values(self, critics: BatchedMlp, seen: Tensor, actions: Tensor) -> Tensor:
-        """Values of normalised observations (B, k) and actions (B, m) by both critics: (2, B)."""
+        """Values that the two critics give to normalised observations (B, k) and actions (B, m): (2, B)."""
         values: Tensor = critics(torch.cat((seen, actions), -1).expand(2, -1, -1))[..., 0]
         return values
 
@@ -204,7 +204,7 @@ class SoftActorCritic(nn.Module):
         return found
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore weights and optimisers from `tensors`, a result of the method of the same name."""
+        """Restore weights and optimisers from `tensors`, which the method of this name returned."""
         self.load_state_dict(below(tensors, "sac.weights"))
         for name, optimizer in self.optimizers.items():
             restore_optimizer(optimizer, below(tensors, f"sac.{name}"))

@@ -32,7 +32,7 @@ class Gradient(NetworkMethod):
         return replace(found, performance=1.0, samples=task.system.decl.train.samples or 0)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Objective of Meng and Fan (2023); it rewards robustness up to gamma, given in the system file."""
+        """Objective of Meng and Fan (2023), whose margin gamma is set in the system file."""
         return paper_objective(learner.task)
 
 

@@ -46,10 +46,10 @@ class Guided(NetworkMethod):
         return replace(found, hard=found.batch, varied=True)
 
     def objective(self, learner: Trainer) -> Objective:
-        """Objective on exact robustness (not smoothed); it rewards robustness up to `learner.margin`.
+        """Objective on exact robustness; robustness above `learner.margin` does not reduce the loss.
 
-        The search for plans can reach this margin from most states. The loss of a plan far below it grows
-        only slowly, so that states without a satisfying plan do not dominate.
+        The search for plans can reach this margin from most states. Far below the margin the loss grows only
+        slowly, so that states without a satisfying plan do not dominate.
         """
         return guided_objective(
             learner.margin, slope=learner.config.slope, performance_weight=learner.config.performance

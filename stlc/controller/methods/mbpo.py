@@ -1,10 +1,11 @@
 """MBPO: model-based policy optimisation (Janner, Fu, Zhang and Levine, NeurIPS 2019).
 
-An ensemble learns the system from episodes of the policy. Short imagined episodes (predicted by the ensemble)
-begin at observed states. Soft actor-critic learns from their transitions, together with a few observed ones.
-The reward of imagined steps is not learnt, but computed by the task. If an imagined
-episode reaches the last step of a plan, the robustness of the whole trajectory is computed: of the observed
-states up to the beginning of the imagined episode, followed by the imagined states.
+An ensemble of networks learns the system from episodes of the policy. Short imagined episodes, which the
+ensemble predicts, begin at states that were observed in these episodes. Soft actor-critic learns from the
+imagined transitions, and from a few observed ones. The rewards of imagined steps are computed from the task,
+not learnt. The rewards `robustness` and `accuracy` need a whole trajectory. They are given if an imagined
+episode reaches the last step of a plan. The trajectory then consists of the observed states before the
+imagined episode, followed by the imagined states.
 
 Meng and Fan (2023) compare with MBPO under these settings: `environments=1 growth=0 imagined=400 longest=15
 growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256 temperature=0.2`, and
@@ -44,16 +45,16 @@ class MbpoConfig(ModelConfig):
 
     Attributes:
         imagined: number of imagined episodes per observed step.
-        shortest: number of steps of an imagined episode at first.
-        longest: number of steps of an imagined episode in the end.
-        growing_from: training step from which this number of steps grows linearly.
-        growing_to: training step at which this number reaches `longest`.
+        shortest: length of imagined episodes at the beginning of training, in steps.
+        longest: length of imagined episodes at the end of training, in steps.
+        growing_from: training step from which the length grows linearly from `shortest`.
+        growing_to: training step at which the length reaches `longest`.
         observed: share of observed transitions in a batch; the others are imagined.
         updates: number of gradient steps of actor and critics for every observed step.
         critic_width: number of units per hidden layer of actor and critics.
         discount: discount factor of the return.
         follow: share by which the target critics move towards the critics in a gradient step.
-        temperature: weight of the entropy; 0: learnt.
+        temperature: weight of the entropy; 0: the weight is learnt.
     """
 
     imagined: float = 10.0
@@ -167,12 +168,12 @@ class MbpoLearner(ModelLearner):
         )
 
     def _drawn(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw random observed steps: index of the episode and index of the step in it, (count,) each."""
+        """Draw random observed steps; return the indices of their episodes and the steps, (count,) each."""
         episodes = torch.randint(self.episodes.count, (count,), generator=self.generator)
         return episodes, torch.randint(self.task.horizon, (count,), generator=self.generator)
 
     def _mixed(self, imagined: Batch) -> Batch:
-        """Draw a batch: a share `config.observed` of observed transitions, the rest from `imagined`."""
+        """Draw a batch: the share `config.observed` from observed transitions, the rest from `imagined`."""
         size = self.config.batch
         real = min(size, round(self.config.observed * size))
         rows = torch.randint(len(imagined.rewards), (size - real,), generator=self.generator)
@@ -254,7 +255,7 @@ class MbpoLearner(ModelLearner):
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
+        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         self.actor_critic.restore(tensors)
 

@@ -53,7 +53,8 @@ class PetsConfig(ModelConfig):
     Attributes:
         ahead: number of steps that a search covers. If it is positive, a search is made for every step of the
             plan, and only the first control of its result is used. If it is 0, one search covers the whole
-            plan. The same holds for the rewards `robustness` and `accuracy`, which need a whole episode.
+            plan. For the rewards `robustness` and `accuracy`, which need a whole episode, `ahead` counts
+            as 0.
         piece: number of steps over which a control is constant.
         population: number of control sequences in a round.
         rounds: number of rounds of the cross-entropy method.
@@ -243,7 +244,10 @@ class Pets(Method):
     learns = PetsLearner
 
     def resolve(self, task: Task, config: TrainConfig) -> PetsConfig:
-        """Determine the options; a validation judges plans from few states, since planning takes long."""
+        """Determine the options.
+
+        A validation judges plans from fewer states than in other methods, since planning takes long.
+        """
         found = base_config(task, config, kind=PetsConfig)
         return replace(found, hidden=(200,) * 4, plans=1, every=EVERY, pool=POOL)
 

@@ -80,7 +80,7 @@ def planner_of(name: str, options: Mapping[str, str]) -> Planner:
 
     Raises:
         UsageError: U101, there is no such planner or option; or `name` is `policy`, the planner that takes
-            the plans of a trained policy. The run of this policy is to be simulated instead.
+            the plans of a trained policy. In closed loop, simulate the run of this policy instead.
     """
     if name == "policy":
         raise usage(

@@ -1,8 +1,9 @@
 """Proximal policy optimisation over batched episodes (Schulman et al., arXiv 1707.06347, 2017).
 
-One step of the training plays one episode in every environment and then passes several times over the
-transitions, with the clipped surrogate objective (Eq. 7), advantages by generalised estimation (Schulman et
-al., arXiv 1506.02438, Eq. 16), and an entropy bonus. Observations, returns and advantages are normalised.
+One step of the training plays one episode in every environment. Then it passes several times over the
+transitions. The loss is the clipped surrogate objective (Eq. 7) with an entropy bonus. Advantages are those
+of generalised advantage estimation (Schulman et al., arXiv 1506.02438, Eq. 16). Observations, returns and
+advantages are normalised.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ class PpoConfig(ActorConfig):
         ratio: bound on the change of the probability ratio (epsilon of Schulman et al. 2017).
         entropy: weight of the entropy bonus.
         deviation: initial standard deviation of the controls before the tanh.
-        correlation: correlation of the exploration noise of successive steps. White noise would hardly move
-            states that integrate the controls (autoregressive policies: Korenkevych et al., IJCAI 2019).
+        correlation: correlation between the exploration noises of successive steps (Korenkevych et al., IJCAI
+            2019). Uncorrelated noise averages out in states that integrate the controls.
     """
 
     environments: int = ENVIRONMENTS
@@ -158,7 +159,7 @@ class ActorCritic(nn.Module):
         return self.controls(mean)
 
     def judged(self, seen: Tensor, noise: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithm of the probability density of the controls `raw`, and the critic's values, (B,) each.
+        """Log probability density of the controls `raw`, and the critic's values of `seen`, (B,) each.
 
         Args:
             seen: normalised observations, (B, k).
@@ -362,8 +363,9 @@ class PpoLearner(ActorLearner):
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which training resumes exactly: random numbers, network, optimiser.
 
-        All ranks (processes that train together) must call this at the same time. Only on the first rank
-        does the result contain the random numbers of all ranks; it is the one to be stored.
+        All ranks (processes that train together) must call this at the same time. The result on the first
+        rank contains the random numbers of all ranks, and is stored in the checkpoint. The results on the
+        other ranks contain only their own random numbers.
         """
         own = super().tensors()
         found = dict(own)
@@ -373,7 +375,7 @@ class PpoLearner(ActorLearner):
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
+        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         own = {} if self.ranks.first else {"generator": tensors[f"rank{self.ranks.rank}.generator"]}
         super().restore(tensors | own, facts)
         self.network.load_state_dict(below(tensors, "network"))

@@ -32,11 +32,11 @@ VARIATIONS = (0.01, 0.05)
 
 
 def variations(task: Task) -> Tensor:
-    """Small changes of plans, in physical units: (V, T, m), float64.
+    """Small changes to be added to plans, in physical units: (V, T, m), float64.
 
-    Each changes a single control by the same amount at every step, or by an amount that falls like half a
-    cosine from its value at the first step to its negative at the last one. V = 8 m: both signs and all
-    sizes of `VARIATIONS`.
+    Each changes a single control. The change is the same at every step, or falls like half a cosine from an
+    amount at the first step to its negative at the last step. Each of the m controls has V / m = 8 changes:
+    these two shapes, with two sizes (`VARIATIONS`) and both signs.
     """
     steps, controls = task.horizon, task.system.control_low.shape[0]
     half = 0.5 * (task.system.control_high - task.system.control_low).to("cpu", torch.float64)
@@ -124,7 +124,7 @@ class ModelRollout(Policy):
     The plan consists of the actions that the actor chooses in closed loop on the model of the system.
 
     Args:
-        actor: the actor: states (B, n), timers included, -> actions (B, m) in physical units.
+        actor: function from states (B, n), which include timers, to actions (B, m) in physical units.
         task: specification and system.
     """
 
@@ -149,7 +149,7 @@ class PlanNetwork(nn.Module):
 
     Attributes:
         plans: number of plans.
-        changes: changes of plans that `BestOfKPolicy` tries, (V, T, m) float64; V is 0 without variations.
+        changes: changes that `BestOfKPolicy` adds to a plan that fails, (V, T, m) float64; V may be 0.
         mirror: the system's mirror symmetry; None if the system has none or the network does not use it.
         centre: mean of the observations, (k,), by which the network's inputs are centred.
         spread: standard deviation of the observations, (k,), by which the network's inputs are divided.
@@ -187,8 +187,8 @@ class PlanNetwork(nn.Module):
     def normalise(self, x0: Tensor) -> None:
         """Set `centre` and `spread` to mean and standard deviation of the observations of states (n, dim).
 
-        For timers, both are computed from the range of the timer. The states would give too small values:
-        early in the training, missions end soon, so late times do not occur.
+        For timers, both are computed from the range of the timer instead. Early in the training, missions end
+        soon, so the states `x0` contain no late times.
         """
         observed = self._task.system.observe(self._folded(x0)[0])
         centre, spread = observed.mean(0), observed.std(0)

@@ -1,9 +1,9 @@
-"""Episodes of a task on its model, in one batch: environment for learners that choose one action per step.
+"""Episodes of a task, simulated in one batch, for learners that choose one action per step.
 
-An episode begins at a random initial state and has as many steps as a plan. There are three rewards, compared
-by Meng and Fan (2023). `task` (RL_R) is the reward that the system file declares for every step. The others
-are given once, at the end of an episode: `robustness` (RL_S) is its robustness; `accuracy` (RL_A) is positive
-if it satisfies the specification, else 0.
+An episode begins at a random initial state and has as many steps as a plan. There are three rewards, which
+Meng and Fan (2023) compare. `task` (RL_R) is the reward that the system file declares for every step. The
+others are given once, at the end of an episode. `robustness` (RL_S) is the robustness of the episode.
+`accuracy` (RL_A) is positive if the episode satisfies the specification, else 0.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 HINT = "--system FILE"
-"""What to do if no system is named, on most command lines."""
+"""Advice that most commands print if no system is named."""
 
 
 def load_task(

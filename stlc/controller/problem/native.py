@@ -76,7 +76,7 @@ class NativeJudge:
     def of(
         cls, system: System, rules: Sequence[CompiledRequirement], end: End = "strict"
     ) -> NativeJudge | None:
-        """Build the kernel for a system and requirements; None if there is no C code or compiler for it."""
+        """Build the kernel for a system and requirements; None without a compiler or a C form of them."""
         try:
             library = load(emit(motion_of(system), [rule.formula for rule in rules], end))
         except Untranslatable:
@@ -161,7 +161,7 @@ class NativeGradient:
         judge: NativeJudge | None,
         end: End = "strict",
     ) -> NativeGradient | None:
-        """Build the kernel for a system and requirements; None if there is no C code or compiler for it."""
+        """Build the kernel for a system and requirements; None without a compiler or a C form of them."""
         if judge is None:
             return None
         fixed = [timer.name for timer in system.timers]
@@ -229,7 +229,7 @@ class NativeStep:
 
     @classmethod
     def of(cls, system: System, *, rewarded: bool) -> NativeStep | None:
-        """Build the functions for a system; None if there is no C code or compiler for it.
+        """Build the functions for a system; None without a compiler or a C form of the system.
 
         Raises:
             UsageError: U101, `rewarded` is True, but the system file declares no reward.

@@ -72,7 +72,7 @@ class PlanVerdicts:
         )
 
     def put(self, index: Tensor, other: PlanVerdicts) -> PlanVerdicts:
-        """These verdicts, with those on the plans with indices `index`, (k,), replaced by `other`."""
+        """Copy of these verdicts, in which `other` replaces those on the plans with indices `index`, (k,)."""
         columns = {
             name: column.index_copy(1, index, other.columns[name]) for name, column in self.columns.items()
         }
@@ -224,9 +224,10 @@ class Task:
         return NativeGradient.of(self.system, self.rules, self.native, self.compiled.end)
 
     def torch_reasons(self, device: str, *, searches: bool, smooth: bool) -> Mapping[str, str]:
-        """Parts of a training run, and for each the reason why it uses torch; "" if it runs in C.
+        """For each part of a training run, the reason why this part runs in torch; "" if it runs in C.
 
-        The parts are `verdicts` (of plans), `search` (for better plans), and `gradient` (of robustness).
+        The keys of the mapping are `verdicts` (on plans), `search` (for better plans), and `gradient` (of the
+        robustness).
 
         Args:
             device: type of the torch device.

@@ -83,7 +83,7 @@ class TimeBudget:
 
     Attributes:
         now: function that reads the clock, in seconds.
-        started: clock reading at the start, reduced by the time that a resumed run took before.
+        started: clock reading at the start; in a resumed run, less the time that the run took before.
         allowed: the user's budget in seconds; 0: unlimited.
         seconds: part of the budget that is available to the training.
     """
@@ -188,7 +188,7 @@ class StepSchedule:
         return self.plannings[-1].steps
 
     def at(self, step: int) -> int:
-        """Total number of steps of the run that is planned once `step` steps are made."""
+        """Total number of steps that was planned for the run when `step` steps had been made."""
         return [each.steps for each in self.plannings if each.step <= step][-1]
 
 
@@ -236,19 +236,19 @@ class Pace:
             self.searched(step, 0.0)
 
     def searched(self, step: int, waited: float) -> None:
-        """Record that the concurrent search ended at `step`, after a wait of `waited` seconds for it."""
+        """Record that the search had ended by `step`, and that training waited `waited` seconds for it."""
         self._apart += waited
         if self._running and self._last_validation is not None and self.per_step > 0.0:
             self._search = step - self._last_validation + waited / self.per_step
         self._running = False
 
     def saved(self, seconds: float) -> None:
-        """Record the duration of a checkpoint."""
+        """Record that writing a checkpoint took `seconds`."""
         self._apart += seconds
         self._since_validation += seconds
 
     def validated(self, step: int, seconds: float) -> None:
-        """Record the duration of a search round at `step`, which has started a search."""
+        """Record that a search round at `step` took `seconds`, and that its search, if any, runs now."""
         self.saved(seconds)
         if self.per_step > 0.0:
             self._rounds.append(self._since_validation / self.per_step)

@@ -148,7 +148,7 @@ def _damaged(folder: Path, why: str) -> Diagnostic:
 
 
 def _shown(folder: Path) -> str:
-    """The folder as printed in messages."""
+    """Path of the folder `folder`, as messages print it."""
     return f"{RunDir(folder.parent).shown}/{folder.name}"
 
 
@@ -158,6 +158,6 @@ def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:
 
 
 def below(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    """Tensors whose names begin with `prefix.`; in the result, the names lack this prefix."""
+    """Tensors whose names begin with `prefix.`; this prefix is removed from the names."""
     start = prefix + "."
     return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}

@@ -21,7 +21,7 @@ ENGINE_VERSION = 4
 """Version of the training engine; results of older versions are recomputed."""
 
 DRIVES = 400
-"""Maximum number of closed-loop runs per guard after training."""
+"""Default maximum number of closed-loop runs after training, for each kind of guard."""
 HELD_OUT = 5000
 HELD_OUT_SEED = 981_273
 """Seed of the held-out states: used for the final evaluation only, never during training or tuning."""
@@ -29,7 +29,7 @@ HELD_OUT_SEED = 981_273
 MISSION_HOLD = 0.7
 """Share of steps at peak learning rate on missions, whose training states change as the policy improves."""
 MISSION_MOST = 128
-"""Maximum number of hard states per search round on missions, where they are often infeasible and alike."""
+"""Maximum number of hard states per search round on missions, where many hard states are similar."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +66,8 @@ class TrainConfig:
         lr: peak learning rate.
         batch: number of newly drawn states per step.
         held_out: number of initial states of the final evaluation, on which no policy is trained.
-        drives: maximum number of closed-loop simulations per guard (check of plans at run time) after the
-            training; 0: none.
+        drives: maximum number of closed-loop simulations after the training, for each kind of guard (a guard
+            checks plans at run time); 0: none.
         planner: planner of the method `plan`, with its options.
         reward: name of the reward, for a method that learns from rewards; None leaves the choice to the
             method.
@@ -128,7 +128,8 @@ class ResolvedConfig:
         samples: size of a fixed training set; 0: fresh states in every step.
         clock: clock of budgets and recorded times: `wall` or `processor`.
         ranks: number of processes that train together, each with its own batch.
-        drives: maximum number of closed-loop simulations per guard after the training.
+        drives: maximum number of closed-loop simulations after the training, for each kind of guard (a guard
+            checks plans at run time).
     """
 
     method: str

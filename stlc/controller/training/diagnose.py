@@ -74,7 +74,7 @@ class TrainingStep:
     def of(
         cls, network: PlanNetwork, objective: Objective, x0: Tensor, number: int, task: Task
     ) -> TrainingStep:
-        """Training step that judges all plans that the network proposes for the states `x0`, (B, n)."""
+        """Make the training step number `number`, on all plans that `network` proposes from `x0`, (B, n)."""
         with torch.no_grad():
             plans = network(x0)
         return cls(task, objective, x0.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1), number)
@@ -162,7 +162,7 @@ def _robustness(step: TrainingStep) -> StlcError | None:
 
 
 def _cost(step: TrainingStep) -> StlcError | None:
-    """Error that names a performance term whose value or gradient is not finite; None if all are."""
+    """Error that names a performance term whose value or gradient is not finite; None if there is none."""
     declared = step.task.system.decl
     for term in declared.objective.terms:
         alone = replace(declared, objective=replace(declared.objective, terms=(term,)))
@@ -256,13 +256,14 @@ TRIES = 4000
 
 
 def conflict(task: Task, enough: Stop = never) -> Diagnostic:
-    """Diagnostic R404, which names requirements that no plan was found to satisfy together.
+    """Find requirements that seem to conflict; return the diagnostic R404, which names them.
 
-    If bounds prove that no plan satisfies some requirement, the first such requirement is named. Otherwise
-    the requirements are tested one after the other. In a test, a search looks for a plan that satisfies the
-    remaining requirements except the tested one. If it finds none, the tested requirement is removed, because
-    the others already conflict. The requirements that remain after all tests are named. The tests end early
-    once `enough` returns True.
+    Requirements seem to conflict if no plan was found that satisfies all of them. If bounds prove that no
+    plan satisfies some requirement, the first such requirement is named. Otherwise the requirements are
+    tested one after the other. In a test, a search looks for a plan that satisfies the remaining requirements
+    except the tested one. If the search finds none, the tested requirement is removed, because the others
+    already conflict. The requirements that remain after all tests are named. The tests end early once
+    `enough` returns True.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:
@@ -383,7 +384,7 @@ def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:
     """Bounds on the states that any controls can reach from state `x`, (n,).
 
     Returns:
-        For each instant 0 to T, the known bounds by name of the state.
+        For each instant from 0 to T, the known bounds: name of a state -> bounds.
     """
     step, system = task.system.exact_step, task.system
     low, high = system.control_low.tolist(), system.control_high.tolist()

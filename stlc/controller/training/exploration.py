@@ -55,9 +55,9 @@ EFFORTS = (8, 24, 72)
 USUAL = 30
 """Plan length in steps to which `EFFORTS` refers; the cost of a sweep grows with its square."""
 BATCH = 8
-"""Sweeps from one start before the next start's turn."""
+"""Number of sweeps from one initial state before it is the next state's turn."""
 TAILS = 8
-"""Number of instants of a plan from which on its remainder is tried as a further plan."""
+"""Number of instants of a plan; the remainder after each of them is tried as a further plan."""
 RAISED = 250
 """Generations of the local search that increases the margin of a found plan."""
 
@@ -224,7 +224,7 @@ class Exploration:
     def _raised(self, x: Tensor, plan: Tensor, spare: float) -> Tensor:
         """Improve a plan (T, m) by local search until its robustness is `spare`.
 
-        Without a native kernel the plan is returned unchanged.
+        Without a native kernel (compiled code) the plan is returned unchanged.
         """
         if self.task.native is None:
             return plan
@@ -271,7 +271,7 @@ class Exploration:
         return self._layer(np.concatenate((states, after[:, 1:]), 1), np.concatenate((before, piece), 1))
 
     def _layer(self, states: Numbers, plans: Numbers) -> Layer:
-        """Make a layer of the given prefixes that may still satisfy the specification.
+        """Make a layer from those of the given prefixes that may still satisfy the specification.
 
         A prefix is a sequence of the first actions of a plan.
 
@@ -299,7 +299,7 @@ class Exploration:
 
         Args:
             states: trajectories, (rows, samples, n).
-            end: `lower` or `upper` bounds, or `strict`: the robustness itself, for whole trajectories.
+            end: `lower` or `upper` for these bounds; `strict` for the exact robustness of whole trajectories.
         """
         if not len(states):
             return np.empty((0, len(self.pieces)))

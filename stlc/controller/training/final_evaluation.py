@@ -86,7 +86,9 @@ class FinalEvaluation:
         return simulation_reserve(self.time.seconds) if self.config.drives else 0.0
 
     def of(self, policy: Policy, steps: int) -> TrainingOutcome:
-        """Evaluate a policy after `steps` training steps, and write the result into the run's folder.
+        """Evaluate a trained policy, write the result into the run's folder, and return it.
+
+        `steps`: number of training steps made.
 
         The status of the run becomes `finished`.
         """

@@ -1,4 +1,4 @@
-"""Creation of a run's folder, with copies of its inputs, its options, versions and the machine."""
+"""Creation of a run's folder: copies of its inputs, and a record of options, versions and machine."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
 """Training state of a plan network: gradient steps, exploration, validation, checkpoint contents.
 
-Search and distil: every few dozen steps the policy's plans from new states are judged, failing plans are
-repaired by a search that starts from them, and repaired plans are imitated for as long as the policy fails at
-their state. Each gradient step uses newly drawn (fresh) states and states at which the policy failed before
-(hard states). The network proposes several plans per state, of which the best one is trained (winner takes
-all), with a small weight on the mean loss of all plans, so that none stays untrained.
+Every few dozen steps the policy's plans from newly drawn states are judged. In the method `guided`, a search
+starts from the plans that fail, and tries to repair them. The network imitates a repaired plan for as long as
+its own plans from the same state fail. Each gradient step uses newly drawn (fresh) states, and states at
+which the policy failed before (hard states). The network proposes several plans per state. Mainly the best of
+them is trained (winner takes all). The mean loss of all plans has a small weight, so that no plan stays
+untrained.
 """
 
 from __future__ import annotations
@@ -58,9 +59,9 @@ They are: states for the margin, states per search round, and plans tried per st
 BARREN = 0.05
 """Share of failing states solved by local search below which exploration is used too."""
 LEARNT = 0.5
-"""Accuracy on fresh states from which on exploration is not used."""
+"""Accuracy on fresh states at and above which exploration is not used."""
 NEAREST = 0.75
-"""Share of the states of a search round that are those whose plans fail by the least robustness."""
+"""Share of the states of a search round that are chosen because their plans fail by the least amount."""
 COUNTS = ("accuracy", "solved", "barren", "effort", "failing")
 """Facts of which every rank (process) has its own, in the order in which a checkpoint stores them."""
 EXPLORED = 4
@@ -154,7 +155,7 @@ class Trainer(Learner):
         return self.buffer.count > 0
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """Reasons why parts of the training run in torch: name of the part -> reason; "" if it runs in C."""
+        """For each part of the training, the reason why this part runs in torch; "" if it runs in C."""
         smooth = self.objective.smoothing is not None
         return self.task.torch_reasons(self.device.type, searches=self.searches, smooth=smooth)
 
@@ -163,7 +164,7 @@ class Trainer(Learner):
         return self.repairing is None or self.repairing.result(stop) is not None
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Find the cause of a step whose loss or gradient was not finite on any of the ranks (processes).
+        """Find the cause of a step whose loss or gradient was not finite on at least one rank (process).
 
         Returns:
             The error that describes the cause, and whether the weights before the step gave finite plans.
@@ -238,8 +239,8 @@ class Trainer(Learner):
     def _to_repair(self, rho: Tensor, failing: Tensor) -> Tensor:
         """Choose the failing states of a search round: those nearest to success, and some of the others.
 
-        A search repairs a plan that nearly satisfies the specification far more often than one that violates
-        it by much, and many of the latter start from infeasible states.
+        A search is far more likely to repair a plan that nearly satisfies the specification. Plans that
+        violate the specification by much often start from states without any satisfying plan.
 
         Args:
             rho: robustness of the policy's plans, (B,).
@@ -257,7 +258,7 @@ class Trainer(Learner):
         return torch.cat((first, rows[~chosen[rows]]))[:most]
 
     def _nearest(self, failing: int) -> int:
-        """Number of states of a search round that are chosen by their robustness, out of `failing` states."""
+        """Number of states that a search round chooses by their robustness, out of `failing` states."""
         most = self._effort[0]
         return failing if failing <= most else math.ceil(NEAREST * most)
 
@@ -271,7 +272,7 @@ class Trainer(Learner):
 
     @property
     def _effort(self) -> tuple[int, int]:
-        """Maximum number of failing states per search round, and evaluations per state."""
+        """Maximum number of failing states in a search round, and of plans judged for each of them."""
         native = self.task.native is not None
         return (self.config.most, THOROUGH) if native else (min(self.config.most, TORCH_MOST), TORCH_TRIES)
 
@@ -332,7 +333,8 @@ class Trainer(Learner):
         """Find the best of the proposed plans (B, plans, T, m) of each state.
 
         Returns:
-            Index of the best plan, (B,), and whether it or another one satisfies the specification, (B,).
+            Index of the best plan, (B,); and whether any of the plans satisfies the specification, (B,). If
+            there is one plan per state and `config.hard` is 0, nothing is judged: all are 0 and False.
         """
         batch, count = plans.shape[:2]
         if count == 1 and self.config.hard == 0:
@@ -380,7 +382,10 @@ class Trainer(Learner):
         return Searcher(self.task, self.generator, enough=enough, device=self.device)
 
     def _supply(self) -> Supply:
-        """Source of training states: along missions if the specification adds timers, else random."""
+        """Make the source of training states.
+
+        If the specification adds timers, these are states that simulated missions visit, else random states.
+        """
         if not self.task.compiled.timers:
             return Draws(self.task, self.generator, self.device)
         policy = BestOfKPolicy(self.task, self.network)
@@ -430,7 +435,7 @@ class Trainer(Learner):
         return found
 
     def facts(self) -> dict[str, float | int]:
-        """Scalars that are stored together with `tensors`."""
+        """Numbers that a checkpoint stores in addition to `tensors`, by name."""
         return super().facts() | {
             "solved": self.buffer.count,
             "accuracy": self.accuracy,
@@ -440,7 +445,7 @@ class Trainer(Learner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, results of the methods of the same names."""
+        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         tensors, facts = self._restored(tensors, facts)
         super().restore(tensors, facts)
         self.accuracy, self.failing = float(facts["accuracy"]), int(facts.get("failing", 0))
@@ -503,7 +508,7 @@ class NetworkMethod(Method):
 
     @abstractmethod
     def objective(self, learner: Trainer) -> Objective:
-        """Parameters of the method's loss; a method that adapts the margin takes it from `learner.margin`."""
+        """Parameters of the method's loss, which may depend on the adapted margin `learner.margin`."""
 
     def network(self, task: Task, config: ResolvedConfig) -> PlanNetwork:
         """Make a network with random weights, drawn from torch's global generator."""

@@ -38,7 +38,7 @@ TRIES = 64
 MOST_TRIED = 4_000_000
 """Maximum number of plan entries evaluated at a time in torch, which bounds its memory."""
 LOOK = 0.1
-"""Polling interval of a wait in seconds."""
+"""Interval in seconds at which a waiting thread looks whether it has to stop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ class SearchResult:
     def solved(self) -> Tensor:
         """Mask of the states whose plan satisfies the specification up to rounding errors, (B,).
 
-        A robustness of exactly 0 counts: where an allowance is counted in whole steps, no plan has more from
-        the states that need all of it.
+        A robustness of exactly 0 counts as satisfied. For example, a requirement may allow a condition to
+        fail for 5 steps. From a state that needs all 5 steps, even the best plan has robustness 0.
         """
         return satisfied(self.rho)
 
@@ -151,7 +151,8 @@ class Searcher:
     ) -> None:
         """Prepare searches for plans of `task` with a robustness of at least `enough`.
 
-        The generator and the native search are on the CPU; states and plans are on `device`.
+        `generator`: source of all random numbers, on the CPU. `device`: torch device of states and plans; a
+        search in compiled code runs on the CPU all the same.
         """
         self.task = task
         self.generator = generator
@@ -285,7 +286,7 @@ class _TorchClimb:
         return self.found
 
     def _keep_better(self, still: Tensor, tried: Tensor) -> None:
-        """Judge plans (k, tries, T, m) for the states with indices `still`, (k,), and update `found`."""
+        """Judge the plans `tried`, (k, tries, T, m), for the states with indices `still`; update `found`."""
         found, tries = self.found, tried.shape[1]
         x0 = found.states[still].repeat_interleave(tries, 0)
         judged = self.task.judge(x0, tried.flatten(0, 1), states=False)
@@ -296,7 +297,7 @@ class _TorchClimb:
         found.rho[rows] = value[better]
 
     def _proposals(self, plans: Tensor, tries: int, bank: Tensor) -> Tensor:
-        """Random changes of plans (B, T, m), within the control bounds: (B, tries, T, m)."""
+        """Randomly changed copies of plans, within the control bounds: (B, T, m) -> (B, tries, T, m)."""
         quarter = tries // 4
         span = self.high - self.low
         start = plans[:, None]
@@ -310,9 +311,9 @@ class _TorchClimb:
         return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
 
     def _others(self, plans: Tensor, count: int, bank: Tensor) -> Tensor:
-        """Random plans of the library `bank`, or random piecewise constant plans if it holds few plans.
+        """Draw random plans for the B states of `plans`: (B, count, T, m).
 
-        They are (B, count, T, m).
+        They are taken from the library `bank`, or are piecewise constant if the library holds few plans.
         """
         states, steps, controls = plans.shape
         if bank.shape[0] >= 64:
@@ -322,7 +323,10 @@ class _TorchClimb:
         return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]
 
     def _stretch(self, shape: tuple[int, ...]) -> Tensor:
-        """Mask of a random interval of time for each plan and control: (B, tries, T, m)."""
+        """Draw random intervals of time: (B, tries, T, m), 1 inside an interval and 0 outside.
+
+        There is one interval for each of the changed plans and each control.
+        """
         states, tries, steps, controls = shape
         first = self._randint(0, steps, states, tries, 1, controls)
         length = self._randint(1, steps + 1, states, tries, 1, controls)

@@ -43,7 +43,7 @@ first validation.
 SAVE_EVERY = 500
 """Maximum number of steps between checkpoints."""
 SAVE_SECONDS = 10.0
-"""Maximum seconds between checkpoints: the loss from a kill."""
+"""Maximum number of seconds between checkpoints, and so the most that a killed run loses."""
 
 
 @cache
@@ -264,7 +264,7 @@ def find_device(name: str) -> torch.device:
 
 
 class _Session:
-    """Training from the learner's present state to the last step or an interruption, and the evaluation."""
+    """Training from the learner's present state to the last step or an interruption; then the evaluation."""
 
     def __init__(
         self, writer: RunWriter, learner: Learner, watch: Watch, time: TimeBudget, schedule: StepSchedule

@@ -33,8 +33,8 @@ class Objective:
         saturation: s in the loss term s log(1 + hinge / s), where hinge is max(margin - robustness, 0). This
             term grows slowly, so that states without a satisfying plan do not dominate the loss. None: the
             hinge itself is the loss term.
-        violation: weight of a second hinge, at robustness 0, by which a plan that violates the specification
-            is penalised more than one whose robustness is only below gamma.
+        violation: weight of a second hinge, max(-robustness, 0), which penalises only plans that violate the
+            specification.
         stl_weight: lambda, the weight of the hinge on robustness.
         performance_weight: weight of the performance terms.
     """
@@ -64,7 +64,12 @@ def paper_objective(task: Task) -> Objective:
 
 
 def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
-    """Objective of the method `guided`: exact min and max, saturating hinges at `margin` and at 0."""
+    """Objective of the method `guided`, with exact minima and maxima.
+
+    The penalty begins where the robustness falls below `margin`, and is steeper below 0. It grows slowly far
+    below. `slope` is k in the smooth step (1 + tanh(k x)) / 2, whose derivative replaces those of jumps and
+    conditions in the dynamics.
+    """
     return Objective(
         margin=margin,
         smoothing=None,

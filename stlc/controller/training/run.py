@@ -47,7 +47,7 @@ class Run:
     Attributes:
         dir: folder of the run.
         task: problem that the policy was trained for.
-        policy: the trained policy; call it with states (B, n) for plans (B, T, m) in physical units.
+        policy: the trained policy; a call with states (B, n) returns plans (B, T, m) in physical units.
     """
 
     dir: RunDir
@@ -201,22 +201,22 @@ def load_weights(folder: RunDir, module: Net, prefix: str) -> Net:
 
 
 def spec_hash(folder: RunDir) -> str:
-    """SHA-256 of the specification in a run's folder, of its imports, and of the run's `--set` changes."""
+    """SHA-256 of the specification in a run's folder, with its imports and the run's `--set` changes."""
     return _hash(folder, SPEC, read_library(folder))
 
 
 def system_hash(folder: RunDir) -> str:
-    """SHA-256 of the system file in a run's folder and of the run's `--set` changes."""
+    """SHA-256 of the system file in a run's folder, with the run's `--set` changes."""
     return _hash(folder, SYSTEM)
 
 
 def trained_on(folder: RunDir) -> str:
     """Hash of the system file, for comparison with the hash that is stored in a run's checkpoint.
 
-    The file in the run's folder may have been edited since training began. Edits of worlds, scenarios and
-    backup do not affect what a policy learns. If there are only such edits, the hash at the start of training
-    is returned, so that the checkpoint is accepted. After any other edit the hash of the present file is
-    returned, so that the checkpoint is refused.
+    The file in the run's folder may have been edited since training began. Edits of the worlds, scenarios and
+    backup policy do not affect what a policy learns. If there are only such edits, the hash at the start of
+    training is returned, so that the checkpoint is accepted. After any other edit the hash of the present
+    file is returned, so that the checkpoint is refused.
     """
     now, record = system_hash(folder), folder.record()
     then, learnt = record.get("system_hash"), record.get("learnt")
@@ -233,7 +233,7 @@ def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -
 
 
 def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -> None:
-    """Save the texts of a specification's imports in the subfolder `below`, with an index."""
+    """Save a specification's imports (name -> text) in the subfolder `below` of a run's folder."""
     for key, text in library.items():
         write_atomic(folder.path / below / file_of(key), text)
     if library:

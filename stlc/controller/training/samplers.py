@@ -1,11 +1,12 @@
 """Sources of training states: independent draws, a fixed set, states along missions, and a replay buffer.
 
-If a specification has memory (the time of the mission, satisfied goals, timers), only states that a mission
-reaches are useful for training, because the memory must fit the position. Therefore a pool of missions is
-simulated with the plans of the present policy, and the states on the way are returned. A mission is replaced
-by a new one if it is over or can no longer satisfy the specification, and often if no satisfying plan is
-found from its present state. Early in training missions end soon; later they get further. If a search finds
-plans from states at which the policy failed, some missions continue from states that these plans visit.
+A mission is a closed-loop simulation from an initial state on. If a specification has memory (the time since
+the start of the mission, satisfied goals, timers), only states that a mission reaches are useful for
+training, because the memory must fit the position. Therefore a pool of missions is simulated with the plans
+of the present policy, and the states on the way are returned. A mission is replaced by a new one if it is
+over or can no longer satisfy the specification, and often if no satisfying plan is found from its present
+state. Early in training missions end soon; later they get further. If a search finds plans from states at
+which the policy failed, some missions continue from states that these plans visit.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Supply(ABC):
 
     @abstractmethod
     def _more(self, n: int) -> Tensor:
-        """Draw k states, if possible at least `n`; return them, (k, dim)."""
+        """Draw some states and return them, (k, dim); k may be more or less than `n`, the number needed."""
 
     def take(self, n: int) -> Tensor:
         """Return the next `n` states, (n, dim), float32."""
@@ -60,9 +61,10 @@ class Supply(ABC):
         return taken
 
     def follow(self, states: Tensor, plans: Tensor) -> None:  # noqa: B027
-        """Draw further states along plans (k, T, m) that a search found from states (k, n).
+        """From now on, also supply states that the plans `plans` visit, if the source can do so.
 
-        By default nothing is done.
+        `plans`: plans that a search found, (k, T, m), from the states `states`, (k, n). By
+        default nothing is done.
         """
 
     def tensors(self) -> dict[str, Tensor]:
@@ -70,7 +72,7 @@ class Supply(ABC):
         return {name: getattr(self, name) for name in self.state}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state from `tensors`, a result of the method of the same name."""
+        """Restore the state from `tensors`, which the method of this name returned."""
         for name in self.state:
             setattr(self, name, tensors[name].to(self.device))
 
@@ -109,7 +111,7 @@ class FixedSet:
         return {"states": self.states, "queue": self.queue}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the state from `tensors`, a result of the method of the same name."""
+        """Restore the state from `tensors`, which the method of this name returned."""
         self.states, self.queue = (tensors[name].to(self.states.device) for name in ("states", "queue"))
 
 
@@ -145,10 +147,10 @@ class Missions(Supply):
 
     @torch.no_grad()
     def follow(self, states: Tensor, plans: Tensor) -> None:
-        """Continue some missions from states that are visited by plans that a search found.
+        """Continue some missions from states that `plans` visit.
 
-        `states`: states at which the policy failed, (k, n). `plans`: the plans found from there, (k, T, m).
-        Each plan contributes one state, which it visits after a random number of steps.
+        `states`: states at which the policy failed, (k, n). `plans`: plans that a search found from there,
+        (k, T, m). Each plan contributes the state that it reaches after a random number of steps.
         """
         if len(states) and len(self.pool):
             judged = self.task.judge(states, plans)
@@ -217,9 +219,10 @@ class Missions(Supply):
 def mission_steps(task: Task) -> int:
     """Number of steps for which a mission is simulated.
 
-    If the specification names no times of the mission, a mission takes four horizons. Otherwise let t be the
-    last time that it names. The mission ends one horizon after t. If requirements recur forever, it ends
-    `ROUNDS` periods after t instead, where a period counts as at least one horizon.
+    If no requirement refers to times since the start of the mission, a mission takes four horizons. Otherwise
+    let t be the last time to which a requirement refers. The mission ends one horizon after t. If
+    requirements recur forever, it ends `ROUNDS` periods after t instead. Here a period is taken as at least
+    one horizon.
     """
     named, recurring = task.compiled.mission, task.compiled.recurring
     if named is None:
@@ -274,7 +277,7 @@ class ReplayBuffer:
 
     @classmethod
     def empty(cls, state: int, steps: int, controls: int, device: torch.device) -> ReplayBuffer:
-        """Make an empty buffer for states (state,) and plans (steps, controls)."""
+        """Make an empty buffer for states of shape (state,) and plans of shape (steps, controls)."""
         return cls(
             torch.zeros(CAPACITY, state, device=device), torch.zeros(CAPACITY, steps, controls, device=device)
         )

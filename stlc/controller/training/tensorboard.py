@@ -46,7 +46,7 @@ class TensorBoardLogger:
         self._writer.add_text("engine", f"| | |\n|---|---|\n{lines}", 0)
 
     def row(self, row: Mapping[str, Any]) -> None:
-        """Log a row of `train.jsonl`: each number under its name, the numbers of requirements as a group."""
+        """Log the numbers of a row of `train.jsonl`; those of the requirements form a group."""
         step = int(row["step"])
         for key in _PLAIN:
             if row.get(key) is not None:

@@ -29,13 +29,16 @@ class _Space(Protocol):
     """Space of vectors, (d,), from which the cross-entropy method samples; each vector represents a plan."""
 
     def centre(self, start: Tensor) -> Tensor:
-        """Centres of the first populations, as vectors, (k, d), for guesses of k plans, (k, T, m)."""
+        """Mean vectors of the first populations, (k, d).
+
+        `start`: initial guesses of k plans, (k, T, m), on which the mean vectors may depend.
+        """
 
     def deviation(self, x0: Tensor) -> Tensor:
         """Standard deviation of each component of the first population: (d,), or (1,) if all are equal."""
 
     def plans(self, x0: Tensor, vectors: Tensor) -> Tensor:
-        """Plans that vectors represent, (k, p, T, m).
+        """Plans that the vectors `vectors` represent, (k, p, T, m).
 
         `x0`: initial states, (k, n). `vectors`: p vectors per state, (k, p, d).
         """
@@ -48,12 +51,12 @@ class Cem:
     Attributes:
         population: number of samples per round.
         elites: number of samples, the most robust ones, to which the Gaussian is fitted.
-        deviation: standard deviation of the first population. Its unit is half the width of each control's
-            range. With `over=policy` the weights are sampled, and it has no unit.
+        deviation: standard deviation of the first population, in units of half the width of each control's
+            range. With `over=policy` it is the standard deviation of the weights, without unit.
         physical: whether `deviation` is in the physical units of the controls instead.
         floor: least standard deviation, in the units of `deviation`.
         rounds: maximum number of rounds, after which the search from an initial state begins anew.
-        over: `plan`: plans are sampled; `policy`: weights of a network with `hidden` ReLU units are sampled.
+        over: `plan` to sample plans; `policy` to sample the weights of a network with `hidden` ReLU units.
         hidden: number of hidden units of the network.
     """
 

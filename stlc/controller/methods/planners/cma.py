@@ -1,4 +1,4 @@
-"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by the package `cma` of `stlc[plan]`."""
+"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by the package that `stlc[plan]` installs."""
 
 from __future__ import annotations
 
@@ -54,10 +54,14 @@ class Cma:
     def _climb(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
         """Run CMA-ES once for the initial state with index `row`.
 
-        The run ends once it has converged, reached the target robustness, or spent the budget. `restarts`:
-        number of earlier runs for this state; each of them doubles the population of the next run. The first
-        run begins at the initial guess, later runs begin at random plans. `strategy`: class for CMA-ES of the
-        package `cma`.
+        The run ends once it has converged, reached the target robustness, or spent the budget. The first run
+        begins at the initial guess, later runs begin at random plans.
+
+        Args:
+            search: the search for plans, which keeps the best plan.
+            row: index of the initial state.
+            strategy: class of the package `cma` that runs CMA-ES.
+            restarts: number of earlier runs for this state; each of them has doubled the population.
         """
         system, rows = search.task.system, torch.tensor([row])
         low, high = system.control_low.double(), system.control_high.double()

@@ -25,8 +25,8 @@ class GradientPlanner:
     of a policy network.
 
     Attributes:
-        objective: `exact`: exact robustness, with gradients by generated C code; `paper`: smooth robustness
-            with tanh switching.
+        objective: `exact` for exact robustness, with gradients by generated C code; `paper` for smooth
+            robustness, where tanh also smooths the jumps and conditions of the system.
         steps: number of gradient steps, after which the search begins anew from random latent plans.
         starts: number of latent plans per initial state; the first is 0, the others are drawn at random.
         rate: learning rate of Adam.

@@ -28,7 +28,7 @@ class Halving:
     only the best ones.
 
     Attributes:
-        starts: number of searches per initial state that a round begins.
+        starts: number of searches that a round begins for each initial state.
         tries: number of plans that each search tries before the first selection.
         keep: number by which each selection divides the number of searches. Each remaining search then tries
             `keep` times as many plans as before.

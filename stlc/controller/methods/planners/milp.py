@@ -1,7 +1,8 @@
-"""`milp`: mixed-integer linear programming by HiGHS (Huangfu & Hall 2018); extra `stlc[plan]`.
+"""`milp`: mixed-integer linear programming by HiGHS (Huangfu & Hall 2018), which `stlc[plan]` installs.
 
-It applies to piecewise linear systems and uses the big-M encodings of Karaman et al. (2008) and Raman et al.
-(2014). It is the only planner that can prove that no plan from an initial state satisfies the specification.
+This planner applies to piecewise linear systems. It uses the big-M encodings of Karaman et al. (2008) and
+Raman et al. (2014). No other planner can prove that no plan from an initial state satisfies the
+specification.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ class Milp:
     def _solve(self, search: PlanSearch, row: int, highs: Any) -> None:
         """Find a satisfying plan from the initial state with index `row`, or prove that there is none.
 
-        The plan or the proof is stored in `search`.
+        The plan or the proof is stored in `search`. If time runs out, there may be neither.
         """
         task, state, budget = search.task, search.states[row], search.budget
         limit = _Limit(process_time() + budget.seconds - float(search.seconds[row]), budget.stop)
@@ -126,9 +127,15 @@ class Milp:
     ) -> tuple[str, Tensor | None]:
         """Search for a plan from the state `state`, (n,), that reaches the robustness in `goal`.
 
-        `limit`: condition that ends the solve early. `highs`: the module of HiGHS. `tight`: choice between
-        two programs. True: every solution is a plan with this robustness. False: all plans with this
-        robustness are solutions, but not only these; such a program can only prove that there is no plan.
+        Args:
+            task: specification and system.
+            state: the initial state, (n,).
+            goal: the robustness to be reached.
+            limit: condition that ends the solve early.
+            highs: the module of HiGHS.
+            tight: if True, every solution of the program is a plan with this robustness. If False, all plans
+                with this robustness are solutions, but not only these. The program then serves only to prove
+                that there is no such plan.
 
         Returns:
             A result: `FOUND`, `IMPOSSIBLE` (there is no solution) or `UNKNOWN`; and the plan, (T, m), or None
@@ -223,8 +230,8 @@ def _encoded(
 
     If `target` is finite, the robustness of the plan must be at least `target`, and the cost is 0. If
     `target` is inf, the robustness must be at least `known`, and the cost is the negative robustness.
-    `tight`: if True, every solution is a plan with this robustness. If False, all plans with this robustness
-    are solutions, but not only these.
+    `tight`: if True, every solution of the program is a plan with this robustness. If False, all plans with
+    this robustness are solutions, but not only these.
 
     Raises:
         UsageError: U101, an expression has no mixed-integer linear form.
@@ -258,7 +265,7 @@ def _encoded(
 
 
 def _program(arrays: Arrays, highs: Any) -> Any:
-    """The program, given as arrays, in the form that HiGHS reads."""
+    """Convert a program, given as arrays, to the form that HiGHS reads."""
     program, inf = highs.HighsLp(), highs.kHighsInf
     program.num_col_, program.num_row_ = len(arrays.lower), len(arrays.row_lower)
     program.col_cost_, program.col_lower_, program.col_upper_ = arrays.cost, arrays.lower, arrays.upper

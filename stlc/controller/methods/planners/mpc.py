@@ -1,8 +1,8 @@
-"""`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT; extra `stlc[mpc]`.
+"""`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT, which `stlc[mpc]` installs.
 
-It applies to smooth systems and uses multiple shooting with the smooth robustness of Pant et al. (2017), from
-several initial guesses. `simulate --method mpc` plans anew in every step: model predictive control
-(Sadraddini & Belta 2015).
+This planner applies to smooth systems. It uses multiple shooting with the smooth robustness of Pant et al.
+(2017), from several initial guesses. `simulate --method mpc` plans anew in every step: model predictive
+control (Sadraddini & Belta 2015).
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class Mpc:
         drawn: number of random plans that are judged for one guess; the most robust of them is taken.
         iterations: maximum number of iterations of the interior-point method from each guess.
         smoothing: k of log-sum-exp, which replaces minima and maxima inside conditions; larger is sharper.
-        sharpness: greatest slope of the smooth functions, from 0 to 1, that replace conditions.
-        margin: robustness by which the program demands more than the target, since its smooth functions are
-            approximations.
+        sharpness: greatest slope of the smooth functions, with values from 0 to 1, that replace conditions.
+        margin: robustness that the program demands in addition to the target, since its smooth functions only
+            approximate the exact robustness.
         repair: number of plans that a local search tries if the best plan nearly reaches the target.
     """
 
@@ -125,9 +125,10 @@ class Mpc:
     ) -> None:
         """Solve the program for one initial state, starting from the plan `guess`, (T, m).
 
-        `rows`: index of the state, (1,). The result is offered to `search`, which keeps it if it is the best.
-        Its exact robustness may be below the target, although it nearly solves the program. Then the program
-        is solved once more, with a margin that is increased by the missing robustness.
+        `rows`: index of the state, (1,). The solution is offered to `search`, which keeps the best plan. A
+        solution may have an exact robustness below the target, since the program uses smooth functions. The
+        program is then solved once more with a larger margin, unless the solution violates its conditions by
+        much.
         """
         target = search.budget.target
         maximise = math.isinf(target)

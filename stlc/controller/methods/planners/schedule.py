@@ -59,9 +59,9 @@ class SchedulePlanner:
         margin: distance from their boundaries at which conditions shall hold, as a share of the typical range
             of the states.
         best: number of plans that a local search improves at the end of a round.
-        tries: number of changed plans that this local search tries per plan.
+        tries: number of changed plans that the local search at the end of a round tries per plan.
         starts: number of plans, the best of the library, that a local search improves before the first round.
-        first: number of changed plans that this local search tries per plan.
+        first: number of changed plans that the local search before the first round tries per plan.
     """
 
     schedules: int = 48
@@ -190,7 +190,8 @@ class _Attempts:
     def _nearest(self, needed: Tensor) -> Tensor:
         """Select a plan for each of the k schedules `needed`: (k, T, m).
 
-        Of a random part of the library, the plan that comes nearest to meeting the schedule is taken.
+        For each schedule, some plans of the library are drawn at random. The one that comes nearest to
+        meeting the schedule is selected.
         """
         missed = needed.flatten(1).double() @ self._missed
         seen = torch.rand(missed.shape, generator=self._search.generator) < SEEN
