@@ -1,4 +1,7 @@
-"""Evaluation of numeric expressions, common to the back ends: traversal, sharing, inlining of functions."""
+"""Base of the evaluators of numeric expressions in all back ends.
+
+Each expression is evaluated once. A function call can be replaced by the body of the function.
+"""
 
 from __future__ import annotations
 

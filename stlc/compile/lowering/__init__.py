@@ -1,1 +1,1 @@
-"""Lowering of typed formulas to the intermediate representation, with time in steps."""
+"""Lowering (translation) of typed formulas to the intermediate representation, with time in steps."""

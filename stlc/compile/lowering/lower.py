@@ -1,9 +1,12 @@
-"""Lowering of typed formulas to the IR: margins in the units of the source, and time in whole steps.
+"""Lowering (translation) of typed formulas to the intermediate representation (IR), with time in steps.
 
-In training all margins are in SI, so that requirements are comparable. For recorded traces each predicate is
-divided by the scale of its unit, so that the margin of `speed < 120 km/h` is in km/h; signs do not change.
-The formula is first brought into negation normal form, so that bounds between two samples are rounded for the
-operator that remains: `not always[0, b] p` is `eventually[0, b] not p`, whose bound is rounded inwards.
+In training all margins are in SI, so that requirements are comparable. For recorded traces, margins are in
+the units of the source: each predicate is divided by the scale of its unit. For example, the margin of
+`speed < 120 km/h` is then in km/h. Signs do not change.
+
+First each `not` is moved inwards (negation normal form). This matters for bounds that lie between two
+samples, since their rounding depends on the operator. For example, `not always[0, b] p` becomes
+`eventually[0, b] not p`, whose bound is rounded inwards.
 """
 
 from __future__ import annotations
@@ -52,7 +55,7 @@ def _in_written_units(formula: typed.Formula) -> typed.Formula:
 
 
 def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
-    """Convert a number from SI to `unit`; a signal that is stored in `unit` is read without conversion."""
+    """Convert the expression `num` from SI to `unit`; signals stored in `unit` are read as they are."""
     if unit.ratio == 1:
         return num
     match num:
@@ -69,7 +72,7 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
 
 
 def _divided(value: float, unit: Unit) -> float:
-    """Return an SI constant in a unit, without rounding errors: 120, not 120.00000000000001."""
+    """Convert the constant `value` from SI to `unit` without rounding errors: 120, not 120.00000000000001."""
     found = value / unit.scale
     short = float(f"{found:.14g}")
     return short if math.isclose(short, found, rel_tol=1e-15) else found
@@ -78,17 +81,19 @@ def _divided(value: float, unit: Unit) -> float:
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:
     """Lower a typed formula to an IR formula in negation normal form, with time in steps.
 
-    The interval of an operator such as `always@[a, b]` counts from the first sample; a formula for training
-    has no such operator (`stlc.compile.augment`). Findings about intervals are appended to `sink`, such as
-    W304 for a bound that is rounded to a sample. If a finding is an error, the result must not be used.
+    The interval of an operator such as `always@[a, b]` counts from the first sample. In training there is no
+    such operator, since `stlc.compile.augment` has replaced it. Findings about intervals are appended to
+    `sink`, such as W304 for a bound that is rounded to a sample. If a finding is an error, the result must
+    not be used.
     """
     return _Lowering(grid, sink).formula(normal(formula))
 
 
 def _meaning(node: typed.Edge | typed.Recalled) -> typed.Formula:
-    """Return the definition of `rise`, `fall` or a past operator that was rewritten with timers.
+    """Return the formula that defines the operator `node`.
 
-    `rise(p)` is `p and prev(not p)`, with `prev(not p)` false at the first sample.
+    For example, `rise(p)` is `p and prev(not p)`, where `prev(not p)` is false at the first sample. For a
+    past operator that was rewritten with timers (`Recalled`), the formula is `node.along`.
     """
     if isinstance(node, typed.Recalled):
         return node.along
@@ -126,7 +131,10 @@ class _Lowering:
                 raise AssertionError("not in negation normal form")
 
     def _negated(self, node: typed.Formula) -> ir.Formula:
-        """Lower the negation of `node`, one of the nodes before which negation normal form keeps a `not`."""
+        """Lower the negation of `node`, an operator before which negation normal form keeps a `not`.
+
+        This is `until`, a shift in time, `rise`, `fall`, or a past operator that was rewritten with timers.
+        """
         match node:
             case typed.Until(_, op, _, left, right):
                 return self._timed(replace(node, left=normal(left, -1), right=normal(right, -1)), DUAL[op])

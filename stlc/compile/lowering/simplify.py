@@ -49,7 +49,7 @@ def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
 
 
 def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:
-    """Remove a window [0, 0] or one whose operand is constant; merge nested windows of the same operator."""
+    """Remove an operator with the window [0, 0] or a constant operand; merge two nested equal operators."""
     body, window = node.body, node.window
     every = node.op == node.names[0]
     if isinstance(body, ir.Truth) and (body.value is every or window.lo == 0):
@@ -72,7 +72,7 @@ def _at_start(node: ir.AtStart, _semantics: Semantics) -> ir.Formula:
 
 
 def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
-    """Drop unused bindings of a `freeze`; if its body is a predicate, substitute the bound numbers in it."""
+    """Drop unused bindings of a `freeze`; if its body is a predicate, insert the bound numbers there."""
     read = frozenset().union(*map(frozen_in, numbers(node.body)))
     kept = tuple((name, num) for name, num in node.bindings if name in read)
     if not kept:
@@ -83,9 +83,9 @@ def _freeze(node: ir.Freeze, _semantics: Semantics) -> ir.Formula:
 
 
 def _sum(outer: ir.Window, inner: ir.Window, semantics: Semantics) -> ir.Window | None:
-    """Return the window that replaces two nested windows of one operator; None if there is none.
+    """Return the window that replaces two nested windows of one operator; None if they cannot be merged.
 
-    With two windows of several samples each, some samples are read repeatedly. Merging these windows needs a
+    If both windows have several samples, some samples are read repeatedly. Merging these windows needs a
     semantics that is idempotent and associative.
     """
     lattice = semantics.associative and semantics.idempotent

@@ -1,1 +1,1 @@
-"""Schedule: values of sub-formulas and the instants at which they are needed."""
+"""Schedule of an evaluation: the sub-formulas, and the instants at which their values are needed."""

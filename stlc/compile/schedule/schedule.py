@@ -1,9 +1,9 @@
-"""Schedule: ordered steps that compute the values that formulas need, each at its instants.
+"""Schedule: list of steps, each of which computes one sub-formula at the instants at which it is needed.
 
-Only needed values are computed: for `p and always[0, T] q` at one instant, `p` is computed at that instant,
-and `q` at T + 1 instants. Equal sub-formulas at equal instants share one step. All back ends read the same
-steps and handle each by the class of its node. Instants are integers, or expressions in a loop index of the
-back end (`LoopIndex`).
+For `p and always[0, T] q` at one instant, for example, `p` is computed at that instant only, and `q` at T + 1
+instants. Equal sub-formulas at equal instants share one step. All back ends read the same steps and handle
+each by the class of its node. An instant is an integer. In generated code it may depend on the index of a
+loop (`LoopIndex`).
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class IndexRange:
     def count(self) -> int:
         """Number of instants in the range; 0 or less for an empty range.
 
-        If `start` and `last` depend on the indices of loops, all instants count from the earliest `start` to
+        If `start` or `last` depends on the index of a loop, the range extends from the earliest `start` to
         the latest `last` over all iterations.
         """
         if isinstance(self.start, int) and isinstance(self.last, int):
@@ -140,7 +140,7 @@ class IndexRange:
 
     @property
     def settled(self) -> IndexRange:
-        """Range from the earliest to the latest instant over all iterations of the enclosing loops."""
+        """This range in integers: from the earliest `start` to the latest `last` over all loop iterations."""
         return IndexRange(earliest(self.start), latest(self.last))
 
 
@@ -156,11 +156,11 @@ class TraceDomain:
     Attributes:
         samples: number of known samples.
         end: treatment of the instants beyond the last sample (`Boundary`).
-        stop: final length of an open trace in samples. An open trace continues, but its predicates are
-            unknown there. Windows to the end of the trace are cut at `stop`; if it is None, at the last known
-            sample.
-        counted: whether every instant contributes to the value, even one with unknown predicates, as in a
-            mean. If so, no instant may be left out.
+        stop: final length of an open trace in samples. An open trace continues beyond its known samples, but
+            its predicates are unknown there. Unbounded windows end at `stop`. If `stop` is None, they end at
+            the last known sample.
+        counted: whether every instant contributes to the value of an operator, as it does to a mean. No
+            instant may then be left out, even if all predicates are unknown there.
     """
 
     samples: int
@@ -175,7 +175,7 @@ class TraceDomain:
 
     @property
     def length(self) -> int:
-        """Final number of samples, at which windows to the end of the trace are cut."""
+        """Final number of samples; unbounded windows end there."""
         return self.samples if self.stop is None else self.stop
 
 
@@ -223,8 +223,8 @@ def _last(
 ) -> Instant:
     """Return the last instant at which a formula reads an operand.
 
-    An open trace (one that continues with unknown predicates) may need instants far beyond the last sample.
-    If all operands are known to be constant from some instant on, later instants are left out.
+    On an open trace (one that continues with unknown predicates), a window may extend far beyond the last
+    sample. If all operands are known to be constant from some instant on, later instants are left out.
 
     Args:
         read: offsets in samples. For its value at an instant k, the formula reads the operand from
@@ -251,20 +251,20 @@ def _last(
 
 
 def reads(num: ir.Num, domain: TraceDomain) -> Reach:
-    """Return how many samples before and after an instant must exist for an expression to be defined there.
+    """Return how many samples before and after an instant the expression `num` needs to be defined there.
 
-    An expression may read the samples after the end of the trace as copies of the last one (`clamped`). These
-    samples need not exist. But if more samples will follow (`domain.stop`, the final length, is given), it is
-    not yet known which sample will be the last. Then all samples that the expression reads must exist.
+    A clamped read beyond the end of the trace gives the last sample, so it needs no samples there. But if
+    more samples will follow (`domain.stop`, the final length, is given), the last sample is not yet known.
+    Then all samples that `num` reads must exist.
     """
     past, future = reach_of(num)
     return Reach(past, future if domain.stop is None else max(future, farthest(num).future))
 
 
 def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
-    """Return the instants of `run` for which all samples exist that an expression reads.
+    """Return the instants of `run` at which an expression is defined: all samples that it needs exist.
 
-    The expression reads up to `reach.past` samples before the instant and up to `reach.future` after it.
+    The expression needs `reach.past` samples before the instant and `reach.future` samples after it.
     """
     first = max(earliest(run.start), reach.past)
     return IndexRange(first, max(min(latest(run.last), domain.samples - 1 - reach.future), first - 1))
@@ -330,9 +330,9 @@ class Scheduler:
         self._count = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """Return the number of the step that computes a formula at `run`; a missing step is added.
+        """Return the number of the step that computes `node` at the instants `run`; None if `run` is empty.
 
-        The result is None if `run` is empty.
+        If there is no such step yet, it is added.
         """
         if run.count <= 0:
             return None
@@ -343,7 +343,7 @@ class Scheduler:
         return found
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """Add steps for the operands of a formula, then a step for the formula; return its number."""
+        """Add steps for the operands of `node`, then a step for `node`; return the number of the latter."""
         args = tuple(self.place(part, its) for part, its in operands(node, run, self.domain))
         return self.add(Step(node, run, args, number=self.number(run)))
 

@@ -1,1 +1,1 @@
-"""Semantics of robustness: minima and maxima that are exact, smooth, or means."""
+"""Semantics of robustness: definitions of minimum and maximum that are exact, smooth, or based on means."""

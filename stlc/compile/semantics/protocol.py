@@ -15,12 +15,12 @@ Parts: TypeAlias = tuple[Array, ...]
 class Semantics(Protocol):
     """Definition of minima and maxima over arrays `(time, batch)`.
 
-    Infinite operands that do not decide the result have no influence, and no gradient. Windows are computed
-    from partial results: `lift` turns operands into `Parts`, `merge` joins the parts of disjoint sets of
-    operands, and `finish` converts parts to a value.
+    An infinite operand that does not decide the result, such as +inf in a minimum, has no influence and no
+    gradient. Extrema over windows are computed from partial results: `lift` turns operands into `Parts`,
+    `merge` joins the parts of disjoint sets of operands, and `finish` converts parts to a value.
 
     Attributes:
-        exact: whether the value is that of an operand, so that the array library's own minimum and maximum
+        exact: whether the value is always that of an operand. Minimum and maximum of the array library then
             apply.
         idempotent: whether repeated operands make no difference, so that overlapping blocks may cover a
             window.

@@ -3,7 +3,7 @@
 The rest of the evaluation (`stlc.compile.backends.array.graph`) does not depend on the semantics. Neither do
 verdicts: they follow from the truth of the predicates, in agreement with the sign of the exact robustness.
 
-| name     | class                     | is a positive value satisfied, a negative one violated?       |
+| name     | class                     | does > 0 mean satisfied, and < 0 violated?                    |
 |----------|---------------------------|---------------------------------------------------------------|
 | `exact`  | `Exact`                   | yes                                                           |
 | `smooth` | `LogSumExp`               | not near 0: every operator may be off by log(n) / k           |

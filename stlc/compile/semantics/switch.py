@@ -17,8 +17,8 @@ class Switch(Protocol):
     """Protocol of a switch, which evaluates conditions as numbers and uses them to choose between values.
 
     Attributes:
-        exact: whether conditions are evaluated as masks, by comparisons instead of margins, so that each
-            predicate keeps its own `>` or `>=`.
+        exact: whether conditions are evaluated as masks of booleans, by the comparisons `>` and `>=` as
+            written. If not, a condition is evaluated from its margin (robustness).
     """
 
     exact: ClassVar[bool]

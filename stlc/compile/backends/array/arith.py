@@ -144,10 +144,12 @@ class ArrayProgram:
 class _Bound:
     """Tape (list of operations) bound to the functions of an array library, ready to run.
 
+    A register is a numbered place in memory. It holds an input, a constant, or the result of an operation.
+
     Attributes:
-        inputs: pairs of the name of an input and the register into which the input is copied.
+        inputs: (name of an input, register that receives this input) pairs.
         code: operations in order, as (function, registers of the operands, register of the result).
-        registers: initial memory of a run, with the constants in place.
+        registers: contents of all registers at the start of a run: the constants, and None elsewhere.
         arrays: name of an output -> register with its value.
         numbers: name of a constant output -> its value.
     """
@@ -178,9 +180,9 @@ def _first(env: Mapping[str, Array]) -> Array:
 
 
 def _needed(tape: GradientTape, outputs: Any) -> list[int]:
-    """Registers that must be computed to obtain `outputs`, in ascending order.
+    """Registers of `tape` that must be computed to obtain `outputs`, in ascending order.
 
-    `outputs` contains registers of `tape`, and constants, which need no computation.
+    An int in `outputs` is a register. A float is a constant, which needs no computation.
     """
     wanted: set[int] = set()
     stack = [value for value in outputs if isinstance(value, int)]
@@ -193,10 +195,10 @@ def _needed(tape: GradientTape, outputs: Any) -> list[int]:
 
 
 class _TapeWriter(NumberEvaluator[Operand]):
-    """Writer of expressions and state formulas (formulas without temporal operators) to a tape.
+    """Writer that appends the operations of expressions and conditions to a tape.
 
-    If `exact`, a condition is written as a mask of booleans. Otherwise it is written as a soft weight between
-    0 (false) and 1 (true), computed from the robustness of the condition.
+    A condition is a formula without temporal operators. If `exact`, a condition becomes a mask of booleans.
+    Otherwise it becomes a soft weight between 0 (false) and 1 (true), computed from its robustness.
     """
 
     def __init__(self, constants: Mapping[str, float], *, exact: bool) -> None:
@@ -247,10 +249,10 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return self.tape.emit("where" if self._exact else "blend", choice, yes, no)
 
     def _truth(self, cond: ir.Formula) -> int | bool:
-        """Return the register of the mask that is true where a state formula holds.
+        """Return the register of the mask that is True where the condition `cond` holds.
 
-        If the formula is always true or always false, the truth value itself is returned. A state formula has
-        no temporal operators. A margin of exactly 0 satisfies `>=`, but not `>`.
+        If `cond` is always true or always false, the truth value itself is returned. `cond` is a formula
+        without temporal operators. A margin of exactly 0 satisfies `>=`, but not `>`.
         """
         match cond:
             case ir.Truth(value):
@@ -274,13 +276,14 @@ class _TapeWriter(NumberEvaluator[Operand]):
         return reduce(lambda a, b: a if a == b else self.tape.emit(kernel, a, b), registers)
 
     def _weight(self, cond: ir.Formula, sharpness: float | None) -> Operand:
-        """Return the register of a state formula's soft weight, a number between 0 and 1.
+        """Return the register of the soft weight of the condition `cond`, a number between 0 and 1.
 
-        If the weight is constant, its value is returned instead. The weight is computed from the margin
-        (robustness) of the formula, for instance as `(1 + tanh(sharpness * margin)) / 2`. If `sharpness` is
-        None, the switch uses its default. A formula with both `>` and `>=` may be true or false where its
-        margin is 0. For such a formula, the exact truth is computed as well, and the switch adjusts the
-        weight to it (`Switch.settle`).
+        If the weight is constant, its value is returned instead. A `Switch` computes the weight from the
+        margin (robustness) of `cond`, for instance as `(1 + tanh(sharpness * margin)) / 2`. If `sharpness` is
+        None, the default of the switch is used.
+
+        Where the margin is 0, a condition that contains both `>` and `>=` may be true or false. For such a
+        condition the exact truth is computed as well, and `Switch.settle` corrects the weight.
         """
         kinds = _strictness(cond)
         margin = self.margin(cond)
@@ -308,7 +311,7 @@ def _strictness(cond: ir.Formula) -> set[bool]:
 
 
 def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
-    """Return the arrays that `program` reads at the instants `run`, by name, `(count, batch)` each.
+    """Return the arrays that `program` reads at the instants `run`: name -> array `(run.count, batch)`.
 
     If the program reads no signal, the result contains an arbitrary signal, since the constant outputs of the
     program take their shape from it.
@@ -335,7 +338,7 @@ def _rows(column: Array, start: int, count: int) -> Array:
 
 
 def _shifted_rows(column: Array, at: ir.ShiftedSignal, run: IndexRange, ops: Ops) -> Array:
-    """Values of a signal `at.steps` samples after each instant in `run`: `(count, batch)`.
+    """Values of a signal `at.steps` samples after each instant in `run`: `(run.count, batch)`.
 
     `column` holds all samples of the signal. A read before the first sample gives the first sample, and a
     read after the last sample gives the last.

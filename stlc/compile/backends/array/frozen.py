@@ -1,9 +1,9 @@
 """Evaluation of `freeze`: a formula that refers to signal values at the instant at which it is evaluated.
 
 For example, `freeze a = x in eventually[0 s, 1 s] x > a` compares later values of `x` with the present value.
-The value of `a` differs from instant to instant. So instants become part of the batch axis: signals
-`(time, batch)` are copied to `(time, instants * batch)`. If the body (the formula after `in`) reads only
-samples near the instant, only these samples are copied.
+The value of `a` differs from instant to instant. So each instant gets its own copy of the signals. The copies
+are stacked along the batch axis: signals `(time, batch)` become `(time, instants * batch)`. If the body (the
+formula after `in`) reads only samples near the instant, only these samples are copied.
 """
 
 from __future__ import annotations
@@ -63,10 +63,11 @@ class Freezer:
         return self.ops.cat(parts) if len(parts) > 1 else parts[0]
 
     def _unbound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
-        """Yield, in chunks, the robustness at the instants `run`, at which bound values are undefined.
+        """Yield, in chunks, the robustness at the instants `run`, at which some bound value is undefined.
 
-        A predicate that reads an undefined value is unknown if the trace is open (continues beyond its last
-        sample), and false otherwise.
+        A value that `freeze` binds is undefined if it needs samples outside the trace. A predicate that reads
+        this value is unknown if the trace is open (continues beyond its last sample). Otherwise the predicate
+        is false, and its negation is true.
         """
         for missing, instants in groupby(
             range(run.start, run.start + run.count), partial(self._undefined, node)
@@ -120,8 +121,8 @@ class Freezer:
         """Yield, in chunks, the robustness at the instants `run`, whose neighbourhoods may leave the trace.
 
         The neighbourhood of an instant extends from `back` samples before the instant to `ahead` samples
-        after the instant. Every instant of a chunk has its own copy of all samples in the neighbourhoods of
-        the chunk.
+        after the instant. A chunk is a group of consecutive instants. Each of them gets its own copy of all
+        samples that the chunk needs.
         """
         ops, batch = self.ops, self._batch
         for chunk in _chunks(run, _chunk_size(_MOST // batch, back + ahead, self.domain.samples)):
@@ -141,9 +142,9 @@ class Freezer:
             yield there.reshape(chunk.count, chunk.count, batch)[each, each]
 
     def _bound_values(self, node: ir.Freeze, run: IndexRange, length: int) -> dict[str, Array]:
-        """Values that `freeze` binds at each instant in `run`, by name: `(length, count * batch)`.
+        """Values that `freeze` binds at each instant in `run`: name -> array `(length, run.count * batch)`.
 
-        A value is the same in all `length` rows.
+        All `length` rows of an array are equal.
         """
         program = ArrayProgram(dict(node.bindings))
         found = program(inputs(program, self.env, run, self.ops), self.ops)
@@ -152,10 +153,10 @@ class Freezer:
         return {name: blank + (value + rows).reshape(1, -1) for name, value in found.items()}
 
     def _columns_read(self, node: ir.Freeze) -> dict[str, Array]:
-        """Signals, and values bound by enclosing `freeze` formulas, that the body reads, by name.
+        """Arrays that the body of `node` reads: name -> signal, or value bound by an outer `freeze`.
 
-        The body is the formula inside the `freeze` operator `node`. If the body reads no signal and no bound
-        value, the result is one arbitrary signal, which gives the shape.
+        The body is the formula after `in`. If it reads no such array, the result is one arbitrary signal, so
+        that the shape is known.
         """
         own = {name for name, _ in node.bindings}
         names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own

@@ -188,10 +188,10 @@ def _too_far(plan: ArrayPlan) -> Diagnostic:
 
 
 class Weighed(Protocol):
-    """Requirement with its weight, such as `stlc.compile.pipeline.CompiledRequirement`."""
+    """Protocol of a weighted requirement; `stlc.compile.pipeline.CompiledRequirement` implements it."""
 
     def under(self, semantics: Semantics) -> ir.Formula:
-        """Formula of the requirement, simplified, with times counted in steps.
+        """Return the formula of the requirement, simplified, with times counted in steps.
 
         The simplification uses only laws of min and max that hold in `semantics`.
         """

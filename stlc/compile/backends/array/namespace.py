@@ -113,7 +113,7 @@ class Ops(Protocol):
         """Elementwise disjunction of masks."""
 
     def settled(self, weight: Array, mask: Mask) -> Array:
-        """Array that is 1 where `mask` is True, else 0, with the gradient of `weight`."""
+        """Array that is 1 where `mask` is True, else 0; its gradient is that of `weight`."""
 
     def number(self, mask: Mask, like: Array) -> Array:
         """Array that is 1 where `mask` is True, else 0, in the dtype of `like`."""
@@ -165,14 +165,15 @@ class Ops(Protocol):
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
         """Exact extrema over the sliding windows `window`: `(time, batch)` -> `(count, batch)`.
 
-        `pick` is "max" or "min". The result is None if a combination of other operations is faster; the
-        caller then uses these.
+        `pick` is "max" or "min". The result is None if a combination of other operations is faster. The
+        caller then uses that combination.
         """
 
     def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
         """Exact `until` (`pick` "max") or `release` ("min") over windows, (time, batch) -> (count, batch).
 
-        The result is None if a combination of other operations is faster; the caller then uses these.
+        The result is None if a combination of other operations is faster. The caller then uses that
+        combination.
         """
 
     # constants and shapes
@@ -189,7 +190,7 @@ class Ops(Protocol):
         """Array of a constant, with dtype and device of `like`."""
 
     def counted(self, first: int, count: int, like: Array) -> Array:
-        """Array `first`, `first + 1`, … along time, `(count, batch)`.
+        """Array of the numbers `first`, `first + 1`, … along time, `(count, batch)`.
 
         Batch size, dtype and device are those of `like`.
         """

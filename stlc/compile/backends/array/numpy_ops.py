@@ -28,7 +28,7 @@ _LARGE_KERNEL = 1 << 16
 
 @final
 class NumpyOps:
-    """`backends.array.namespace.Ops` for NumPy arrays, without gradients."""
+    """Implementation of `stlc.compile.backends.array.namespace.Ops` for NumPy arrays, without gradients."""
 
     name = "numpy"
 
@@ -67,7 +67,7 @@ class NumpyOps:
         return np.sqrt(reduce(operator.add, (np.square(part) for part in components)))
 
     def settled(self, weight: Array, mask: Mask) -> Array:
-        """Array that is 1 where `mask` is True, else 0."""
+        """Array that is 1 where `mask` is True, else 0, with the shape and dtype of `weight`."""
         return np.broadcast_to(np.asarray(mask, dtype=weight.dtype), weight.shape)
 
     def number(self, mask: Mask, like: Array) -> Array:
@@ -148,9 +148,9 @@ class NumpyOps:
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Return None, one common key for all arrays.
+        """Return None for every array, so that all arrays share converted constants.
 
-        Constants are converted once per key. Here they stay Python floats, which suit every array.
+        A converted constant is just a Python float, which suits every array.
         """
         return None
 

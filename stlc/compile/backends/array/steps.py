@@ -1,8 +1,8 @@
 """Execution of an evaluation schedule (`stlc.compile.schedule.schedule`: a list of steps) over arrays.
 
 A step is one sub-formula at a range of instants; its values are an array `(count, batch)`. One program
-computes all predicates that are evaluated at the same instants. Every other step has a function of its own.
-The functions are built once for each semantics and array library, and cached.
+computes all predicates that are evaluated at the same instants. The step of every other sub-formula has its
+own function. The functions are built once for each semantics and array library, and cached.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class StepSource:
     Attributes:
         batch: index of the program in `ArrayPlan.batches`; None for a signal.
         name: name of the output, or of the signal.
-        inside: instants at which the predicate is defined.
+        inside: instants of the step at which the predicate is defined: all samples that it reads exist.
     """
 
     batch: int | None
@@ -82,8 +82,8 @@ class ArrayPlan:
     Attributes:
         schedule: the steps; a step is a sub-formula at a range of instants.
         batches: programs of the predicates.
-        predicates: step number of a predicate -> source of its values. A predicate that is defined at none of
-            its instants has no entry.
+        predicates: step number of a predicate -> source of its values. If the predicate is undefined at all
+            instants of the step, there is no entry.
         beyond: number of instants beyond the last sample, summed over all steps.
         runners: (semantics, array library) -> functions of the steps, in order; they are built on first use.
     """
@@ -180,8 +180,8 @@ class Machine:
     def unknown(self) -> float:
         """Robustness of an unknown predicate: -inf in a lower bound, +inf in an upper bound.
 
-        If both bounds are computed together (`end` of the domain is "both"), the batch holds one trace per
-        bound. The result is then an array of the two values.
+        If `domain.end` is "both", a batch consists of two copies of the trace, one for each bound. The result
+        is then the array [-inf, inf].
         """
         if self.domain.end == "both":
             both: Any = np.array([-math.inf, math.inf])
@@ -191,8 +191,9 @@ class Machine:
     def predicate(self, node: ir.Predicate, run: IndexRange, inside: IndexRange) -> Kernel:
         """Return the function that extends a predicate's values from the instants `inside` to all of `run`.
 
-        The predicate is defined at the instants `inside` only. At the others it is unknown if the trace is
-        open (continues beyond its last sample), and false otherwise.
+        At instants of `run` that are not `inside`, the predicate `node` is undefined. It is unknown there if
+        the trace is open (continues beyond its last sample). Otherwise a predicate is false there, and a
+        negated predicate is true.
         """
         outside = self.unknown if self.domain.open else -node.sign * math.inf
         if inside.count <= 0:
@@ -251,9 +252,9 @@ class Machine:
     def _future(self, window: ir.Window, run: IndexRange, operands: int, pick: Pick) -> Kernel:
         """Function that computes a temporal operator over future windows at the instants `run`.
 
-        The function computes an extremum of one operand, or `until` of two. If a trace is open, it continues
-        beyond its last known sample. An operator with an unbounded window is then unknown at instants whose
-        window starts beyond the final length of the trace.
+        The function computes an extremum of one operand, or `until` of two. An open trace continues beyond
+        its last known sample. On such a trace, an unbounded window may start beyond the final length of the
+        trace. At the instant of this window the operator is unknown.
 
         Args:
             window: window of the operator, relative to each instant.
@@ -289,7 +290,8 @@ class Machine:
     def _windows(self, window: ir.Window, operands: int, pick: Pick, rows: int) -> Kernel:
         """Function that computes extrema of one operand, or `until` of two, over `rows` sliding windows.
 
-        `window` contains the bounds of the windows, relative to an instant. `pick` is "max" or "min".
+        `window` holds the bounds of a window in steps, counted from the instant of the window. `pick` is
+        "max" or "min".
         """
         extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1
@@ -354,7 +356,10 @@ def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
 
 
 def _predicate(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
-    """Return the function that reads a predicate's values from its program's outputs, or from a signal."""
+    """Return the function that computes the values of `step`, whose formula is a predicate.
+
+    The function reads the margin of the predicate from an output of a program, or directly from a signal.
+    """
     source, domain = plan.predicates.get(step.number), plan.schedule.domain
     if source is None:
         kernel = machine.predicate(step.node, step.run, spanning(step.run.start, 0))
@@ -382,7 +387,7 @@ def _frozen(node: ir.Freeze, run: IndexRange, machine: Machine) -> Runner:
 def _judge(
     formula: ir.Formula, env: Mapping[str, Array], run: IndexRange, domain: TraceDomain, *, windows: Windows
 ) -> Array:
-    """Robustness of one formula at consecutive instants, which may lie beyond the trace: `(count, batch)`."""
+    """Robustness `(count, batch)` of one formula at the instants `run`, which may lie beyond the trace."""
     plan = _scheduled(formula, run, domain)
     return all_values(plan, env, windows)[plan.schedule.roots[0]]
 

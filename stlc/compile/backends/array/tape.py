@@ -25,9 +25,9 @@ class Instr:
     """Array operation.
 
     Attributes:
-        kernel: name of the operation. This is a method of `Ops` (array library) or of `Switch` (conditions as
-            numbers), or one of three special names. `input` reads a signal, `extern` calls a function of the
-            system, and `pick` selects a component of that function's result.
+        kernel: name of the operation. This is a method of `Ops` (array library), a method of `Switch` (which
+            converts conditions to numbers), or one of three special names. `input` reads a signal, `extern`
+            calls a function of the system, and `pick` selects a component of that function's result.
         args: operands, each a register number or a constant.
         params: further arguments of the operation, after the operands.
     """
@@ -54,7 +54,10 @@ class GradientTape:
         return register
 
     def parts(self, operand: Operand, kernel: str) -> tuple[Operand, ...] | None:
-        """Operands of the instruction that computes `operand`; None if this is not an operation `kernel`."""
+        """Operands of the instruction that computes `operand`.
+
+        The result is None if `operand` is a constant, or the instruction is not the operation `kernel`.
+        """
         if isinstance(operand, float) or self.code[operand].kernel != kernel:
             return None
         return self.code[operand].args

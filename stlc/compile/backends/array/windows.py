@@ -40,7 +40,7 @@ class Windows:
     ops: Ops
 
     def padded(self, x: Array, rows: int, value: float) -> Array:
-        """The first `rows` rows of `x`; if `x` has fewer, rows of `value` are appended."""
+        """The first `rows` rows of `x`; if `x` has fewer, rows filled with `value` are appended."""
         if x.shape[0] >= rows:
             return x[:rows] if x.shape[0] > rows else x
         missing = self.ops.full((rows - x.shape[0], *x.shape[1:]), value, x)
@@ -69,10 +69,10 @@ class Windows:
         return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
 
     def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
-        """Tiles of a long trace, which are computed one after the other; empty if one tile suffices.
+        """Divide the computation on a long trace into tiles, which are computed one after the other.
 
-        A tile is a pair of slices. The first slice selects the windows to compute, the second one the rows
-        that these windows read.
+        Returns a pair of slices for each tile: the windows to compute, and the rows that these windows read.
+        The list is empty if no division is needed.
         """
         if self.ops.name != "numpy" or not self.semantics.exact:
             return []
@@ -111,10 +111,10 @@ class Windows:
         return self.semantics.finish(total, pick, self.ops)
 
     def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
-        """Merge the partial extremum of each block of rows with that of the block `shift` rows later.
+        """Join each block of rows in `a` with the block in `b` that starts `shift` rows later.
 
-        Row j of `a` belongs to the block that starts at row j. It is the partial extremum of this block, in
-        the form `Parts` of the semantics. The same holds for `b`.
+        `a` and `b` contain partial results (`Parts`), from which the semantics computes an extremum. Row j is
+        the partial result of the block that starts at row j. The joined blocks are returned in the same form.
         """
         rows = min(a[0].shape[0], b[0].shape[0] - shift)
         return self.semantics.merge(
@@ -246,10 +246,10 @@ class Windows:
         """`until` over windows of `width` rows, by about log2(width) rounds that join adjacent blocks.
 
         Every window must lie within the array. A block has two values: the least `left` in the block
-        (`held`), and `until` within the block (`met`). At first every block is one row. In the loop, row j of
-        `held` and `met` belongs to the block of `size` rows that starts at row j. Row j of `total` belongs to
-        the first `done` rows of window j.
+        (`held`), and `until` within the block (`met`). The arguments contain blocks of one row each.
         """
+        # Row j of `held` and `met` belongs to the block of `size` rows that starts at row j. Row j of `total`
+        # belongs to the first `done` rows of window j.
         size, done = 1, 0
         total: tuple[Array, Array] | None = None
         while True:
@@ -265,9 +265,9 @@ class Windows:
     def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
         """Join each block of rows in `a` with the adjacent later block in `b`.
 
-        A block is given by two values: the least `left` over its rows, and `until` within the block. For
-        `pick` "min", they are the greatest `left`, and `release`. The result gives the joined blocks in the
-        same form.
+        A block has two values: the least `left` over its rows, and `until` within the block. For `pick`
+        "min", the values are the greatest `left`, and `release` within the block. The joined blocks are
+        returned in the same form.
         """
         rows = min(a[0].shape[0], b[0].shape[0])
         pair, other = self.semantics.pair, dual(pick)

@@ -1,9 +1,9 @@
 """C code for the gradient of robustness and states with respect to plans (control sequences).
 
-First the code of `emit` computes the states and the robustness. Then the gradient is computed in reverse:
-through the formulas back to the states, and through the steps of the system back to the controls. Minimum and
-maximum are exact, and the first of equal operands gets the gradient. The code works on sixteen trajectories
-at a time.
+First the states and the robustness are computed (by the code of the module `emit`). Then the gradient is
+computed in reverse: through the formulas back to the states, and through the steps of the system back to the
+controls. Minimum and maximum are exact, and the first of equal operands gets the gradient. The code works on
+sixteen trajectories at a time.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def emit_adjoint(
     Args:
         motion: one step of the system.
         formulas: the requirements.
-        fixed: names of states. No gradient is propagated back through the update of these states.
+        fixed: names of states whose next value is treated as a constant: no gradient passes through it.
         end: treatment of windows that extend beyond the end of a plan.
 
     Raises:
@@ -88,8 +88,8 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
     """C code that propagates the gradient one step back in time.
 
     The gradient with respect to the states at sample k + 1 is passed to the states and controls at sample k.
-    Several trajectories are computed side by side; the code is for one of them, number `j`. No gradient is
-    propagated through the update of a state in `fixed`.
+    Several trajectories are computed side by side; the code is for one of them, number `j`. The next value of
+    a state in `fixed` is treated as a constant: no gradient passes through it.
     """
     index = state_index(motion)
     writer = SlopeWriter(place_in_step(motion), soft=True)

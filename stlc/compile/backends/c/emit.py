@@ -75,9 +75,9 @@ class Motion:
 
 
 def emit(motion: Motion, formulas: Sequence[ir.Formula], end: End = "strict") -> str:
-    """Return the C source of `judge` (robustness) and `climb` (local search), described in `stlc.native`.
+    """Return the C source of the functions `judge` (robustness) and `climb` (local search).
 
-    With `end` "truncate", windows are cut at the end of the plan.
+    `stlc.native` describes these functions. With `end` "truncate", windows are cut at the end of the plan.
 
     Raises:
         Untranslatable: the IR has a node without a C form.
@@ -105,7 +105,7 @@ def state_index(motion: Motion) -> dict[str, int]:
 
 
 def passes(motion: Motion, plan: Plan) -> list[str]:
-    """Return the C functions `roll`, which computes states, and `check`, which computes the robustness."""
+    """Return the lines of the C functions `roll` (computes states) and `check` (computes robustness)."""
     blocks = forward_blocks(plan, state_index(motion))
     return [
         "typedef double lane[LANES];",

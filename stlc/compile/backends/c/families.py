@@ -107,8 +107,7 @@ def _family(formulas: Sequence[ir.Formula], members: Sequence[int], number: int)
 def _entries(formula: ir.Formula) -> list[Entry]:
     """Constants and signals of a formula that may differ between the members of a family.
 
-    They are listed in order of occurrence. A constant exponent is left out, for instance, since it must not
-    differ.
+    They are listed in order of occurrence. Constants that must not differ, such as exponents, are left out.
     """
     found: list[Entry] = []
 

@@ -30,7 +30,7 @@ class Frame:
 
 
 def in_parts(frame: Frame, blocks: Sequence[Sequence[str]], buffers: Mapping[str, str]) -> list[str]:
-    """Split a long C function into parts: return the functions of the parts, then one that calls them.
+    """Split a long C function into short ones; return these, then a function that calls them in order.
 
     Args:
         frame: name, arguments and local statements of the function.

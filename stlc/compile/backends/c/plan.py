@@ -1,9 +1,9 @@
-"""Evaluation schedule of formulas from which the C code is printed, with memory for all values.
+"""Evaluation schedule of formulas with memory for all values; the C code is printed from this schedule.
 
 A `freeze` is computed in a loop over its instants. Sub-formulas that do not read the frozen values are
 computed before the loop. Requirements that differ in parameters only are computed in a loop over a table of
-the parameters (`families`); so are operands of `and` and `or`. A function of signals is computed once for all
-samples.
+the parameters (`families`). The same holds for operands of `and` and `or`. A function call with signals as
+arguments, such as `f(x, y)`, is computed once, for all samples.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Buffer:
         name: name of the C array.
         origin: instant of the first row.
         rows: number of instants.
-        place: start of the array in the working memory, as a number of doubles per trajectory.
+        place: offset of the array in the working memory, in doubles per trajectory.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Loop:
         index: C name of the loop index.
         steps: steps that are computed in every iteration.
         own: step numbers of all values that an iteration overwrites, in order of allocation.
-        root: step number of an iteration's result.
+        root: number of the step whose value is the result of an iteration.
     """
 
     index: str
@@ -160,9 +160,10 @@ class Plan:
 
 
 def plan_of(formulas: Sequence[ir.Formula], samples: int, end: End = "strict") -> Plan:
-    """Return the schedule, with its memory, that evaluates formulas at the first sample of a trajectory.
+    """Return the schedule that evaluates `formulas` at the first sample of a trajectory.
 
-    With `end` "truncate", windows are cut at the last sample.
+    The schedule includes the memory of its steps. The trajectory has `samples` samples. With `end`
+    "truncate", windows are cut at the last sample.
 
     Raises:
         Untranslatable: a formula needs samples outside of the trajectory.
@@ -180,7 +181,8 @@ class _Scope(StepScope):
     """Group of steps: the whole schedule, the body of a `freeze`, or the body of a loop over a table.
 
     Attributes:
-        read: names of the values that change in every iteration of the loop; empty for the whole schedule.
+        read: names of the values that the steps may read and that change from iteration to iteration; empty
+            for the whole schedule.
         table: whether the group is the body of a loop over a table.
         own: numbers of the steps in the group.
     """
@@ -204,9 +206,9 @@ class _Planner(Scheduler):
         self._loops = 0
 
     def place(self, node: ir.Formula, run: IndexRange) -> int | None:
-        """Return the number of the step that computes a formula at `run`; None if `run` is empty.
+        """Return the number of the step that computes `node` at the instants `run`; None if `run` is empty.
 
-        A new step is added outside of all loops on which its value does not depend.
+        If there is no such step yet, it is added, outside of all loops on which its value does not depend.
         """
         node = _split(node)
         depth = self._depth(node)
@@ -243,7 +245,7 @@ class _Planner(Scheduler):
         return max((depth for depth, scope in enumerate(self.scopes) if read & scope.read), default=0)
 
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
-        """Add the step that computes a formula at the instants `run`; return its number.
+        """Add the step that computes the formula `node` at the instants `run`; return the step's number.
 
         Raises:
             Untranslatable: the formula needs samples outside of the trajectory.
@@ -286,7 +288,7 @@ class _Planner(Scheduler):
         return number
 
     def _join(self, node: ir.BoolOp, pick: Pick, items: Sequence[ir.Formula], run: IndexRange) -> int:
-        """Add the step that computes an `and` or `or` as a minimum or maximum; return its number.
+        """Add the step that computes `and` as a minimum or `or` as a maximum; return the step's number.
 
         Operands that differ in parameters only (a family) are computed by one step, as a loop over a table.
         """

@@ -1,9 +1,9 @@
 """C code of the steps of a schedule: forward code computes values, adjoint code computes gradients.
 
-For each kind of step there is a class that prints both codes (`FORMS`). The states come from a rollout. The
-innermost loop runs over trajectories and is vectorized. `gb7` is the gradient with respect to buffer `b7`,
-and `gx` the gradient with respect to the states. The gradient of a minimum or maximum goes to the first of
-equal operands.
+For each kind of step there is a class that prints both codes (`FORMS`). The states are already known from a
+simulation. The innermost loop runs over trajectories and is vectorized. `gb7` is the gradient with respect to
+buffer `b7`, and `gx` the gradient with respect to the states. The gradient of a minimum or maximum goes to
+the first of equal operands.
 
 If a step is a loop over other steps, the adjoint code recomputes the body of the loop. Iterations whose
 gradient is zero are skipped. Windows that all end with the trace, or all begin with it, are computed by one
@@ -64,7 +64,7 @@ class StepPrinter:
 
 
 class StepForm(ABC):
-    """C code of one step of a schedule, forward and adjoint."""
+    """Printer of the C code of one step: `forward` for its values, `backward` for the gradients."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         self.printer, self.plan, self.step = printer, printer.plan, step
@@ -103,11 +103,11 @@ def _indented(lines: Iterable[str], by: int = 2) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class LeafReader:
-    """Function from a leaf of an expression (signal, call, frozen value) to its C expression at sample `k`.
+    """Function that returns the C expression of a leaf (signal, call, frozen value) at sample `k`.
 
     Attributes:
         printer: printer of the step that contains the expression.
-        indices: C name of a sample index that is clamped to the trajectory -> its C expression.
+        indices: C name of a sample index -> its C expression, for indices that are clamped to the trajectory.
     """
 
     printer: StepPrinter
@@ -127,8 +127,8 @@ class LeafReader:
     def _instant(self, leaf: ir.Num) -> str:
         """C expression of the index of the sample at which a signal is read.
 
-        A clamped read repeats the first or last sample outside the trajectory. For such a read, the result is
-        a C variable that `heads` declares.
+        If the sample may lie outside the trajectory, a clamped read gives the first or last sample instead.
+        The result is then a C variable that `heads` declares.
         """
         if not isinstance(leaf, ir.ShiftedSignal):
             return "k"
@@ -206,7 +206,7 @@ class _Margin(StepForm):
 
 
 class _Call(StepForm):
-    """C code of a function of signals: all its components, at all samples."""
+    """C code of a function call with signals as arguments: all its results, at all samples."""
 
     def __init__(self, printer: StepPrinter, step: Step) -> None:
         super().__init__(printer, step)
@@ -214,7 +214,7 @@ class _Call(StepForm):
         self.outs = self.plan.buffers[step.number : step.number + len(self.parts)]
 
     def _place(self, leaf: Leaf) -> str | None:
-        """C expression of a signal at sample `k`; None for other leaves, which are inlined."""
+        """C expression of a signal at sample `k`; None for a function: its body is then written in place."""
         return column(self.printer.index, leaf.name, "k") if isinstance(leaf, ir.Signal) else None
 
     def forward(self) -> list[str]:
@@ -459,16 +459,20 @@ class _Until(_Windowed):
         ]
 
     def _step(self) -> str:
-        """C expression `u(k) = min(left(k), max(right(k), u(k + 1)))`, or its dual (min for max)."""
+        """C expression of `until` at `k`: `min(left(k), max(right(k), until(k + 1)))`.
+
+        For past operators, k - 1 replaces k + 1. For `release`, min and max are exchanged.
+        """
         reached = f"{self.pick}({self.args[1]['k']}, {self.before})"
         return f"{self.dual}({self.args[0]['k']}, {reached})"
 
     def _scan_back(self) -> list[str]:
         """C statements that pass the gradient of the value at `k` to the operand that attains the value.
 
-        They search the window for the first instant at which the value is attained. If `right` attains the
-        value, `right` gets the gradient at that instant. Otherwise `left` gets the gradient, at the instant
-        from `k` on at which `left` is worst so far.
+        For `until`, the value is the maximum over the window of `min(right[i], left[k], …, left[i])`. The
+        statements search for the first `i` whose minimum equals the value. If this minimum is `right[i]`,
+        then `right` gets the gradient at `i`. Otherwise `left` gets it, at the sample of its least value. For
+        `release`, minimum and maximum are exchanged.
         """
         out, (left, right), less = self.out["k"], self.args, _LESS[self.dual]
         near, far = self._outwards()

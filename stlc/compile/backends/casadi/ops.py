@@ -1,8 +1,8 @@
 """Array operations on CasADi expressions (Andersson et al. 2019), for nonlinear programs.
 
-An array is `(time, 1)`, since a program is about one trajectory. Kinks of functions (`abs`, `min`, `max`,
-`clip`) are rounded within `ROUNDING`, so that Newton's method applies. Step functions (`floor`, `sign`) stay
-exact, with derivative 0. CasADi comes with the extra `stlc[mpc]`.
+An array is `(time, 1)`, since a nonlinear program computes one trajectory. Kinks of functions (`abs`, `min`,
+`max`, `clip`) are rounded over the width `ROUNDING`, so that Newton's method applies. Step functions
+(`floor`, `sign`) stay exact, with derivative 0. CasADi comes with the extra `stlc[mpc]`.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def _each(*functions: Any) -> list[Any]:
 
 @final
 class CasadiOps:
-    """`stlc.compile.backends.array.namespace.Ops` for CasADi expressions."""
+    """Implementation of `stlc.compile.backends.array.namespace.Ops` for CasADi expressions."""
 
     name = "casadi"
 
@@ -178,7 +178,7 @@ class CasadiOps:
     # ------------------------------------------------------------------- truth
 
     def settled(self, weight: SymbolicColumn, mask: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
-        """Return `weight` unchanged, not 0 or 1 as `mask` says, since the program must be smooth."""
+        """Return `weight` unchanged. The exact truth `mask`, 0 or 1, would not be smooth."""
         return weight
 
     def number(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
@@ -269,9 +269,9 @@ class CasadiOps:
     # ------------------------------------------------------ constants and shapes
 
     def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """Return None, one common key for all arrays.
+        """Return None for every array, so that all arrays share converted constants.
 
-        Constants are converted once per key. Here they stay Python floats, which suit every array.
+        A converted constant is just a Python float, which suits every array.
         """
         return None
 
@@ -304,7 +304,7 @@ class CasadiOps:
         return x[::-1]
 
     def rows(self, keep: NDArray[np.bool_], x: SymbolicColumn, value: float) -> SymbolicColumn:
-        """Copy of `x` in which the samples where `keep` is False have the value `value`."""
+        """Copy of `x` with `value` at the samples where `keep` is False."""
         blank = casadi.SX(value)
         return SymbolicColumn(casadi.vertcat(*(x[k].entries if keep[k] else blank for k in range(len(x)))))
 
@@ -318,9 +318,9 @@ class CasadiOps:
 
 
 def _rounded(a: Any, b: Any, sign: float) -> Any:
-    """Maximum (`sign` 1) or minimum (-1) of two expressions, rounded around the kink.
+    """Maximum (`sign` 1) or minimum (`sign` -1) of `a` and `b`, smooth also where `a` equals `b`.
 
-    The error vanishes far from the kink.
+    The error vanishes where `a` and `b` are far apart.
     """
     return 0.5 * (a + b + sign * casadi.sqrt((a - b) ** 2 + ROUNDING**2))
 

@@ -2,8 +2,8 @@
 
 All states that controls affect are variables of the program; the dynamics are equality constraints (Bock &
 Plitt 1984). States that no control affects are parameters of the program. If a state is clamped to a range,
-its variable is bounded to this range. The correction by the clamp is a further variable in the dynamics,
-which the cost penalises.
+its variable is bounded to this range. A further variable in the dynamics is the correction by the clamp. The
+cost penalises this correction.
 
 A formula requires conditions at certain samples. Each condition is a constraint
 `value + shortfall >= margin`. All these constraints share the variable `shortfall`, which the cost minimises.
@@ -104,7 +104,7 @@ class Motion:
         return frozenset(found)
 
     def needed(self, columns: Iterable[str]) -> frozenset[str]:
-        """Names of `columns`, and of the signals and intermediate variables on which they depend."""
+        """Return the names `columns`, and the names of all signals and variables on which these depend."""
         table: dict[str, set[str]] = {}
         for name, num in (*self.lets, *self.step.items()):
             table.setdefault(name, set()).update(_names(num))
@@ -326,7 +326,10 @@ def _initial(num: ir.Num) -> set[str]:
 
 
 def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
-    """Raise NotSmoothError if an expression is discontinuous at a place that depends on the controls."""
+    """Raise NotSmoothError if an expression has a discontinuity that depends on the controls.
+
+    `reached` contains the names of the controls, and of all signals that the controls affect.
+    """
     for part in subexpressions(num):
         match part:
             case ir.Op(name) if name in STEPS and _names(part) & reached:
@@ -346,5 +349,5 @@ def _holds(row: SymbolicColumn) -> bool:
 
 
 def _tall(column: SymbolicColumn, rows: int) -> SymbolicColumn:
-    """Repeat a constant over `rows` samples; a series of that length is returned unchanged."""
+    """Repeat `column` over `rows` samples if it is a single value; otherwise return it unchanged."""
     return column if len(column) == rows else CASADI.cat([column] * rows)

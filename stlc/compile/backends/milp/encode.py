@@ -52,8 +52,8 @@ class Conditional:
 
     Attributes:
         yes, no: the value if the condition holds, and the value if it fails.
-        holds: the condition as a tree.
-        fails: negation of the condition as a tree.
+        holds: the condition, as a tree of affine conditions.
+        fails: the negation of the condition, in the same form.
     """
 
     yes: Expression
@@ -121,8 +121,8 @@ class Demand:
 
     Attributes:
         formula: formula of the IR.
-        margin: least robustness of each predicate in the formula, as an affine form. Predicates on time only
-            need to be true.
+        margin: least robustness of each predicate in the formula, as an affine form. It does not apply to
+            predicates on time alone, which only need to be true.
     """
 
     formula: ir.Formula
@@ -215,7 +215,7 @@ class Encoding:
         return [self._tree(each.formula, 0, each) for each in requirements]
 
     def _invariants(self, requirements: Sequence[Demand], row: Row, k: int) -> None:
-        """Tighten the bounds of the states of sample `k` by conditions that hold in every satisfying plan.
+        """Tighten the bounds of the states at sample `k`, using conditions that the requirements imply there.
 
         `row` maps the name of a signal to its value at sample `k`. If one of the conditions cannot hold, the
         model is marked as infeasible.
@@ -310,7 +310,7 @@ class Encoding:
             samples: samples of the window, at one of which `right` must hold.
             left: left operand.
             right: right operand.
-            margin: requirement that the formula belongs to.
+            margin: requirement that contains the formula; it gives the least robustness of each predicate.
         """
         inner, outer = ("and", "or") if strong else ("or", "and")
         found = []
@@ -352,7 +352,7 @@ class Encoding:
         raise UnencodableError("a condition over time")
 
     def _condition(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
-        """`value >= margin` as a tree of affine conditions.
+        """Condition `value >= margin` as a tree of affine conditions.
 
         Each operand of a maximum, and each branch of a conditional value, becomes a condition of its own.
         `num` is the source expression of `value`; error messages show it.
@@ -375,7 +375,7 @@ class Encoding:
         return self._polynomial(value, margin, num)
 
     def _polynomial(self, value: Expression, margin: Affine, num: ir.Num) -> Tree:
-        """`value >= margin` as a tree, for an affine or quadratic value without maxima and conditionals.
+        """Condition `value >= margin` as a tree, if `value` is affine or quadratic without other atoms.
 
         `num` is the source expression of `value`; error messages show it.
         """
@@ -437,9 +437,9 @@ class Encoding:
         return self._circle(constant(-sign * math.sqrt(-rest)), sign, tuple(parts), ZERO)
 
     def _circle(self, form: Affine, factor: float, parts: Sequence[Affine], margin: Affine) -> Tree:
-        """`form + factor * norm(parts) >= margin`, with a polygon instead of the circle.
+        """Condition `form + factor * norm(parts) >= margin`, with a polygon in place of the circle.
 
-        The condition becomes stronger in a tight encoding and weaker in a relaxed one.
+        By this replacement the condition becomes stronger in a tight encoding and weaker in a relaxed one.
         """
         if len(parts) == 1:
             both = (form.plus(parts[0], factor), form.plus(parts[0], -factor))
@@ -522,7 +522,7 @@ class Encoding:
         return self._greatest([above.times(-1.0), args[2].times(-1.0)]).times(-1.0)
 
     def _greatest(self, items: Sequence[Expression]) -> Expression:
-        """Maximum of values; values that cannot be the greatest, by their bounds, are left out."""
+        """Maximum of values. A value that is never the greatest, as the bounds show, is left out."""
         ends = [(-math.inf, math.inf) if v.atoms else self.model.bounds(v.form) for v in items]
         least = max(low for low, _ in ends)
         left = [i for i, (_, high) in enumerate(ends) if high > least]

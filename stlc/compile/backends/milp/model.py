@@ -1,9 +1,9 @@
 """Mixed-integer linear models: variables with bounds, affine forms, linear constraints, conditions.
 
-A tree of conditions is a conjunction or disjunction of affine conditions. Each condition is tied to a binary
-variable in one direction only: if the variable is 1, the condition holds. The constraint for this has a
-constant (big-M) that makes it void if the variable is 0. The constant is the least one that the bounds of the
-variables in the constraint allow.
+A tree of conditions joins affine conditions by `and` and `or`. A condition is implied by a binary variable:
+if the variable is 1, the condition holds; if it is 0, the condition may hold or fail. The implication is a
+linear constraint with a large constant (big-M), so that the constraint has no effect if the variable is 0.
+The constant is the least one that the bounds of the variables in the constraint allow.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Leaf:
 
     Attributes:
         form: affine form.
-        margin: affine form that `form` must reach. An example is the variable of the robustness that is
-            maximised. For predicates on time, the margin is 0.
+        margin: affine form that `form` must reach. If the robustness is maximised, the margin contains the
+            variable of the robustness. For predicates on time, the margin is 0.
         literal: index of the binary variable that implies the condition; None until one is needed.
     """
 

@@ -47,7 +47,10 @@ def _comparison(op: str) -> Callable[[OnnxOps, Number, Number], Value]:
 
 @final
 class OnnxOps:
-    """`stlc.compile.backends.array.namespace.Ops` for symbolic values; min and max propagate NaN."""
+    """Implementation of `stlc.compile.backends.array.namespace.Ops` for symbolic arrays.
+
+    If an operand of min or max is NaN, so is the result.
+    """
 
     name = "onnx"
 
@@ -217,7 +220,7 @@ class OnnxOps:
 
 
 def _negative(x: Value) -> Value:
-    """Mask of negative numbers, -0 included."""
+    """Mask that is True where `x` is negative or -0."""
     return ONNX_OPS.where(x.apply("Equal", 0.0, kind="bool"), 1.0 / x, x).apply("Less", 0.0, kind="bool")
 
 
@@ -249,7 +252,7 @@ Columns = dict[str, Value]
 
 
 def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, count: int = 1) -> list[Value]:
-    """Return the exact robustness at the first `count` samples.
+    """Return the exact robustness of `formulas` at the first `count` samples.
 
     Args:
         formulas: formulas in negation normal form.

@@ -105,7 +105,7 @@ def reduction(x: Tensor, pick: Pick) -> Tensor:
 class _Windows(torch.autograd.Function):
     """Autograd function: extrema over windows, or `until`, by the C kernel.
 
-    The whole gradient goes to one of several equal rows.
+    If several rows are equal, one of them gets the whole gradient.
     """
 
     @staticmethod
@@ -185,7 +185,7 @@ def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Ten
 
 
 def _gathered(x: Tensor, fill: float, window: Sliding) -> Tensor:
-    """All windows as one array, `(count, batch, width)`; rows beyond the array are `fill`."""
+    """All windows as one array, `(count, batch, width)`; rows beyond the array have the value `fill`."""
     missing = window.count + window.width - 1 - window.rows
     filled = pad(x, (0, 0, 0, missing), value=fill) if missing > 0 else x
     return _first(filled.unfold(0, window.width, 1), window.count)

@@ -126,9 +126,10 @@ def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
 
 @final
 class TorchOps:
-    """`stlc.compile.backends.array.namespace.Ops` for torch tensors; results keep dtype and device.
+    """Implementation of `stlc.compile.backends.array.namespace.Ops` for torch tensors.
 
-    Operands are `(time, batch)` or of any shapes that broadcast; reductions over time give `(1, batch)`.
+    Results keep dtype and device. Operands are `(time, batch)`, or of any shapes that broadcast. Reductions
+    over time give `(1, batch)`.
     """
 
     name = "torch"
@@ -183,7 +184,7 @@ class TorchOps:
         return torch.where(positive, torch.where(positive, total, 1.0).sqrt(), total)
 
     def settled(self, weight: Tensor, mask: Mask) -> Tensor:
-        """Array that is 1 where `mask` is True, else 0, with the gradient of `weight`."""
+        """Array that is 1 where `mask` is True, else 0; its gradient is that of `weight`."""
         return weight + (self.number(mask, weight) - weight.detach())
 
     def number(self, mask: Mask, like: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""Semantics selected by `--robustness` and `semantics=`: one file each, registered in `SEMANTICS`."""
+"""Robustness semantics, one file each: the values of `--robustness` and `semantics=`."""

@@ -1,8 +1,8 @@
 """Mean-based semantics: extrema replaced by means of all operands with the same sign.
 
 If all operands are positive, their minimum becomes their geometric mean, in which the smallest operand has
-the most weight. Otherwise it becomes a power mean of the negative operands, in which the others count as 0. A
-maximum is `max(x) = -min(-x)`. Both means are functions of sums over the operands.
+the most weight. Otherwise it becomes a power mean of the operands, in which those that are not negative count
+as 0. A maximum is `max(x) = -min(-x)`. Both means are functions of sums over the operands.
 """
 
 from __future__ import annotations
