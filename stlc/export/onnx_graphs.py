@@ -442,10 +442,9 @@ def deciding(task: Task, network: PlanNetwork, *, varied: bool = True) -> dict[s
         Untranslatable: a part of the task has no ONNX form.
     """
     state = OnnxGraph().input("state", (BATCH, len(task.system.names)))
-    plans = _options(task, network, state, varied=varied)
-    table = _table(task, state, plans)
-    tried = varied and len(network.changes) > 0
-    return _shown(_picked(table, _chosen(table, plans.shape[1], tried))) | _added(task, state)
+    table = _table(task, state, proposed(task, network, columns_of(state, task.system.names)))
+    policy = _picked(table, _best(table["rank"]))
+    return _shown(_varied(task, network, state, policy) if varied else policy) | _added(task, state)
 
 
 def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
@@ -464,50 +463,55 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     sheet = OnnxGraph()
     state = sheet.input("state", (BATCH, len(task.system.names)))
     begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.decl.controls)))
-    fresh = _options(task, network, state)
+    fresh = proposed(task, network, columns_of(state, task.system.names))
     count = fresh.shape[1]
     table = _table(task, state, joined([fresh, begun.reshaped(BATCH, 1, *begun.shape[1:])], axis=1))
-    best = _chosen(table, count, len(network.changes) > 0)
-    policy = _picked(table, best)
-    better = ONNX_OPS.ge(_one(table["rank"], count), policy["rank"])
+    policy = _varied(task, network, state, _picked(table, _best(table["rank"].T[:count].T)))
+    rest = {name: _one(values, count) for name, values in table.items()}
+    better = ONNX_OPS.ge(rest["rank"], policy["rank"])
     if task.pending_goals.items:
-        better = ONNX_OPS.either(better, _one(table["deepened"], count))
-    kept = ONNX_OPS.both(better, ONNX_OPS.ge(_one(table["rho"], count), -TOLERANCE))
-    index = kept.reshaped(BATCH, 1).apply("Where", sheet.constant([[count]], "int64"), best, kind="int64")
+        better = ONNX_OPS.either(better, rest["deepened"])
+    kept = ONNX_OPS.both(better, ONNX_OPS.ge(rest["rho"], -TOLERANCE))
+    chosen = {
+        name: ONNX_OPS.where(kept.reshaped(BATCH, *[1] * (len(own.shape) - 1)), rest[name], own)
+        for name, own in _shown(policy).items()
+    }
     shown = {"kept": kept, "policy_plan": policy["plan"], "policy_rho": policy["rho"]}
-    return _shown(_picked(table, index)) | shown | _added(task, state)
+    return chosen | shown | _added(task, state)
 
 
-def _options(task: Task, network: PlanNetwork, state: Value, *, varied: bool = True) -> Value:
-    """Return the plans among which the policy selects, (batch, count, T, m), in `state` (batch, n).
+def _varied(task: Task, network: PlanNetwork, state: Value, policy: Mapping[str, Value]) -> dict[str, Value]:
+    """Replace a plan that violates phi by the best of the plan and its changed copies.
 
-    With `varied`, and if the network has changes to try, these are the best of the network's plans, and then
-    its changed copies; else all plans of the network.
+    The plan is the best of the network's plans; `policy` holds its results, (batch, …) each, as `_picked`
+    returns them. Changed copies are judged only if the plan of some agent violates the specification phi.
     """
-    plans = proposed(task, network, columns_of(state, task.system.names))
-    if not varied or not len(network.changes):
-        return plans
-    table = _table(task, state, plans)
-    best = _picked(table, _best(table["rank"]))["plan"].reshaped(BATCH, 1, *plans.shape[2:])
+    names = ("plan", "rank", "rho", "safe", "cost", "requirements")
+    if not len(network.changes):
+        return {name: policy[name] for name in names}
     bounds = task.system.control_low, task.system.control_high
-    changes, low, high = (
-        state.sheet.constant(numbers.double().numpy()) for numbers in (network.changes[None], *bounds)
-    )
-    return joined([best, (best + changes).apply("Max", low).apply("Min", high)], axis=1)
 
+    def changed(sheet: OnnxGraph) -> Sequence[Value]:
+        own = {name: policy[name].on(sheet) for name in names}
+        plan = own["plan"].reshaped(BATCH, 1, *own["plan"].shape[1:])
+        numbers = (network.changes[None], *bounds)
+        changes, low, high = (sheet.constant(each.double().numpy()) for each in numbers)
+        plans = joined([plan, (plan + changes).apply("Max", low).apply("Min", high)], axis=1)
+        table = _table(task, state.on(sheet), plans)
+        better = _picked(table, _best(table["rank"]))
+        good = ONNX_OPS.ge(own["rho"], -TOLERANCE)
+        return [
+            ONNX_OPS.where(good.reshaped(BATCH, *[1] * (len(own[name].shape) - 1)), own[name], better[name])
+            for name in names
+        ]
 
-def _chosen(table: Mapping[str, Value], count: int, varied: bool) -> Value:
-    """Index, (batch, 1), of the plan that the policy selects among the first `count` plans in `table`.
+    def as_proposed(sheet: OnnxGraph) -> Sequence[Value]:
+        return [policy[name].on(sheet).apply("Identity") for name in names]
 
-    If `varied`, the other plans are changed copies of plan 0, which count only if plan 0 violates the
-    specification.
-    """
-    best = _best(table["rank"].T[:count].T)
-    if not varied:
-        return best
-    good = ONNX_OPS.ge(_one(table["rho"], 0), -TOLERANCE).reshaped(BATCH, 1)
-    first = best.sheet.constant([[0]], "int64")
-    return good.apply("Where", first, best, kind="int64")
+    least = _reduced("ReduceMin", policy["rho"], (0,))
+    fails = least.apply("Less", -TOLERANCE, kind="bool").reshaped()
+    found = state.sheet.branched(fails, changed, as_proposed)
+    return dict(zip(names, found, strict=True))
 
 
 def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:

@@ -14,6 +14,7 @@ from stlc.compile.backends.onnx import sheet as sheets
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
+from stlc.controller.problem.task import satisfied
 from stlc.dynamics.model.algebra import substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.rollout import Stepper
@@ -118,6 +119,24 @@ def test_a_graph_takes_any_number_of_agents() -> None:
         plans = torch.ones(count, run.task.horizon, 1, dtype=torch.float64)
         found = computed(outputs, {"state": x.numpy(), "plan": plans.numpy()})
         np.testing.assert_allclose(found["rho"], run.task.judge(x, plans).rho, rtol=0.0, atol=1e-12)
+
+
+def test_changed_copies_are_judged_where_the_plan_of_some_agent_fails() -> None:
+    run, _ = exported("traffic", "car")
+    outputs = deciding(run.task, run.network)
+    assert {node.op for node in outputs["plan"].sheet.nodes} >= {"If"}
+    x = run.task.sample(60, seed=6, dtype=torch.float64)
+    proposed = run.policy.continuation(x)
+    good = satisfied(run.task.judge(x, proposed).rho)
+    assert set(good.tolist()) == {True, False}
+    plans, judged = run.plan_judged(x)
+    assert (plans != proposed)[~good].any()
+    for rows in (slice(None), good, ~good, slice(0, 1)):
+        found = computed(outputs, {"state": x[rows].numpy()})
+        np.testing.assert_allclose(found["plan"], plans[rows], rtol=0.0, atol=1e-4)
+        np.testing.assert_allclose(found["cost"], run.task.cost(judged)[rows], rtol=0.0, atol=1e-4)
+    alone = computed(deciding(run.task, run.network, varied=False), {"state": x.numpy()})
+    np.testing.assert_allclose(alone["plan"], proposed, rtol=0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("substeps", [1, 6])

@@ -40,7 +40,7 @@ class GraphNode:
     def reads(self) -> frozenset[str]:
         """Names of the values that the node reads.
 
-        If the node is a loop, they include values of the enclosing graph that the loop body reads.
+        If the node is a loop or a condition, they include values of the enclosing graph that its bodies read.
         """
         bodies = (value for _, value in self.attributes if isinstance(value, GraphBody))
         return frozenset(self.inputs).union(*(body.around for body in bodies))
@@ -48,11 +48,11 @@ class GraphNode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphBody:
-    """Body of a loop: a graph inside a node.
+    """Body of a loop, or branch of a condition: a graph inside a node.
 
     Attributes:
-        sheet: graph of one iteration; `sheet.inputs` are its inputs.
-        outputs: values that each iteration returns.
+        sheet: graph of one iteration or of the branch; `sheet.inputs` are its inputs.
+        outputs: values that each iteration, or the branch, returns.
     """
 
     sheet: OnnxGraph
@@ -60,7 +60,7 @@ class GraphBody:
 
     @property
     def nodes(self) -> list[GraphNode]:
-        """Nodes that an iteration needs, in order."""
+        """Nodes that an iteration or the branch needs, in order."""
         return self.sheet.needed(self.outputs)
 
     @property
@@ -168,6 +168,28 @@ class OnnxGraph:
             history.append(kept)
         return tuple(joined(each) for each in zip(*history, strict=True))
 
+    def branched(self, where: Value, yes: Branch, no: Branch) -> tuple[Value, ...]:
+        """Write a condition as an `If` node: only the operations of one branch are executed.
+
+        Args:
+            where: the condition, a single bool of shape ().
+            yes: branch that is executed if the condition holds, a function graph -> outputs. It adds
+                operations to the graph that it gets. If it reads a value of the enclosing graph, it must
+                convert the value by `Value.on`.
+            no: branch that is executed otherwise, the same; its outputs have the shapes of those of `yes`.
+                All outputs of both have one element type.
+
+        Returns:
+            Outputs of the branch that is executed.
+        """
+        bodies = []
+        for mark, branch in (("y", yes), ("n", no)):
+            inner = OnnxGraph(prefix=f"{self.prefix}{mark}{len(self.nodes)}.")
+            bodies.append(GraphBody(inner, tuple(branch(inner))))
+        outputs = bodies[0].outputs
+        facts: dict[str, Attribute] = dict(zip(("then_branch", "else_branch"), bodies, strict=True))
+        return self.emit("If", (where,), [each.shape for each in outputs], outputs[0].kind, facts)
+
     def needed(self, outputs: Sequence[Value]) -> list[GraphNode]:
         """Return the nodes that `outputs` depend on, in order."""
         wanted, kept = {value.name for value in outputs}, []
@@ -195,9 +217,9 @@ class Value:
     kind: Kind
 
     def on(self, sheet: OnnxGraph) -> Value:
-        """Return this value for use in a loop body.
+        """Return this value for use in a loop body or a branch.
 
-        The value belongs to the enclosing graph; `sheet` is the graph of the loop body.
+        The value belongs to the enclosing graph; `sheet` is the graph of the loop body or branch.
         """
         return Value(sheet, self.name, self.shape, self.kind)
 
@@ -328,6 +350,7 @@ class Value:
         return out
 
 
+Branch: TypeAlias = Callable[[OnnxGraph], Sequence[Value]]
 Turn: TypeAlias = Callable[
     [OnnxGraph, Sequence[Value], Sequence[Value]], tuple[Sequence[Value], Sequence[Value]]
 ]
