@@ -1,1 +1,1 @@
-"""Hybrid systems declared in YAML."""
+"""Hybrid systems (continuous motion with discrete jumps), declared in YAML."""

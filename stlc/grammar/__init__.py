@@ -1,1 +1,1 @@
-"""Specification language: concrete syntax, AST, parser, printer."""
+"""Specification language: grammar, parser from text to syntax tree, formatter and printers."""

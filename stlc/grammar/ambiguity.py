@@ -58,9 +58,9 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
 
 
 class _Words:
-    """Words and signs of a source text, from which it is known which operands have parentheses.
+    """Words and signs of a source text, used to find out which operands are in parentheses.
 
-    `parenthesised` holds the (start, end) offsets of the parts that were already reported for lack of
+    `parenthesised` has the (start, end) offsets of operands that were reported before because they have no
     parentheses.
     """
 
@@ -70,9 +70,9 @@ class _Words:
         self.parenthesised: set[tuple[int, int]] = set()
 
     def closed(self, node: ast.Node, *, left: bool) -> bool:
-        """True if the operand `node` has parentheses, or was already reported for lack of them.
+        """True if the operand `node` has parentheses, or was reported before because it has none.
 
-        `left` tells whether it is the left operand.
+        `left` is True if `node` is the left operand of its connective.
         """
         if (node.span.start, node.span.end) in self.parenthesised:
             return True

@@ -166,7 +166,7 @@ class Interval(Node):
         hi: upper bound; `Inf` and the name `end` mean "to the end of the trace".
         lo_open: whether the lower bound is excluded, `(lo, …`.
         hi_open: whether the upper bound is excluded, `…, hi)`.
-        clock: "now": bounds are relative to the present sample; "start": they count from the start of the
+        clock: zero point of the bounds. It is "now" for the present sample, or "start" for the start of the
             mission, as in `always@[a, b]`.
     """
 
@@ -403,8 +403,8 @@ class Spec(Node):
         imports: imports, in order.
         items: declarations, in order.
         source: the source text.
-        library: texts of imported files by key (see `stlc.compile.frontend.modules`), such as those stored in
-            a trace; None: the files are read from disk.
+        library: key of an imported file (see `stlc.compile.frontend.modules`) -> its text. A trace, for
+            example, stores such texts. If None, the files are read from disk.
     """
 
     name: str

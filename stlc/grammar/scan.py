@@ -44,9 +44,9 @@ class Lexeme:
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """Opening bracket (`opening`), and the bracket that closes it, or None if it is not closed.
+    """An opening bracket, and the bracket that closes it; `closing` is None if there is none.
 
-    `interval` tells whether it may open the interval of a temporal operator.
+    `interval` is True if the opening bracket may begin the interval of a temporal operator.
     """
 
     opening: Lexeme
@@ -66,9 +66,10 @@ def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexem
 
 
 def declaration_starts(text: str) -> list[int]:
-    """Return the offset at which each declaration of a text starts, including its tags and its role (`env`).
+    """Return the offset at which each declaration of a text starts.
 
-    The first offset is always 0.
+    A declaration starts with its first tag. Without tags, it starts with its first word, such as `env` in
+    `env signal`. The first offset is always 0.
     """
     starts = [0]
     tag: int | None = None
@@ -91,7 +92,7 @@ def declaration_starts(text: str) -> list[int]:
 def _is_pragma(text: str, word: Lexeme, behind: Lexeme) -> bool:
     """True if `word` and the next lexeme, `behind`, begin a pragma such as `spec name` or `time unit`.
 
-    A pragma stands at the start of a line. No expression contains these pairs of words.
+    A pragma stands at the start of a line. No expression contains such a pair of words.
     """
     if word.text not in PRAGMAS or (word.start and text[word.start - 1] != "\n"):
         return False
@@ -125,8 +126,9 @@ def opens_interval(before: Lexeme) -> bool:
 
 
 def closes(bracket: Bracket, text: str) -> bool:
-    """True if the sign `text` closes the bracket: the counterpart of the opening sign.
+    """True if the sign `text` closes the bracket.
 
-    The interval of a temporal operator is closed by `)` or `]`, whichever sign opens it.
+    A bracket is closed by the counterpart of its opening sign. The interval of a temporal operator is closed
+    by `)` or `]`, whichever sign opens it.
     """
     return text == CLOSES[bracket.opening.text] or (bracket.interval and text in (")", "]"))

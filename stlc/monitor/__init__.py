@@ -1,1 +1,1 @@
-"""Evaluation and explanation of recorded traces."""
+"""Evaluation of recorded and growing traces, and explanation of violations."""

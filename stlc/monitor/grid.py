@@ -76,7 +76,10 @@ def _dividing(horizon: float, dt: float) -> str:
 
 
 def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -> Times:
-    """Convert `dt` and `horizon`, in seconds, to exact times. Raises UsageError (U101) if not positive."""
+    """Convert `dt` and `horizon`, in seconds, to exact times.
+
+    Raises UsageError (U101) if either of them is not positive.
+    """
     for name, value in (("dt", dt), ("horizon", horizon)):
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(Diagnostic("U101", f"{name} is a time in seconds above 0, not {value}"))
@@ -124,7 +127,7 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
 def recorded_times(trace: Trace, given: Times) -> Times:
     """Return the time step and the horizon of a trace.
 
-    Raises TraceError (E602) if the time step of the trace differs from that in `given`.
+    Raises TraceError (E602) if the time step of the trace differs from the time step in `given`.
     """
     dt = as_fraction(trace.dt)
     if given.dt is not None and abs(given.dt - dt) > Fraction(1, 1000) * dt:

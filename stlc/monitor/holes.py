@@ -2,7 +2,7 @@
 
 An unknown sample is NaN in the arrays. A predicate that reads it counts as -inf in the lower bound, and as
 +inf in the upper bound. The robustness of a formula never falls if the value of a predicate rises. Therefore
-a verdict that follows from the bounds is true for all values that the samples may have.
+a verdict that follows from the bounds is true for all values that the unknown samples may have.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.For
 def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
     """Return an expression that is 1 where all signals in `num` are known, else -1.
 
-    None is returned if `num` reads no signal in `holes`: it is then known everywhere.
+    None is returned if `num` reads no signal in `holes`, because `num` is then known everywhere.
     """
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)

@@ -1,9 +1,9 @@
 """Instants at which a requirement is evaluated, and its values there.
 
-A requirement that mentions the horizon `T` applies to every planning window: it is evaluated at each sample
-that is followed by a full window of length `T`. In its formula, `end` is the end of this window. Other
-requirements are evaluated once, at the start of the trace. So are requirements with absolute operators
-(`always@[a, b]`), whose interval counts from the start of the mission.
+An instant is a sample of the trace. A requirement that mentions the horizon `T` applies to every planning
+window: it is evaluated at each sample that a full window of length `T` follows. In its formula, `end` is the
+end of this window. Other requirements are evaluated once, at the start of the trace. So are requirements with
+absolute operators (`always@[a, b]`), whose interval counts from the start of the mission.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
 def rule_bounds(
     rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
 ) -> tuple[Array, Array]:
-    """Least and greatest robustness at the instants `starts`, each `(count, batch)`.
+    """Lower and upper bounds on the robustness at the instants `starts`, each `(count, batch)`.
 
-    If nothing is unknown, the same array is returned twice. `horizon` is the length of a planning window in
-    steps. `ends` is the treatment of windows that extend beyond the trace: "open" leaves the missing samples
-    unknown, "truncate" clips the windows.
+    The bounds hold for all values that unknown samples may have. If nothing is unknown, the same array is
+    returned twice. `horizon` is the length of a planning window in steps. `ends` is the treatment of windows
+    that extend beyond the trace: "open" leaves the missing samples unknown, "truncate" clips the windows.
     """
     window = window_of(rule, horizon)
     if window is None:
@@ -82,8 +82,8 @@ def rule_known(
 ) -> NDArray[np.bool_]:
     """Return for each instant in `starts` whether its value is exact: booleans, (count,).
 
-    The trace has `samples` samples. A value is exact if it depends on no later samples. `horizon` is the
-    length of a planning window in steps.
+    The trace has `samples` samples. A value is exact if it depends on no samples after the end of the trace.
+    `horizon` is the length of a planning window in steps.
     """
     window = window_of(rule, horizon)
     if window is None:

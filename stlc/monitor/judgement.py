@@ -54,7 +54,7 @@ class Prepared:
         return self.signals.gaps
 
     def under(self, semantics: Semantics) -> Prepared:
-        """Return a copy that is evaluated in another semantics (definition of minimum and maximum)."""
+        """Return a copy that is evaluated in the given `semantics` (definition of minimum and maximum)."""
         return replace(self, record=replace(self.record, semantics=semantics))
 
     def time(self, sample: int) -> float:
@@ -79,8 +79,8 @@ class Judgement:
         holds: whether the requirement is certainly satisfied, (instants, traces).
         fails: whether the requirement is certainly violated, (instants, traces).
         shape: axes of the signals before their time axis; () for a single trace.
-        scope: True for traces that satisfy the assumptions, (traces,); None: all do. Traces that violate the
-            assumptions do not affect verdicts over all traces.
+        scope: True for traces that satisfy the assumptions, (traces,); None if all traces do. Traces that
+            violate the assumptions do not affect verdicts over all traces.
         reported: `low` and `high` in the semantics (definition of min and max) that the caller requested;
             None if the caller requested the exact semantics.
     """
@@ -110,7 +110,7 @@ class Judgement:
 
     @property
     def unit(self) -> str:
-        """Unit of the robustness: that of the predicates; "" if predicates have different units."""
+        """Unit of the robustness: the unit of all predicates, or "" if they have different units."""
         return self.rule.unit
 
     @property
@@ -133,7 +133,10 @@ class Judgement:
 
     @property
     def overall(self) -> Status:
-        """Status over the traces in scope: violated if any is, satisfied if all are, else inconclusive."""
+        """Status over all traces that satisfy the assumptions.
+
+        It is violated if any trace violates the requirement, satisfied if all satisfy it, else inconclusive.
+        """
         holds = self.counted(self.holds)
         return _status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
@@ -181,7 +184,7 @@ class Judgement:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Pair (trace, sample): index of the trace, and the sample, at which the robustness is least.
+        """Return (trace, sample): the index of the trace, and the sample at which its robustness is least.
 
         If the requirement is violated, the upper bounds on the robustness (`high`) are compared. Otherwise
         the lower bounds (`low`) are compared.
@@ -262,7 +265,7 @@ class Verdict:
 
     @property
     def overall(self) -> Status:
-        """Status over all requirements and all traces in scope.
+        """Status over all requirements and all traces that satisfy the assumptions.
 
         It is violated if any requirement is violated, satisfied if all are satisfied, else inconclusive.
         """
@@ -297,7 +300,7 @@ class Verdict:
 
     @property
     def _most_instants(self) -> int:
-        """Number of evaluated instants of the requirement that has the most."""
+        """Greatest number of instants at which any of the requirements is evaluated."""
         return max(judgement.instants for judgement in self.requirements)
 
     def _mean(self, truth: Bools) -> float:
@@ -308,9 +311,9 @@ class Verdict:
         """Return the truth values of a judgement at `most` instants, (most, traces).
 
         `truth` is `judgement.holds` or `judgement.fails`. If the judgement has `most` instants, `truth` is
-        returned unchanged. Otherwise one truth value per trace is repeated at all instants. For `holds`, it
-        tells whether the requirement holds at all of its own instants. For `fails`, it tells whether the
-        requirement fails at any of them.
+        returned unchanged. Otherwise one truth value per trace is repeated `most` times. For `holds`, this
+        value is True if the requirement holds at all of its own instants. For `fails`, this value is True if
+        the requirement fails at any of them.
         """
         if judgement.instants == most:
             return truth
@@ -324,7 +327,10 @@ class Verdict:
 
 
 def beside(moment: str, start: str) -> str:
-    """Return an instant and, if different, the start of its window as text: `t = 4.6 s (window from 2 s)`."""
+    """Return the text of an instant, followed by the start of its window if that is different.
+
+    Example: `t = 4.6 s (window from 2 s)`.
+    """
     return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"
 
 

@@ -5,8 +5,8 @@ least if the trace ends now, since later samples can only increase it. An `alway
 continues. For the greatest values it is the other way round. The least and the greatest value therefore need
 two formulas.
 
-`prefix_bound` adds a predicate to the formula. It is true at every existing sample and unknown after the last
-one. Values after the last sample then do not count.
+`prefix_bound` adds a predicate to the formula. This predicate is true at every existing sample and unknown
+after the last one. Values after the last sample then do not count.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class _PrefixBound:
     def of(self, formula: ir.Formula) -> ir.Formula:
         """Return a formula whose value is a bound on `formula`, wherever the trace ends.
 
-        The trace may end with the latest sample, or later. Some instants of a window do not exist if the
-        trace ends early. They do not count in a window where this is the worst case for the bound.
+        The trace may end with the latest sample, or later. If it ends early, some instants of a window do not
+        exist. These instants are left out if an early end is the worst case for the bound.
         """
         match formula:
             case ir.Temporal(op, window, body):

@@ -101,8 +101,8 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
     Args:
         spec: the specification, which declares the signals. It gives their kinds (such as bool or enum), and
             the numbers that words (members of an enum) stand for.
-        requested: options of the user: the time grid, and the names that signals have in the file. They are
-            keyed by the signal, or by the text after `from` in its declaration.
+        requested: options of the user: the time grid, and the names that signals have in the file. The key of
+            such a name is the signal, or the text after `from` in the declaration of the signal.
     """
     signals = [item for item in spec.items if isinstance(item, ast.Signal)]
     columns = {item.name: item.column for item in signals if item.column}
@@ -141,7 +141,7 @@ class Signals:
         samples: length of the time axis.
         ops: the array library.
         name: name of the trace, for messages.
-        dt: time step in seconds; None if the signals come without one.
+        dt: time step in seconds; None if it is unknown.
         t0: time of the first sample in seconds.
     """
 
@@ -408,7 +408,7 @@ class Gap:
         """Return a gap that also includes the unknown samples of further data.
 
         The array `unknown`, (samples,) or (samples, traces), is True at these samples. `offset` is the index
-        in the trace of its first row.
+        in the trace of the first row of `unknown`.
         """
         rows = np.flatnonzero(unknown.reshape(len(unknown), -1).any(axis=1))
         if not len(rows):

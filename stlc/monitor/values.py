@@ -50,9 +50,9 @@ class Record:
 
     @property
     def sure(self) -> Record:
-        """This record with an empty `holes`.
+        """Copy of this record in which no signal counts as unknown anywhere (`holes` is empty).
 
-        Formulas that account for unknown values themselves are evaluated on it.
+        Formulas that account for unknown values themselves are evaluated on this copy.
         """
         return replace(self, holes=frozenset()) if self.holes else self
 

@@ -53,8 +53,9 @@ class Monitor:
 
     Args:
         spec: a specification, its text, or the path of its file.
-        dt: time step of the signals in seconds; default: that of the trace, or of the system.
-        horizon: horizon `T` of the planning window in seconds; default: that of the system, or of the trace.
+        dt: time step of the signals in seconds. By default, it is taken from the trace or from the system.
+        horizon: horizon `T` of the planning window in seconds. By default, it is taken from the system or
+            from the trace.
         system: path or name of a system file; the specification is then checked against it. Without it, the
             system that the specification names supplies a missing `dt` or `T`.
         overrides: name of a constant -> its value, as text.

@@ -94,7 +94,7 @@ def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
 
 
 def instant_of_word(word: str) -> np.datetime64 | None:
-    """Parse a date and time (ISO 8601); None if the word is not one."""
+    """Return the date and time (ISO 8601) in a word; None if the word is not a date."""
     try:
         return np.datetime64(word.rstrip("Zz"), "ns")
     except ValueError:

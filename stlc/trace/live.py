@@ -191,7 +191,7 @@ class SampleStream:
         raise self._bad(number, f"has {shown}")
 
     def _number(self, signal: str, value: object, number: int) -> float | None:
-        """Convert a value in a line to a number; None if it is a word and no requirement needs the signal.
+        """Convert a value in line `number` to a number; None if it is a word that no requirement needs.
 
         Raises:
             TraceError: E603, a needed signal has an unknown word or another value that is not a number.
@@ -216,7 +216,7 @@ def _with_point(cell: str) -> str:
 
 
 def _plain(value: object) -> float | None:
-    """Number of a JSON value or of the text of a cell; None if it is not a number."""
+    """Return the number in a JSON value or in the text of a cell; None if there is no number."""
     if isinstance(value, str):
         return value_of(value)
     if isinstance(value, int):
@@ -243,12 +243,12 @@ class Uniform:
 
 
 def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
-    """Return an iterator over samples on a uniform time grid; each is yielded as soon as it is known.
+    """Return the samples of a stream on a uniform time grid; each one is yielded once it is known.
 
-    The grid is the one that `stlc.trace.trace.trace_of` would use for a file with the same samples. Without
-    resampling the times must be uniform. Resampling is requested by `reading.resample` or `reading.max_gap`.
-    A sample is then known once every signal has a later value, or had no value for longer than the allowed
-    gap.
+    The grid is the one that `stlc.trace.trace.trace_of` would use for a file with the same samples. The
+    options `reading.resample` and `reading.max_gap` request resampling; without them, the times must be
+    uniform. With resampling, a sample is known once every signal has a later value, or had no value for
+    longer than the allowed gap.
 
     Raises:
         TraceError: E601, the times of the samples are unknown; E602, the times are not uniform, or decrease;

@@ -66,8 +66,8 @@ class Spacing:
 
         Within a bridged gap, values are held or interpolated. If `max_gap` is None, there are two cases. If
         `events` is True, all gaps are bridged: each value of a discrete signal holds until the next sample.
-        Otherwise gaps of up to three steps are bridged. A step is here the longer of `dt` and the usual time
-        between the samples at `times`.
+        Otherwise gaps of up to three steps are bridged. The length of a step is then `dt` or the usual time
+        between the samples at `times`, whichever is longer.
         """
         if max_gap is not None:
             return Spacing(dt, max_gap * _SAME)
@@ -144,8 +144,8 @@ class ResampleGrid:
 
     Attributes:
         dt: time step in seconds; None: the usual time between samples.
-        max_gap: the longest gap, in seconds, within which values are known. If None, it is three steps. There
-            is then no limit for discrete signals with a time column of their own.
+        max_gap: the longest gap, in seconds, within which values are known. If None, the limit is three
+            steps, but discrete signals with a time column of their own have no limit.
     """
 
     dt: float | None = None
@@ -176,7 +176,7 @@ def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind
     Args:
         recording: content of a trace file, with one or more groups of common times.
         grid: the requested grid.
-        kinds: signal -> kind of its numbers; overrides the file.
+        kinds: signal -> kind of its numbers, which takes precedence over the kind in the file.
 
     Raises:
         TraceError: E601, a group has no times; E602, times decrease, have no common interval, or `dt` is not

@@ -172,9 +172,9 @@ def snapped(step: float) -> float:
 
 
 def _snap(mean: float, dt: float | None) -> float:
-    """Return `dt` if it agrees with the measured step `mean`.
+    """Return `dt` if it agrees with the measured time step `mean`, else `mean`.
 
-    Otherwise return `mean`. If there is a simple fraction nearby, `mean` is rounded to it.
+    If there is a simple fraction near `mean`, it is returned instead of `mean`.
     """
     if dt is not None and abs(dt - mean) <= 1e-3 * mean:
         return dt

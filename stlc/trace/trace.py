@@ -203,7 +203,7 @@ def _longest(group: ClockGroup) -> int:
 def _uniform(recording: Recording, step: float | None) -> Trace:
     """Return the trace of a recording whose signals share one uniform time column.
 
-    `step` is the time step in seconds that the user gives, or None. It must not contradict the times.
+    `step` is the time step in seconds that the user gives, or None. A given step must agree with the times.
     """
     name = recording.name
     groups = [group for group in recording.groups if group.arrays] or list(recording.groups)
@@ -252,7 +252,7 @@ def check_writable(path: Path | str) -> None:
     """Check that the format of a path can be written.
 
     Raises:
-        UsageError: U101, the suffix is not that of a writable format.
+        UsageError: U101, files with this suffix cannot be written.
         MissingError: R301, an `.mcap` file needs a package that is not installed.
     """
     suffix, found = Path(path).suffix.lower(), format_of(Path(path))
@@ -266,6 +266,6 @@ def check_writable(path: Path | str) -> None:
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:
-    """Return the exact fraction that is meant by a time step in seconds: 0.1 is 1/10, 0.0333… is 1/30."""
+    """Return the exact fraction that a time step in seconds stands for: 0.1 is 1/10, 0.0333… is 1/30."""
     near = Fraction(dt).limit_denominator(1_000_000)
     return near if near > 0 and abs(float(near) - float(dt)) <= 1e-9 * float(dt) else Fraction(dt)

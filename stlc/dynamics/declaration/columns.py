@@ -219,7 +219,7 @@ def name_columns(names: Names, about: str) -> None:
 def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) -> tuple[Column, ...]:
     """Return the columns of the state or parameter `name`, made from its keys.
 
-    `where` names it in messages.
+    `where` names the state or parameter in messages.
     """
     called = component_names(name, keys.size)
     if keys.enum is not None:
@@ -390,7 +390,7 @@ def _param_keys(entry: Entry, cx: Context) -> ParamKeys:
 def _even(column: Column) -> tuple[ir.Num, str]:
     """Return the uniform distribution over the values that a column can take.
 
-    The result has two entries: the distribution as an expression of the IR, and as text.
+    The result is a pair: the distribution as a numeric expression, and as text.
     """
     if column.labels:
         members = ", ".join(label for label, _ in column.labels)
@@ -402,7 +402,7 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """Return the column with a range that covers nearly all random values that it can get.
+    """Return `column` with a range that covers nearly all of its random values.
 
     `assigns` holds the distributions of the columns. A column that declares a range is returned unchanged,
     and so is a column without a distribution.

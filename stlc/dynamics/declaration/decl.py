@@ -1,6 +1,6 @@
-"""Declaration of a system: declared names, expressions in the IR with checked units, and a description.
+"""Declaration of a system: declared names, expressions with checked units, and a description.
 
-Nothing here imports torch.
+Expressions are in the compiler's intermediate representation (IR). Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ class SystemDecl:
         discrete: whether `flow` gives next values of the states instead of derivatives.
         constants: name -> (value in SI units, unit).
         signature: the state columns (one per scalar state or vector component), in order.
-        controls: planned variables, in order: the inputs of the system, or, if there is an inner feedback,
-            the deviations of the inputs from its commands.
+        controls: planned variables, in order: the inputs of the system or, with an inner feedback, the
+            deviations of the inputs from the commands of the feedback.
         flow: derivative of each column in its unit per second, or its next value; a column that is not listed
             is constant.
         jumps: discrete transitions, in file order.
         clamps: column -> (low, high), the range to which the column is limited after every step.
-        init, objective, policy, train, backup, test: the sections of these names.
+        init, objective, policy, train, backup, test: the sections with these names.
         feedback: inner feedback law; None if plans are the actuator commands themselves.
         scenarios: named changes of the system for deployments.
         scenario: the scenario applied to this declaration, or None.
@@ -105,7 +105,7 @@ class SystemDecl:
 
     @property
     def hash(self) -> str:
-        """SHA-256, in hexadecimal, of the file, the files that it extends, and `--set`."""
+        """SHA-256, in hexadecimal, of the file, the files that it extends, and the values of `--set`."""
         changes = "".join(f"\0{key}={value}" for key, value in sorted(self.overrides.items()))
         texts = "".join(base.text for base in self.bases)
         return hashlib.sha256((self.source.text + texts + changes).encode()).hexdigest()

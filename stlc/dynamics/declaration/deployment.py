@@ -86,9 +86,10 @@ class BackupDecl:
 
 
 def read_backup(cx: Context, node: Node | None, label: str) -> BackupDecl:
-    """Read the section `backup` of a file or of a scenario; `label` names it in messages.
+    """Read the section `backup` of a file or of a scenario; `label` names the section in messages.
 
-    A prefix length is a number of steps. Lengths beyond the horizon are reported (S103) and dropped.
+    The lengths of control prefixes are numbers of steps. A length beyond the horizon is reported (S103) and
+    dropped.
     """
     backup, horizon = read(BackupDecl, cx, node, label), cx.horizon
     lengths = node.get("T0") if isinstance(node, MappingNode) else None
@@ -124,7 +125,7 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
 def _instant(cx: Context, node: Node, label: str) -> int | None:
     """Read an instant of the deployment, given as a time or in steps; return it in steps from the start.
 
-    Returns None if it is invalid. `label` names it in messages.
+    Returns None if the instant is invalid. `label` names the instant in messages.
     """
     return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
 

@@ -23,7 +23,7 @@ _OWN = {"python": ("kind", "target", "arrays"), "urdf": ("kind", "file", "tip", 
 
 @dataclass(frozen=True, slots=True)
 class FunctionDecl:
-    """External function that specifications may call: in Python, or kinematics as IR expressions.
+    """External function that specifications may call: a Python function, or the kinematics of a robot.
 
     Attributes:
         name: its name in the declaration `extern fn` of a specification.
@@ -32,7 +32,8 @@ class FunctionDecl:
             computed.
         library: array library of its arguments; None accepts the arrays of any caller.
         span: source location of its name.
-        body: IR expressions that compute the result vector from one argument vector; None for Python.
+        body: for kinematics, expressions that compute the result vector from one argument vector; None for a
+            Python function.
         base: for kinematics, the link that positions are relative to; "" is the root.
     """
 
@@ -45,7 +46,7 @@ class FunctionDecl:
     base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:
-        """Return the IR expressions of the function; check the sizes that a specification declares.
+        """Return the expressions of the function (`body`); check the sizes that a specification declares.
 
         Args:
             arguments: declared size of each argument, the number of components of a vector; None for a
@@ -81,7 +82,7 @@ class FunctionKeys:
 
 
 def read_functions(node: Node | None, cx: Context) -> tuple[FunctionDecl, ...]:
-    """Read the section `functions`; a function with IR expressions can also be called in the system file.
+    """Read the section `functions`; kinematics can also be called in the system file itself.
 
     `f: {kind: python, target: "package.module:function"}` is a Python function; `"file.py:function"` refers
     to a file beside the system file. `ee: {kind: urdf, file: arm.urdf, tip: flange}` is the position of the

@@ -1,4 +1,8 @@
-"""Section `init`: distribution of initial states, as a mixture of situations, a grid, or a file."""
+"""Section `init`: distribution of initial states.
+
+The distribution is a mixture of situations, a grid, or a file. A situation is one of several ways to draw a
+state.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +47,10 @@ _DRAWS = raw(mapping_of(VECTOR))
 
 @dataclass(frozen=True, slots=True)
 class GridDecl:
-    """Grid of initial states: (column, its values in the unit of the column) for each axis.
+    """Grid of initial states, with one axis per column.
 
-    Every combination of values, one of each axis, is a possible state.
+    An axis is a pair: the name of the column, and its values in the unit of the column. Every combination of
+    values, one from each axis, is a possible state.
     """
 
     axes: tuple[tuple[str, tuple[float, ...]], ...]
@@ -197,7 +202,7 @@ def _situation(node: Node, outer: _Draws) -> Situation:
 
 
 class _Draws:
-    """Reader of the assignments of one situation (a way to draw an initial state), in order of drawing.
+    """Reader of the assignments of one situation (a way to draw an initial state), in drawing order.
 
     The assignment of a local name (from `let`) is placed before the first assignment that reads the name.
 
@@ -279,7 +284,7 @@ class _Draws:
     def _let(self, name: str) -> None:
         """Append to `found` the assignment of the local name `name` (from `let`).
 
-        The assignments of the local names that it reads are appended first.
+        If the value of `name` reads other local names, the assignments of these names are appended first.
         """
         if name not in self.unresolved:
             return

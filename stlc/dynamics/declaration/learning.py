@@ -56,7 +56,7 @@ OUTCOME = {
 def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
     """Read a number and convert it to SI units; a temperature in degC becomes kelvin, offset included.
 
-    Returns None if the number is invalid. `label` names it in messages.
+    Returns None if the number is invalid. `label` names the number in messages.
     """
     value = cx.here.number(node, label)
     return None if value is None else absolute(value).num
@@ -242,10 +242,11 @@ def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
 
 @reads(mapping_of(VECTOR))
 def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
-    """Read the mirror images of states and controls: an expression for each state or control that changes.
+    """Read the entry `mirror`: the states and controls that a mirror symmetry changes, and their images.
 
-    Returns the fields `mirror` and `mirror_span` of `PolicyDecl`. Before training,
-    `stlc.controller.training.diagnose.check_mirror` checks that the dynamics are symmetric.
+    The image of a state or control is an expression. Returns the fields `mirror` and `mirror_span` of
+    `PolicyDecl`. Before training, `stlc.controller.training.diagnose.check_mirror` checks that the dynamics
+    are symmetric.
     """
     found: list[Assign] = []
     entries = cx.reader.entries(node, label)

@@ -120,7 +120,7 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
     Args:
         path: path of the file.
         overrides: new values by dotted key (`train.lr`), or by the name of a constant, parameter or top-level
-            field; any other name without a dot is ignored here, as it may be a name of the specification.
+            field; any other name without a dot is ignored here, because it may belong to the specification.
 
     Raises:
         UsageError: the file does not exist.
@@ -167,7 +167,7 @@ def _sections(
 ) -> tuple[SystemKeys, tuple[Source, ...]]:
     """Read the sections of a file, merged with the files that it extends and with `overrides`.
 
-    Returns also the texts of the extended files.
+    Also returns the texts of the extended files.
     """
     root, bases = extended(load_yaml(source, sink=reader.findings), reader)
     root = overridden(root, overrides, reader)
@@ -276,8 +276,8 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
 class MovingParts:
     """YAML nodes of the sections `flow` and `jump` of a valid file.
 
-    With them, `read_flow` and `read_jumps` can read the sections again in the context `cx`, for example with
-    changed numbers.
+    The functions `read_flow` and `read_jumps` can read these nodes again in the context `cx`, for example
+    with changed numbers.
     """
 
     cx: Context
@@ -330,10 +330,10 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
 
 
 def _merged(base: Mapping, own: Mapping, *, sections: bool = True) -> Mapping:
-    """Merge the mapping `own` over the mapping `base`: an entry of `own` replaces that of the same key.
+    """Merge the mapping `own` over the mapping `base`: entries of `own` replace those with the same key.
 
-    A null entry of `own` removes the entry. With `sections`, two mappings under the same key are merged in
-    the same way, one level deep.
+    A null entry of `own` removes the entry with the same key. If `sections`, two mappings under the same key
+    are merged in the same way, one level deep.
     """
     result = Mapping(own.span, base.entries, base.size)
     for entry in own.entries:
@@ -354,8 +354,8 @@ def overridden(root: Mapping, overrides: MappingType[str, str], reader: Reader) 
     """Replace the fields of a system file (as YAML mapping) that `overrides` names.
 
     A key with dots names a field (`train.lr`, `init.mixture.0.weight`). A key without dots names a constant,
-    a parameter, or a top-level field with a single value; if it names none of these, it is skipped, as it may
-    belong to the specification.
+    a parameter, or a top-level field with a single value; if it names none of these, it is skipped, because
+    it may belong to the specification.
     """
     known, params = _keys(root.get("const")), _keys(root.get("param"))
     for name, text in overrides.items():
@@ -423,7 +423,7 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
 
 
 def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
-    """Return `init` with the initial values of states that `overrides` gives.
+    """Return `init`, with values from `overrides` in place of the initial values of some states.
 
     An entry such as `x=3m`, or `x` with a distribution, replaces the value that is drawn for `x`.
     """

@@ -1,4 +1,7 @@
-"""Sections `flow` and `jump`: derivatives, guards and resets, including those of timers."""
+"""Sections `flow` and `jump`: derivatives, and the guards (conditions) and resets (new values) of jumps.
+
+The motion of timers is included.
+"""
 
 from __future__ import annotations
 

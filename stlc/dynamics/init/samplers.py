@@ -67,12 +67,12 @@ class Rows:
 class _Call:
     """One occurrence of a sampler, such as `uniform(0, 1)`, in an expression.
 
-    Two occurrences are drawn independently, even if they read the same.
+    Two occurrences are drawn independently, even if their texts are the same.
 
     Attributes:
         name: name of the column that receives the drawn numbers; it replaces the sampler in the expression.
         sampler: name of the sampler, such as `uniform`.
-        args: compiled arguments, with outputs "0", "1", ….
+        args: program that computes the arguments of the sampler; its outputs are called "0", "1", ….
         arity: number of arguments.
     """
 
@@ -96,7 +96,7 @@ class Drawing:
         self._seen.clear()
 
     def __call__(self, env: Mapping[str, Tensor], rows: Rows) -> Tensor:
-        """Return the assigned value of each state drawn, (count,) float64.
+        """Return the assigned values, one per drawn state: (count,), float64.
 
         `env` maps the names that the assignment reads to their values (count,); it must not be empty.
         """
@@ -175,7 +175,7 @@ class _Draws:
             self.points = _File(situation.points)
 
     def __call__(self, table: Table, rows: Rows) -> Table:
-        """Draw `rows.count` states by this situation.
+        """Draw `rows.count` states from this situation.
 
         `table` maps the names drawn before to their values, (count,). It is returned with the new values
         added.
@@ -260,7 +260,7 @@ class InitialStates:
         return torch.cat(found)
 
     def _propose(self, n: int, generator: torch.Generator) -> Tensor:
-        """Draw states without applying the conditions of `where`, (n, dim)."""
+        """Draw states (n, dim) without applying the conditions of `where`."""
         rows = Rows(n, generator)
         table = {"": rows.blank()}
         for drawing in self._params:
@@ -344,7 +344,7 @@ class _Grid:
 
 
 class _File:
-    """Random states drawn from the samples that a file holds."""
+    """Source of initial states: random samples of a file."""
 
     def __init__(self, decl: FileDecl) -> None:
         self._decl = decl

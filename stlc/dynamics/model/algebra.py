@@ -1,4 +1,7 @@
-"""Algebra on numeric expressions of the IR: names of columns, substitution, sums and products."""
+"""Algebra on numeric expressions: names of columns, substitution, sums and products.
+
+The expressions are in the compiler's intermediate representation (IR).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ def map_parts(node: N, rewrite: Callable[[ir.Num], ir.Num]) -> N:
 
 
 def substitute(node: N, table: Mapping[str, ir.Num]) -> N:
-    """Replace columns by expressions (`table`: column -> expression), in an expression or a state formula."""
+    """Replace the columns in `node` by expressions; `table` maps column -> expression.
+
+    `node` is a numeric expression or a state formula.
+    """
     return map_leaves(node, lambda leaf: table.get(leaf.name, leaf) if isinstance(leaf, ir.Signal) else leaf)
 
 

@@ -6,10 +6,10 @@ An open-loop plan over a horizon cannot hold an unstable plant: for x' = 4 x + u
     clip(u0 + v + clip(K (x0 - x), -a, a), low, high)
 
 where `v` is planned, so that rollouts, searches and gradients see a stabilised plant. `a` is the authority of
-the feedback, by default half the range of the actuator. The range of `v` is that of the actuator widened by
-`a` on both sides, so that every control remains available in every state. With `lqr` the gain K is that of
-the linear-quadratic regulator for the linearised step (R. E. Kalman, 1960). It is computed by a Riccati
-recursion over a long horizon.
+the feedback, by default half the range of the actuator. The range of `v` is the range of the actuator,
+widened by `a` on both sides, so that every control remains available in every state. The setting `lqr`
+selects the gain K of the linear-quadratic regulator for the linearised step (R. E. Kalman, 1960). This gain
+is computed by a Riccati recursion over a long horizon.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ GROWING = 10.0
 
 
 class NoFeedbackError(ValueError):
-    """Raised where a gain cannot be computed, with the reason."""
+    """Error with the reason why a feedback gain cannot be computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +113,8 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubl
     """Return the operating point: state (n,) and control (m,), in the units of the columns.
 
     `around` gives values of some states and controls. Any other state is 0, or the middle of its range if the
-    range excludes 0. The other controls are chosen within their ranges such that the state stays as constant
-    as possible.
+    range excludes 0. The other controls are chosen within their ranges so that the state stays as constant as
+    possible.
     """
     state = np.array(
         [
@@ -138,9 +138,9 @@ def _rest(decl: SystemDecl, around: Mapping[str, float]) -> tuple[Doubles, Doubl
 
 
 def _held(linear: Linear) -> NDArray[np.bool_]:
-    """Mask (n,) of the moving states on which the change of some state depends.
+    """Mask (n,): True for a moving state if the change of any state depends on it.
 
-    The operating point is chosen such that these states stay constant. Any other state may drift, such as a
+    The operating point is chosen so that these states stay constant. Any other state may drift, such as a
     position in an open field.
     """
     others = np.abs(linear.a - np.eye(len(linear.a)))
@@ -150,7 +150,7 @@ def _held(linear: Linear) -> NDArray[np.bool_]:
 def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
     """Linearise the step at `state` (n,) and `control` (m,) by central differences.
 
-    The step is that of the flow, without inner feedback, jumps and clamps. All values are in the units of the
+    The step follows the flow, without inner feedback, jumps and clamps. All values are in the units of the
     columns.
     """
     columns, names = decl.signature.columns, decl.signature.names
@@ -188,7 +188,7 @@ def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
 def _stepped(decl: SystemDecl, points: Doubles) -> Doubles:
     """Return the states (k, n) one step after `points` (k, n + m), each a state and a control.
 
-    The step is that of the flow, without inner feedback, jumps and clamps.
+    The step follows the flow, without inner feedback, jumps and clamps.
     """
     names = (*decl.signature.names, *(control.name for control in decl.controls))
     step = build_step(replace(decl, feedback=None, clamps={}, jumps=()), soft=False)

@@ -37,7 +37,7 @@ class Mirror:
     def __init__(
         self, images: Sequence[Assign], names: Sequence[str], controls: Sequence[ControlDecl]
     ) -> None:
-        """Compile the images of states and controls; the first of `images` must be that of a state."""
+        """Compile the images of states and controls; the first of `images` must be the image of a state."""
         self._names = tuple(names)
         self._controls = tuple(controls)
         known = {control.name for control in controls}

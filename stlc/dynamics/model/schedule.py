@@ -196,7 +196,8 @@ class Hoist:
 
     Attributes:
         moving: names that change within the loop.
-        early: name -> loop-invariant expression to be computed before the loop; grows with calls of `split`.
+        early: name -> loop-invariant expression to be computed before the loop; each call of `split` adds
+            entries.
         prefix: prefix of the generated names.
     """
 

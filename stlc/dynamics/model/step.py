@@ -1,4 +1,4 @@
-"""One step of a hybrid system (Meng and Fan 2023, Eq. 6) as a list of assignments in the IR."""
+"""One step of a hybrid system (Meng and Fan 2023, Eq. 6) as a list of symbolic assignments."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ class ModelStep:
 def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     """Build the step of a declaration.
 
-    If `soft`, a jump with guard g is the differentiable blend `I_w(g) reset + (1 - I_w(g)) flow`; otherwise
-    it is an exact choice. Guards and resets read the state at the start of the step. Limits (`clamp`) are
-    applied after each substep. If two jumps set the same state, the later one wins.
+    If `soft`, a jump with guard g is the differentiable blend `I_w(g) reset + (1 - I_w(g)) flow`, where
+    I_w(g) is a smooth indicator of g between 0 and 1. Otherwise a jump is an exact choice. Guards and resets
+    read the state at the start of the step. Limits (`clamp`) are applied after each substep. If two jumps set
+    the same state, the later one wins.
     """
     writer = Assignments()
     start: State = {name: ir.Signal(name) for name in decl.signature.names}
@@ -103,7 +104,7 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
 def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
     """Return the states after one jump; `state` is the result of the flow and of earlier jumps.
 
-    With `soft` the jump is a differentiable blend, otherwise an exact choice.
+    If `soft`, the jump is a differentiable blend, otherwise an exact choice.
     """
     changed = dict(state)
     for assign in jump.resets:
@@ -116,9 +117,10 @@ def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
 
 
 def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:
-    """Return `I yes + (1 - I) no`, where I is the smooth indicator of `cond` (I_w of Eq. 6).
+    """Return `I yes + (1 - I) no`, where I is the smooth indicator of `cond`.
 
-    The result is exactly `yes` or `no` where I is 1 or 0.
+    I is the function I_w of Eq. 6, with values between 0 and 1. The result is exactly `yes` or `no` where I
+    is 1 or 0.
     """
     weight = ir.Indicator(cond, sharpness)
     kept = multiply(ir.Op("sub", (ir.Const(1.0), weight)), no)

@@ -266,7 +266,10 @@ class System:
 
     @cached_property
     def exact_step(self) -> ModelStep:
-        """One step in the IR with exact choices for jumps and with timers, for code generators."""
+        """One step as symbolic assignments, for code generators.
+
+        Jumps are exact choices, and timers are included.
+        """
         step = build_step(self.decl, soft=False)
         return ModelStep(step.lets, {**step.next, **{timer.name: timer.update for timer in self.timers}})
 
@@ -337,9 +340,10 @@ class System:
         return ArrayProgram(seen) if self.decl.policy.observe else None
 
     def reward(self, after: Tensor, u: Tensor) -> Tensor:
-        """The declared reward of a step into states `after` (B, n) under actuator commands `u` (B, m): (B,).
+        """Return the declared reward (B,) of a step into states `after` (B, n) under the commands `u` (B, m).
 
-        Raises UsageError (U101) if the file declares no reward.
+        `u` are the commands that the actuators receive. Raises UsageError (U101) if the file declares no
+        reward.
         """
         found: Tensor = self._reward({**self._named(after), **self._inputs(u)}, TORCH, HARD)["reward"]
         return found.expand(len(after))
@@ -349,7 +353,7 @@ class System:
         return ArrayProgram({"reward": self.require_reward()})
 
     def require_reward(self) -> ir.Num:
-        """The declared reward of a step as a numeric expression of the IR.
+        """The declared reward of a step as a numeric expression.
 
         Raises UsageError (U101) if the file declares no reward.
         """
@@ -450,7 +454,7 @@ class System:
     # -------------------------------------------------------------------- health
 
     def require_finite(self, x: Tensor) -> None:
-        """Raise SystemFileError (S302) if states (…, n) hold NaN or infinity."""
+        """Raise SystemFileError (S302) if states (…, n) contain NaN or infinity."""
         bad = ~torch.isfinite(x.detach())
         if not bool(bad.any()):
             return

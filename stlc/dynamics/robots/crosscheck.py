@@ -92,7 +92,7 @@ def _by_library(function: FunctionDecl, q: Doubles) -> Doubles:
 def _by_body(body: ir.Body, q: Doubles) -> Doubles:
     """Positions of a link in metres, (n, 3), at the joint positions `q`, (n, joints).
 
-    They are computed from `body`, the IR expressions of the kinematics.
+    The positions are computed from `body`, the expressions of the kinematics.
     """
     args = tuple(ir.Signal(f"a{index}") for index in range(q.shape[1]))
     program = ArrayProgram({str(i): ir.Extern("f", args, i, body) for i in range(3)})

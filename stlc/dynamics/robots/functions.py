@@ -91,7 +91,7 @@ def _refused(
 class PythonFunction:
     """Loaded Python function of a system.
 
-    A vector argument is an array (…, size), a number an array (…); the same holds for the result.
+    A vector argument is an array (…, size), and a number is an array (…). The same is true for the result.
     """
 
     decl: FunctionDecl

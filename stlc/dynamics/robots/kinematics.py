@@ -1,4 +1,4 @@
-"""Robot descriptions (URDF), and their forward kinematics as IR expressions.
+"""Robot descriptions (URDF), and their forward kinematics as symbolic expressions.
 
 A chain of joints is unrolled and constants are folded. A seven-joint arm then needs the sines and cosines of
 its joints and some thirty products and sums; the torch graph and the C kernel compute the same operations.
@@ -168,9 +168,9 @@ NAME = "v{}"
 
 
 def position(joints: Sequence[Joint]) -> ir.Body:
-    """IR expressions for the tip's position in the frame of the base, (3,) in metres.
+    """Return expressions for the position of the tip in the frame of the base, (3,) in metres.
 
-    The arguments are the positions of the moving joints, in radians or metres.
+    The arguments of the expressions are the positions of the moving joints, in radians or metres.
     """
     moving = [joint for joint in joints if joint.kind != "fixed"]
     formals = {joint.name: f"q{index}" for index, joint in enumerate(moving)}
@@ -186,7 +186,10 @@ def position(joints: Sequence[Joint]) -> ir.Body:
 
 
 def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> Point:
-    """Rotate a point by `angle` (in radians) about an axis through the origin, by Rodrigues' formula."""
+    """Rotate a point by `angle` (in radians) about an axis through the origin, by Rodrigues' formula.
+
+    Coordinates are expressions. Intermediate results are appended to `writer`.
+    """
     along = _linear(np.outer(axis, axis), point)
     across = tuple(writer.name(num, NAME) for num in _linear(np.eye(3) - np.outer(axis, axis), point))
     if all(num == ir.Const(0.0) for num in across):
@@ -201,7 +204,10 @@ def _turned(axis: Doubles, point: Point, angle: ir.Num, writer: Assignments) -> 
 
 
 def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: Assignments) -> Point:
-    """Translate a point along an axis by `length`, in metres."""
+    """Translate a point along an axis by `length`, in metres.
+
+    Coordinates are expressions. Intermediate results are appended to `writer`.
+    """
     return tuple(
         writer.name(_sum(part, _product(ir.Const(float(share)), length)), NAME)
         for part, share in zip(point, axis, strict=True)
@@ -209,7 +215,7 @@ def _pushed(axis: Doubles, point: Point, length: ir.Num, writer: Assignments) ->
 
 
 def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: Assignments) -> Point:
-    """`rotation @ point + offset`."""
+    """Return the point `rotation @ point + offset`, whose coordinates are appended to `writer`."""
     return tuple(
         writer.name(_sum(part, ir.Const(float(shift))), NAME)
         for part, shift in zip(_linear(rotation, point), offset, strict=True)
@@ -217,7 +223,7 @@ def _affine(rotation: Doubles, offset: Doubles, point: Point, writer: Assignment
 
 
 def _linear(matrix: Doubles, point: Point) -> Point:
-    """`matrix @ point`, constants folded."""
+    """Return the point `matrix @ point`; constants are combined."""
     zero: ir.Num = ir.Const(0.0)
     return tuple(
         reduce(_sum, (_product(ir.Const(float(a)), part) for a, part in zip(row, point, strict=True)), zero)

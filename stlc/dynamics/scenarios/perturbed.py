@@ -96,7 +96,7 @@ def perturbable(decl: SystemDecl) -> Perturbable:
 def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
     """Return the declaration with the guards, equations and resets of `flow` and `jumps`.
 
-    Only the equations and resets of real states are replaced; those of bool and enum states are kept.
+    Bool and enum states keep their equations and resets.
     """
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
 
@@ -115,7 +115,8 @@ def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl
 def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
     """Return the names of the states whose next value depends on the column `factor`.
 
-    The equation of such a state reads the column, or a jump that sets the state reads it (guard or reset).
+    Either the equation of such a state reads the column, or a jump that sets the state reads it, in its guard
+    or its reset.
     """
     found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
     for jump in decl.jumps:
@@ -140,7 +141,7 @@ def _place(node: ast.Quantity) -> str:
 def _scaled(number: Number, factor: ir.Num) -> Number:
     """Multiply a number by a factor.
 
-    A number whose unit has an arbitrary zero (such as degC) is returned unchanged, as a relative error of it
+    A number whose unit has an arbitrary zero (such as degC) is returned unchanged, because its relative error
     has no meaning.
     """
     if number.unit.offset:

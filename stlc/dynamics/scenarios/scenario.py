@@ -48,9 +48,9 @@ def standard(name: str) -> ScenarioDecl | None:
 
 
 def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
-    """Return the scenario of that name, from the file or a standard one.
+    """Return the scenario called `name`, from the file or a standard one.
 
-    Raises UsageError (U101) if there is none.
+    Raises UsageError (U101) if there is no such scenario.
     """
     for scenario in decl.scenarios:
         if scenario.name == name:

@@ -48,8 +48,8 @@ class Expressions:
         reader: collects the findings.
         scope: table of the names that expressions may use.
         ready: names of the states, parameters and local names that already have a value. An expression that
-            reads another one is reported as an error (S202). None: all of them have a value.
-        amounts: True where numbers are added to states, as in a disturbance. Then 5 degC is a temperature
+            reads any other of these names is reported as an error (S202). If None, all of them have a value.
+        amounts: whether the numbers are added to states, as in a disturbance. If so, 5 degC is a temperature
             difference, otherwise a temperature.
         rewrite: function applied to every parsed expression before its names are resolved; None changes
             nothing.
@@ -66,8 +66,8 @@ class Expressions:
     ) -> Expressions:
         """Return a compiler that also knows the names in `entries`.
 
-        With `samplers`, functions such as `uniform` are known too. `ready` are the names of the
-        states, parameters and local names that already have a value; None means all.
+        If `samplers`, functions such as `uniform` are known, too. `ready` are the names of the states,
+        parameters and local names that already have a value; None means all.
         """
         return replace(self, scope=self.scope.extended(entries, samplers=samplers), ready=ready)
 
@@ -108,9 +108,10 @@ class Expressions:
     # -------------------------------------------------------------------- typing
 
     def number(self, node: Node | None, where: str) -> Number | None:
-        """Read a number and scale it to SI units; None if it is invalid. `where` names it in messages.
+        """Read a number and scale it to SI units; return None if the number is invalid.
 
-        The zero of a temperature scale is not shifted: 20 degC becomes 20, not 293.15.
+        The zero of a temperature scale is not shifted: 20 degC becomes 20, not 293.15. `where` names the
+        number in messages.
         """
         expr = self.parse(node, where)
         return None if expr is None else self._typed(resolve_number, expr)
@@ -118,8 +119,8 @@ class Expressions:
     def numbers(self, node: Node | None, where: str) -> tuple[Number, ...] | None:
         """Read a number or a vector, written as one expression or as a list; return the components.
 
-        The components are scaled to SI units. Returns None if one is invalid. `where` names the value in
-        messages.
+        The components are scaled to SI units. Returns None if a component is invalid. `where` names the value
+        in messages.
         """
         if isinstance(node, ListNode):
             each = [self.number(item, f"a component of {where}") for item in self.reader.items(node, where)]
@@ -129,12 +130,12 @@ class Expressions:
         return None if expr is None else self._typed(resolve_numbers, expr)
 
     def formula(self, node: Node | None, where: str) -> ir.Formula | None:
-        """Read a state formula; return None if it is invalid. `where` names it in messages."""
+        """Read a state formula; return None if it is invalid. `where` names the formula in messages."""
         expr = self.parse(node, where)
         return None if expr is None else self.formula_of(expr)
 
     def formula_of(self, expr: ast.Expr) -> ir.Formula | None:
-        """Return the expression as a state formula; None if it is not one, which is reported."""
+        """Return `expr` as a state formula; report an error and return None if it is not a formula."""
         return self._typed(resolve_state_formula, expr)
 
     def check(self, expr: ast.Expr) -> None:
@@ -188,7 +189,7 @@ class Expressions:
     def stored(self, node: Node | None, where: str, unit: Unit) -> ir.Num | None:
         """Read a number and convert it to `unit`, the unit of the column in which it is stored.
 
-        Returns None if it is invalid. `where` names it in messages.
+        Returns None if the value is invalid. `where` names the value in messages.
         """
         number = self.number(node, where)
         if number is None or node is None:
@@ -240,7 +241,7 @@ class Expressions:
     def truth(self, node: Node | None, where: str) -> ir.Num | None:
         """Read a number or a formula as the value of a bool column: an expression with the value 0 or 1.
 
-        Returns None if it is invalid. `where` names it in messages.
+        Returns None if the value is invalid. `where` names the value in messages.
         """
         expr = self.parse(node, where)
         match expr:
@@ -257,7 +258,7 @@ class Expressions:
     def constant(self, node: Node | None, where: str, unit: Unit) -> float | None:
         """Read a constant known at compile time, and convert it to `unit`, the unit of its column.
 
-        Returns None if it is invalid. `where` names it in messages.
+        Returns None if the value is invalid. `where` names the value in messages.
         """
         value = self.stored(node, where, unit)
         found = None if value is None or node is None else self._constants((value,), node, where)
@@ -266,13 +267,13 @@ class Expressions:
     def constants(self, node: Node, where: str, unit: Unit, size: int) -> tuple[float, ...] | None:
         """Read `size` constants known at compile time, and convert them to `unit`, the unit of their columns.
 
-        Returns None if one is invalid. `where` names them in messages.
+        Returns None if any of them is invalid. `where` names them in messages.
         """
         values = self.stored_each(node, where, unit, size)
         return None if values is None else self._constants(values, node, where)
 
     def _constants(self, values: tuple[ir.Num, ...], node: Node, where: str) -> tuple[float, ...] | None:
-        """Return the values of constant expressions; report and return None if one is not constant.
+        """Return the values of constant expressions; report any that is not constant, and return None.
 
         `where` names them in messages, which are located at `node`.
         """
@@ -285,7 +286,7 @@ class Expressions:
     def duration(self, node: Node | None, where: str) -> Fraction | None:
         """Read an exact duration in seconds; a number without unit is in seconds.
 
-        Returns None if it is invalid. `where` names it in messages.
+        Returns None if the value is invalid. `where` names the value in messages.
         """
         number = self.number(node, where)
         if number is None or node is None:
@@ -298,7 +299,7 @@ class Expressions:
     def steps(self, node: Node | None, where: str, dt: Fraction) -> int | None:
         """Read a number of steps: `25 steps`, `25`, or a time that is a multiple of the time step `dt`.
 
-        Returns None if it is invalid. `where` names it in messages.
+        Returns None if the value is invalid. `where` names the value in messages.
         """
         if node is None:
             return None

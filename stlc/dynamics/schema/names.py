@@ -95,7 +95,7 @@ class Names:
         return Expressions(reader, scope, rewrite=self.rewrite)
 
     def group(self, name: str) -> tuple[Column, ...]:
-        """Return the columns of a state: one, or one per component of a vector; none if unknown."""
+        """Return the columns of the state `name`: one, or one per component; () for an unknown name."""
         exact = tuple(column for column in self.columns if column.name == name)
         return exact or tuple(column for column in self.columns if base_name(column.name) == name)
 

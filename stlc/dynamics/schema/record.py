@@ -42,7 +42,7 @@ class Kind:
     """A kind of value, such as an integer or an expression.
 
     Attributes:
-        read: (context, node, label for messages) -> value; None if a finding was reported.
+        read: function (context, node, label for messages) -> value, or None if a finding was reported.
         schema: JSON Schema of the accepted values.
         record: the dataclass into which the value, or each of its items, is read; None if it is not read into
             a dataclass.

@@ -56,7 +56,7 @@ class Scalar:
 
     @property
     def escaped(self) -> bool:
-        """True if the value differs from the text between the quotes, as escapes were resolved."""
+        """True if the value differs from the text between the quotes, because escapes were resolved."""
         inside = self.inside.text
         return "\\" in inside if self.style == "double" else self.style == "single" and "''" in inside
 
@@ -83,7 +83,7 @@ class Entry:
     value: Node
 
     def place(self, key: str) -> Span:
-        """Source location of the value of `key` in the mapping that is this entry's value.
+        """Return the source location of the value of `key`, where the value of this entry is a mapping.
 
         If the mapping lacks this key, the source location of the mapping is returned.
         """

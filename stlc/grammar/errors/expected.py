@@ -1,7 +1,7 @@
 """Diagnostic E010, for a syntax error that is not a common mistake: the expected tokens, and a repair.
 
-A message names the terminals (kinds of token) of the grammar in words, one by one or as a class. A repair is
-offered only if the repaired text parses.
+The message names the expected kinds of token (the terminals of the grammar) in words. A repair is offered
+only if the repaired text parses.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def expected(failure: ParseFailure) -> Diagnostic:
 
 
 def point(failure: ParseFailure, lexeme: Lexeme) -> Span:
-    """Return the source location of the first character of a lexeme (word or sign)."""
+    """Return the source location of the first character of `lexeme`, a word or sign."""
     return failure.piece.source.span(lexeme.start, lexeme.start + 1)
 
 
@@ -225,8 +225,8 @@ def _missing(
 ) -> Diagnostic:
     """Return the diagnostic for the missing sign `sign`, with the corrected line as help.
 
-    In the corrected line, `text` replaces the characters from offset `low` to `high`. With `sure`, an editor
-    and `stlc lint --fix` can apply this correction.
+    In the corrected line, `text` replaces the characters from offset `low` to `high`. If `sure`, an editor or
+    `stlc lint --fix` can apply this correction.
     """
     label = f"expected `{sign}` before this" if low == high and failure.found is not None else ""
     return Diagnostic(
@@ -308,7 +308,7 @@ def _context(failure: ParseFailure) -> str:
 
 
 def _declared(failure: ParseFailure) -> tuple[Lexeme, str] | None:
-    """Return (name, kind in words) of the first declaration before the error; None if there is none."""
+    """Return (name, kind in words) of the first declaration in the text before the error, or None."""
     for keyword, name in zip(failure.before, failure.before[1:], strict=False):
         if keyword.text in NOUNS and name.kind in ("word", "quoted"):
             return name, NOUNS[keyword.text]

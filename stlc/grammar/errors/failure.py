@@ -1,4 +1,7 @@
-"""Syntax errors with the words and signs around them, from which common mistakes are recognised."""
+"""Syntax errors, and the words and signs around them.
+
+These words and signs show whether an error is a common mistake.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ class Piece:
         source: the whole text.
         start: offset of the first character of the part.
         end: offset after its last character.
-        rule: start rule of the grammar, `start` for a declaration or `expr` for an expression.
+        rule: grammar rule that the part must match: `start` for a declaration, `expr` for an expression.
     """
 
     source: Source
@@ -52,12 +55,12 @@ class ParseFailure:
 
     @cached_property
     def before(self) -> tuple[Lexeme, ...]:
-        """Lexemes (words, numbers, strings and signs) before the error."""
+        """Lexemes (words, numbers, strings and signs) that come before the error."""
         return tuple(lexeme for lexeme in self.lexemes if lexeme.start < self.at)
 
     @cached_property
     def after(self) -> tuple[Lexeme, ...]:
-        """Lexemes (words, numbers, strings and signs) from the error on."""
+        """Lexemes (words, numbers, strings and signs) from the error to the end of the part."""
         return self.lexemes[len(self.before) :]
 
     @property
@@ -72,7 +75,7 @@ class ParseFailure:
 
     @cached_property
     def follower(self) -> Lexeme | None:
-        """First lexeme (word, number, string or sign) after the part, with which the next declaration begins.
+        """First lexeme (word, number, string or sign) after this part; the next declaration begins with it.
 
         It is None at the end of the text, or if the part is an expression.
         """
@@ -82,7 +85,7 @@ class ParseFailure:
 
     @cached_property
     def accepts(self) -> frozenset[str]:
-        """Terminals of the grammar that would be accepted at the error."""
+        """Kinds of token (terminals of the grammar) that the parser would accept at the error."""
         return acceptable(self.piece.text, self.piece.rule, even_broken=True) or frozenset()
 
     @property
@@ -102,7 +105,10 @@ class ParseFailure:
 
     @property
     def span(self) -> Span:
-        """Source location of the lexeme at the error; without one, the end of the lexeme before the error."""
+        """Source location of the lexeme at the error.
+
+        If the error is at the end of the part, it is the location of the end of the last lexeme.
+        """
         if self.found is not None:
             return self.of(self.found)
         end = self.previous.end if self.previous is not None else self.piece.start
@@ -116,9 +122,10 @@ class ParseFailure:
         return self.piece.source.span(first.start, (last or first).end)
 
     def line_with(self, *edits: tuple[int, int, str]) -> str:
-        """Return the line of the first edit, with all edits applied and without its comment.
+        """Return the line that contains the first of `edits`, with all edits applied.
 
-        An edit is (offset of the first character, offset after the last one, replacement).
+        A comment at the end of the line is removed, except where an edit reaches into it. An edit is (offset
+        of the first character, offset after the last one, replacement).
         """
         source = self.piece.source
         number = source.position(edits[0][0])[0]

@@ -1,7 +1,7 @@
 """Diagnostics of syntax errors: a table of recognisers of common mistakes.
 
-Each recogniser maps a `ParseFailure` to a finding, or to None if it does not match; the first finding is
-used. `expected.py` handles the errors that no recogniser matches.
+A recogniser is a function. It maps a `ParseFailure` to a finding, or to None if it does not recognise the
+mistake. The first finding is used. `expected.py` handles the errors that no recogniser matches.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def diagnose(piece: Piece, at: int) -> Diagnostic:
 
 
 def too_deep(span: Span, limit: int) -> Diagnostic:
-    """Return E005 for a part of a text, at `span`, that is nested more than `limit` deep."""
+    """Return the diagnostic E005: the text at `span` is nested more than `limit` levels deep."""
     first_line = span.source.span(span.start, min(span.end, span.start + 40))
     return Diagnostic(
         "E005",
@@ -181,8 +181,8 @@ def _until_before(failure: ParseFailure, index: int) -> int | None:
 def _behind_interval(failure: ParseFailure, index: int) -> int:
     """Return the index of the first lexeme after a temporal operator and its interval.
 
-    `index` is the index of the operator. If the operator has no interval, the lexeme after the operator is
-    meant.
+    `index` is the index of the operator. If the operator has no interval, the result is the index of the
+    lexeme after the operator.
     """
     items = failure.lexemes
     last = len(items) - 1

@@ -76,9 +76,10 @@ def unexpected_character(lexeme: Lexeme) -> bool:
 
 
 def apart(word: str, text: str, at: int) -> str:
-    """Return `word` as the replacement of the character of `text` at offset `at`, with blanks if needed.
+    """Return `word`, with blanks around it if needed, as a replacement of one character of `text`.
 
-    A blank is added on each side where `word` would otherwise join a letter or digit.
+    `at` is the offset of this character. A blank is added on a side where `word` would otherwise join a
+    letter or digit.
     """
     before = " " if word[0].isalpha() and at and text[at - 1].isalnum() else ""
     behind = " " if word[-1].isalpha() and text[at + 1 : at + 2].isalnum() else ""

@@ -97,9 +97,10 @@ def _word(text: Text, index: int) -> Word:
 
 
 def _splits(text: Text, start: int, end: int, row: frozenset[str]) -> list[int]:
-    """Return the indices of the operators of the kinds `row` among the tokens from `start` to `end`.
+    """Return the indices of the operators whose kind is in `row`.
 
-    Operators within brackets or within `if … else` are left out.
+    Only the tokens from `start` to `end` are searched. Operators within brackets or within `if … else` are
+    left out.
     """
     found: list[int] = []
     index, conditions = start, 0
@@ -189,7 +190,7 @@ def _sequence(text: Text, start: int, end: int) -> tuple[Doc, ...]:
 def _bracket(text: Text, opening: int) -> Group:
     """Return the group of the bracket that begins at the index `opening`.
 
-    If it does not fit on a line, each entry gets its own line.
+    If the bracket does not fit on a line, each entry gets its own line.
     """
     closing = text.partner[opening]
     edge = LINE if text.roles[opening] == "enum" else SOFT
@@ -207,7 +208,10 @@ def _bracket(text: Text, opening: int) -> Group:
 
 
 def _comma(text: Text, start: int, end: int) -> int:
-    """Return the index of the first comma from `start` on that is outside of brackets; `end` without one."""
+    """Return the index of the first comma from `start` on that is outside of brackets.
+
+    If there is no such comma before `end`, the result is `end`.
+    """
     index = start
     while index < end and text.tokens[index].text != ",":
         index = behind(text, index)

@@ -128,9 +128,9 @@ def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
 
 
 def _width(doc: Word | Blank | Line) -> int:
-    """Width of a layout element in characters, if a line break is printed as a blank or as nothing.
+    """Width of a layout element in characters; a possible line break has the width of its text `flat`.
 
-    The width is 0 for a word that has comments above it, because it begins a new line.
+    The width is 0 for a word that has comments above it, because such a word begins a new line.
     """
     match doc:
         case Word(text, before, _):
@@ -144,7 +144,7 @@ def _width(doc: Word | Blank | Line) -> int:
 def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
     """True if the line ends at a layout element: a word with a comment, or a line break.
 
-    With `flat`, the text is printed on one line, so possible line breaks do not count.
+    If `flat`, the text is printed on one line, so possible line breaks do not count.
     """
     if isinstance(doc, Word):
         return bool(doc.before) or doc.after is not None
@@ -152,7 +152,7 @@ def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
 
 
 class _Page:
-    """Lines under construction, of which the last can still grow."""
+    """Lines under construction; only the last line can still grow."""
 
     def __init__(self, indent: int) -> None:
         self.lines: list[str] = []
@@ -169,7 +169,8 @@ class _Page:
     def write(self, word: Word, level: int) -> None:
         """Append a word to the current line.
 
-        The word begins a new line if there are comments above it, or if it follows a comment.
+        The word begins a new line if there are comments above it, or if it follows a comment. The new line is
+        indented by `level` blanks.
         """
         if word.before or self.commented:
             self.end_line(level)
@@ -184,7 +185,10 @@ class _Page:
             self.commented = True
 
     def end_line(self, level: int) -> None:
-        """Begin a new line indented by `level` blanks; the current line is dropped if it is empty."""
+        """End the current line, and begin a new one that is indented by `level` blanks.
+
+        If the current line is empty, it is dropped.
+        """
         if self.line:
             self.lines.append(self.line)
         self.line, self.indent, self.blank, self.commented = "", level, False, False
@@ -246,7 +250,7 @@ def _pad_heads(lines: Sequence[AlignedColumn]) -> list[AlignedColumn]:
 
 
 def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
-    """Return the text of each line with its comment, which starts in the same column as in adjacent lines."""
+    """Return each line with its comment; comments of adjacent lines start in the same column."""
     texts = [line.text for line in lines]
     for group in _groups(lines, by_kind=False):
         noted = [i for i in group if lines[i].comment]
@@ -260,8 +264,8 @@ def _with_comments(lines: Sequence[AlignedColumn]) -> list[str]:
 def _groups(lines: Sequence[AlignedColumn], *, by_kind: bool) -> Iterator[list[int]]:
     """Yield the indices of adjacent lines that are aligned with each other.
 
-    A tag belongs to the group of the declaration below it. With `by_kind`, a group has declarations of one
-    kind only, such as constants.
+    A tag belongs to the group of the declaration below it. If `by_kind`, a group has declarations of one kind
+    only, such as constants.
     """
     group: list[int] = []
     kind = ""

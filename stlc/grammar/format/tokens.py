@@ -42,7 +42,7 @@ class Text:
     def ends_operand(self, index: int) -> bool:
         """True if an operand ends with the token at `index`.
 
-        A `-` after it is then a subtraction, and a `(` a call.
+        After such a token, `-` is a subtraction, and `(` begins the arguments of a call.
         """
         token = self.tokens[index]
         if token.text in _CLOSING:
@@ -73,7 +73,7 @@ def prepare(tokens: Sequence[Token]) -> Text:
 def spelling(kind: str, text: str) -> str:
     """Return the canonical spelling of a token: `always` for `G`, `and` for `&&`.
 
-    `kind` is its terminal in the grammar, and `text` its spelling in the source.
+    `kind` is the kind of token (its terminal in the grammar), and `text` is the spelling in the source.
     """
     if kind.startswith(("UNARY", "BINARY")):
         match = _WORD.match(text)
@@ -115,7 +115,10 @@ def _hugs_left(text: Text, index: int) -> bool:
 
 
 def _typed(text: Text, index: int) -> bool:
-    """True if the colon at `index` precedes a type, as in `signal x : Type`; then a blank precedes it."""
+    """True if the colon at `index` precedes a type, as in `signal x : Type`.
+
+    Such a colon has a blank before it.
+    """
     declared = any(token.kind in ("_SIGNAL", "_CONST", "_PARAM") for token in text.tokens[:2])
     return declared and not any(token.text == "=" for token in text.tokens[:index])
 
@@ -179,8 +182,8 @@ def _holds_interval(text: Text, opening: int) -> bool:
 def level(text: Text, opening: int) -> list[int]:
     """Return the indices of the tokens directly within the bracket that begins at the index `opening`.
 
-    Of an inner bracket only its opening token is included. Of a head such as `forall i in …:` only the first
-    token is included.
+    An inner bracket is represented by its opening token only. A head such as `forall i in …:` is represented
+    by its first token only.
     """
     found: list[int] = []
     index = opening + 1

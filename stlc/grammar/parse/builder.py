@@ -1,8 +1,8 @@
 """Conversion of parsed expressions to the syntax tree: one function per rule of `stl.lark`.
 
 A function takes the converted children of its parse-tree node: nodes of the syntax tree, `TerminalToken`s,
-and None for an omitted optional part. Every rule needs a function. Errors that the grammar cannot exclude,
-such as an unknown unit, are collected in the context.
+and None for an omitted optional part. Every rule needs a function. Errors that the grammar does not detect,
+such as an unknown unit, are collected in `BuildContext.findings`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class BuildContext:
 
     Attributes:
         source: the whole text.
-        findings: errors that the grammar cannot exclude, such as a number too large or an unknown unit.
+        findings: errors that the grammar does not detect, such as a number too large or an unknown unit.
         documented: offset in the text. The `##` comments before it already belong to a declaration.
     """
 
@@ -61,7 +61,8 @@ def name_of(leaf: TerminalToken) -> str:
 def own_name(context: BuildContext, leaf: TerminalToken) -> str:
     """Return the name that a declaration introduces, from its NAME token.
 
-    An error (E010) is added to the context for `T`, `end` and `dt`: these can be declared only in backticks.
+    An error (E010) is added to the context for `T`, `end` and `dt`, because these names can be declared only
+    in backticks.
     """
     if leaf.text in BUILT_IN:
         context.findings.append(
@@ -143,7 +144,7 @@ BuildRule: TypeAlias = Callable[[BuildContext, Span, Sequence[Any]], Any]
 
 
 def node(kind: Callable[..., Any]) -> BuildRule:
-    """Return a function that converts parse-tree nodes of a grammar rule to tree nodes of class `kind`.
+    """Return a function that converts parse-tree nodes of one rule to syntax-tree nodes of class `kind`.
 
     The converted children become the fields of the node, in order.
     """
@@ -201,8 +202,8 @@ def _logic(_: BuildContext, span: Span, children: Sequence[Any]) -> ast.Logic:
 def _operator(token: TerminalToken, written: Sequence[ast.Interval]) -> tuple[str, ast.Interval | None, str]:
     """Return (name, interval or None, alias) of a temporal operator; `token` is its word in the source.
 
-    `written` holds the interval, if there is one. The alias is the spelling in the source, such as `G`; "" if
-    that is the preferred name.
+    `written` holds the interval, if there is one. The alias is the spelling in the source, such as `G`. It is
+    "" if the source uses the preferred name.
     """
     match = _LETTERS.match(token.text)
     assert match is not None

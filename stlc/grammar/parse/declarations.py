@@ -86,7 +86,7 @@ def _formal(context: BuildContext, span: Span, children: Sequence[Any]) -> ast.F
 def _heads(
     context: BuildContext, span: Span, names: Sequence[TerminalToken], tags: tuple[ast.Tag, ...]
 ) -> list[dict[str, Any]]:
-    """Return the values of the fields that all declarations have, as one mapping for each declared name.
+    """Return the fields that every declaration has, as one mapping (field name -> value) per declared name.
 
     The `##` lines before the first name become the field `doc`.
     """

@@ -1,9 +1,9 @@
-"""Parser of the language, made by Lark from `stl.lark` once per process, with tables cached on disk.
+"""Parser of the language, made by Lark from `stl.lark` once per process; its tables are cached on disk.
 
-Building the LALR tables takes a tenth of a second; reading stored tables takes a fifth of that time. They are
-stored as JSON (never a pickle) in the cache folder (`stlc.cache`), under a name that depends on the grammar
-and on the versions of Lark and Python. If the cache is missing, damaged or read-only, the tables are built
-anew.
+Building the parsing tables (LALR) takes a tenth of a second; reading stored tables takes a fifth of that
+time. They are stored as JSON (never a pickle) in the cache folder (`stlc.cache`), under a name that depends
+on the grammar and on the versions of Lark and Python. If the cache is missing, damaged or read-only, the
+tables are built anew.
 """
 
 from __future__ import annotations

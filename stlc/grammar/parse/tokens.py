@@ -1,7 +1,7 @@
-"""Tokens of a specification with their comments, for the formatter; the syntax tree has no comments.
+"""Tokens of a specification, each with the comments around it.
 
-The text is split as in `parser.parse` and parsed with the same tables, so the tokens are those of the syntax
-tree.
+The formatter needs the comments, which the syntax tree does not contain. The text is split as in
+`parser.parse` and parsed with the same tables, so the tokens are those of the syntax tree.
 """
 
 from __future__ import annotations
@@ -151,7 +151,9 @@ def _items(tokens: Sequence[Token], places: Sequence[tuple[str, int, int]]) -> I
 
 
 def _own(token: Token) -> tuple[Comment, ...]:
-    """Return the comments of a token that is not printed itself; each gets its own line.
+    """Return the comments of a token that is not printed itself.
+
+    The formatter prints each comment on its own line.
 
     A `##` comment after the token gets another `#` in front. Otherwise it would document the next item.
     """
@@ -180,8 +182,8 @@ def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
 def _inside(token: Token) -> tuple[Comment, ...]:
     """Return the comments inside a token.
 
-    Comments can occur in the tokens `always@` and `not in`: `always # … @`, `not # … in`. The formatter moves
-    them before the token.
+    The tokens `always@` and `not in` can contain a comment, because they consist of two words or signs. The
+    formatter moves the comment before the token.
     """
     if token.kind not in _WITH_BLANKS:
         return ()
@@ -189,10 +191,11 @@ def _inside(token: Token) -> tuple[Comment, ...]:
 
 
 def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:
-    """Attach a comment that follows a token on its line to this token; return the other comments.
+    """Attach a comment that follows a token on the same line to this token; return the other comments.
 
-    `found` are the comments after the token, of which only the first can be on its line. `index` is the index
-    of the token. If the token is `;`, the comment is attached to the token before the `;`.
+    `index` is the index of the token, and `found` has the comments between this token and the next one. Only
+    the first comment can be on the line of the token. If the token is `;`, the comment is attached to the
+    token before the `;`.
     """
     if not found or found[0].own_line or index < 0:
         return found
@@ -206,7 +209,7 @@ def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) 
 def _comments(text: str, start: int, end: int, *, first: bool) -> tuple[tuple[Comment, ...], bool]:
     """Return the comments between the offsets `start` and `end`, and whether an empty line follows them.
 
-    With `first`, no token precedes them; the first comment then stands on its own line.
+    If `first`, no token precedes the comments. The first comment then counts as alone on its line.
     """
     found: list[Comment] = []
     offset = start

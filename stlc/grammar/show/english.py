@@ -87,7 +87,10 @@ def say(expr: ast.Expr) -> str:
 
 
 def _inner(expr: ast.Expr) -> str:
-    """Return an expression in words for use as an operand; a connective or `until` gets parentheses."""
+    """Return an expression in words for use as an operand.
+
+    A formula with a connective or `until` gets parentheses.
+    """
     return f"({say(expr)})" if isinstance(expr, ast.Logic | ast.Until) else say(expr)
 
 
@@ -110,7 +113,10 @@ def _temporal(expr: ast.Temporal | ast.Until) -> str:
 
 
 def _when(interval: ast.Interval | None, *, past: bool) -> str:
-    """Return the window of a temporal operator in words."""
+    """Return the window of a temporal operator in words.
+
+    `past` is True if the window lies in the past.
+    """
     if interval is None:
         return "so far" if past else "from now on"
     low, high = show_expr(interval.lo), show_expr(interval.hi)
@@ -144,7 +150,10 @@ def _logic(expr: ast.Logic) -> str:
 
 
 def _side(expr: ast.Expr, op: str) -> str:
-    """Return an operand of the connective `op` in words; another connective gets parentheses."""
+    """Return an operand of the connective `op` in words.
+
+    An operand that contains `until` or another connective at the top level gets parentheses.
+    """
     return say(expr) if isinstance(expr, ast.Logic) and expr.op == op else _inner(expr)
 
 

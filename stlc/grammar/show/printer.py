@@ -23,7 +23,7 @@ _PLAIN_DIGITS = 16
 class Level(IntEnum):
     """Precedence levels of expressions, from the connective that binds loosest to names and numbers.
 
-    An operator requires a least level of each operand. An operand below that level gets parentheses.
+    Each operator requires operands of at least a certain level. An operand below that level gets parentheses.
     """
 
     IFF = 0
@@ -200,7 +200,7 @@ _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
 
 
 def show_name(name: str) -> str:
-    """Return the text of a name in an expression: in backticks if it is a reserved word or no identifier.
+    """Return the text of a name in an expression: in backticks if it is reserved or not an identifier.
 
     `T`, `end` and `dt` get no backticks, because in an expression they are the built-in names.
     """
@@ -210,7 +210,7 @@ def show_name(name: str) -> str:
 def own_name(name: str) -> str:
     """Return the text of a name in its declaration, in backticks if needed.
 
-    `T`, `end` and `dt` need them there, because without backticks they are built-in names.
+    The names `T`, `end` and `dt` need backticks there. Without backticks, they are built-in names.
     """
     return f"`{name}`" if name in BUILT_IN else show_name(name)
 

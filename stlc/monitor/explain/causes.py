@@ -1,4 +1,4 @@
-"""Causes of a violation at an instant, as a tree of sub-formulas.
+"""Causes of a violation at an instant (a sample of the trace), as a tree of sub-formulas.
 
 A node of the tree is a sub-formula at an instant, at which it has the wrong truth value. The children of a
 node explain this value. A violated conjunction has one child: the operand with the least robustness. A
@@ -62,9 +62,10 @@ class CauseNode:
         holds: truth value that the sub-formula has; the opposite value is needed.
         sample: the instant, as a sample number.
         rho: robustness of the sub-formula at `sample`; its sign gives `holds`.
-        until: for a temporal operator whose body has the wrong truth value in the whole window: the last
-            instant of the window; `sample` is the first one. Otherwise None.
-        reads: for a predicate, pairs (signal, offset): it reads the signal `offset` samples after `sample`.
+        until: last instant of the window, if the node is a temporal operator whose body has the wrong truth
+            value in the whole window; `sample` is then the first instant. Otherwise None.
+        reads: pairs (signal, offset), if the node is a predicate. The predicate reads the signal `offset`
+            samples after `sample`.
         parts: the children, which explain this node; empty for a predicate.
         main: index in `parts` of the child on the main path. The robustness of this child determines that of
             the sub-formula.
@@ -165,8 +166,8 @@ class _Tied:
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
         """Return the robustness of `formula` at `sample`, with one predicate value slightly increased.
 
-        The sequence `raised` contains the pair (predicate, sample) of this value. The value is increased to
-        the next larger float. If `raised` is empty, no value is changed. Only the first pair in it is used.
+        The first pair (predicate, sample) in `raised` selects this value; other pairs are ignored. The value
+        is increased to the next larger float. If `raised` is empty, no value is changed.
         """
         coded = self.coded(formula)
         env = self._with(raised[0]) if raised else self.env
@@ -379,7 +380,7 @@ class CauseFinder:
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
         """Upper bounds, (instants,), on the robustness of `lowered`, if they were computed before.
 
-        They are stored in `known`; None if they are not there.
+        The bounds are taken from the attribute `known`. The result is None if `known` does not contain them.
         """
         for known, values in self.known.get(lowered, ()):
             if known.start <= instants.start and instants.stop <= known.stop:
@@ -401,7 +402,7 @@ class CauseFinder:
         return replace(self._node(formula, wanted, sample), reads=tuple(sorted(found)))
 
     def _later(self, leaf: ir.Signal | ir.ShiftedSignal, sample: int) -> int:
-        """Number of samples from `sample` to the sample of the signal `leaf` that a predicate reads.
+        """Return how many samples later than `sample` a predicate reads the signal `leaf`.
 
         The predicate is evaluated at `sample`.
         """
@@ -411,7 +412,7 @@ class CauseFinder:
         return min(max(there, 0), self.record.samples - 1) - sample if leaf.clamped else leaf.steps
 
     def _least(self, parts: Sequence[tuple[typed.Formula, int, bool]]) -> tuple[typed.Formula, int, bool]:
-        """Triple (formula, sample, wanted) in `parts` with the least upper bound (`_margin`)."""
+        """Return the triple (formula, sample, wanted) in `parts` with the smallest result of `_margin`."""
         return parts[int(np.argmin([self._margin(*part) for part in parts]))]
 
     def _margin(self, formula: typed.Formula, sample: int, wanted: bool) -> float:
@@ -476,7 +477,10 @@ class CauseFinder:
     # ------------------------------------------------------------------- windows
 
     def _instants(self, formula: typed.Formula, sample: int, wanted: bool) -> range:
-        """Instants in the window of `formula` at `sample` at which its operands can be known."""
+        """Return the instants in the window of `formula` at `sample`.
+
+        Instants at which the operands cannot be known are left out.
+        """
         lowered = self._lowered(formula, wanted)
         match lowered:
             case ir.Windowed(window=window, back=False):
@@ -494,11 +498,11 @@ class CauseFinder:
         raise TypeError(f"{type(lowered).__name__} has no window")
 
     def _stop(self, lowered: ir.Formula) -> int:
-        """Return the first instant from which on the operands of the operator `lowered` are unknown.
+        """Return the first instant at which the operands of the operator `lowered` are unknown.
 
         Usually this is the first instant after the last sample. An operand with past operators still reads
-        recorded samples at later instants. In this case its lookback is added, but at most `_MOST_LATER`
-        samples.
+        recorded samples at later instants. The number of samples that it reads back is then added, but at
+        most `_MOST_LATER`.
         """
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 

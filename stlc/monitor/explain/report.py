@@ -219,7 +219,11 @@ class _Words:
         return text
 
     def reason(self, tree: CauseNode) -> str:
-        """Sentence on the deciding predicate: `before_junction means x < x_inter / 2, and x = 0.27 m …`."""
+        """Return a sentence on the deciding predicate.
+
+        If the predicate is in the text of a definition, the sentence explains the name of this definition:
+        `before_junction means x < x_inter / 2, and x = 0.27 m …`.
+        """
         leaf = tree.leaf
         moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
         values = " and ".join(reading.text for reading in self.readings(leaf))

@@ -58,13 +58,13 @@ class Tracker(Protocol):
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change with later samples."""
+        """Index of the first instant that is not settled yet."""
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
+        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
 
     def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, as no more samples follow.
+        """Final bounds on the robustness at the instants `starts`, now that the trace has ended.
 
         A window that extends to the end of the trace now ends with the last sample.
         """

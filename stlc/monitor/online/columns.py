@@ -1,8 +1,8 @@
-"""Time series of robustness values that grow sample by sample.
+"""Time series of robustness values, to which one row is added per sample.
 
-Such a time series is called a column. It has one row per sample; only the rows that a formula still needs are
-stored. For each row there are two values: the least and the greatest robustness over all continuations of the
-trace. They are equal if no later sample can change the robustness.
+Such a time series is called a column. Only the rows that a formula still needs are stored. For each row there
+are two values: the least and the greatest robustness over all continuations of the trace. They are equal if
+no later sample can change the robustness.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class ColumnReader:
             last row.
         going_on: whether the trace continues after the last row.
         back: lookback of the formulas: number of rows that they read before the first requested row. Unknown
-            values (NaN) in rows before these have no effect.
+            values (NaN) in still earlier rows have no effect.
     """
 
     def __init__(

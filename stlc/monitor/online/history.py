@@ -35,7 +35,7 @@ class ColumnHistory:
         self._origin = self._room = 0
 
     def grow(self, names: Iterable[str], count: int, width: int = 1) -> None:
-        """Append `count` rows with the value `fill` to the columns `names`.
+        """Append `count` rows of `width` entries with the value `fill` to the columns `names`.
 
         All calls must have the same `names`.
         """

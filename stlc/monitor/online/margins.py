@@ -32,7 +32,8 @@ class Margin:
     Attributes:
         low: least robustness over all continuations of the trace. If the requirement is evaluated at every
             sample, this is the minimum over the windows that contain the latest sample.
-        high: greatest robustness over all continuations, with the same minimum over windows.
+        high: greatest robustness over all continuations. If the requirement is evaluated at every sample,
+            this is the minimum over the same windows.
         violated: number of window starts at which the requirement is certainly violated.
         open: whether the requirement is undecided at any window start.
     """
@@ -137,17 +138,17 @@ class _Watched:
         return self.last
 
     def _settled(self, samples: int) -> int:
-        """The first window start at which the robustness may still change after `samples` samples."""
+        """Index of the first window start whose robustness may still change after `samples` samples."""
         if self.ahead is None:
             return 0
         whole = max(samples - self.ahead, 0)
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Number of window starts to leave out of the margin, because their windows are over.
+        """Return how many window starts the margin leaves out, because their windows have ended.
 
-        These are the first window starts from `next` on. Their windows end before the latest sample.
-        `samples` is the number of samples received.
+        The window starts are counted from `next` on. Their windows end before the latest sample. `samples` is
+        the number of samples received.
         """
         if not self.everywhere or self.ahead is None:
             return 0

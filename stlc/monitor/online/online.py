@@ -61,8 +61,8 @@ class How:
     """Options of an online monitor.
 
     Attributes:
-        at: instants at which to evaluate the requirements: "all", every sample; a number, that sample; None,
-            the instants that each requirement prescribes (`stlc.monitor.instants`).
+        at: instants at which to evaluate the requirements: "all" for every sample, a number for that sample,
+            or None for the instants that each requirement prescribes (`stlc.monitor.instants`).
         end: treatment of windows that extend beyond the end of the stream: "open" computes bounds, "strict"
             raises an error, "truncate" clips the windows.
         tolerance: a requirement is satisfied if its robustness is at least minus this value. If the tolerance
@@ -91,8 +91,8 @@ class Watched:
         tolerance: the requirement is satisfied if its robustness is at least minus this value. If it is 0,
             the truth values of the predicates decide.
         tally: summary of the instants whose verdict is final; these instants are called counted.
-        decided: whether an instant already has a verdict, (instants,). It begins with the first instant that
-            is not counted.
+        decided: whether an instant already has a verdict, (instants,). The first entry belongs to the first
+            instant that is not counted.
     """
 
     rule: CompiledRequirement
@@ -105,7 +105,7 @@ class Watched:
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
-        """The evaluator of robustness and, if the tolerance is 0, that of truth values."""
+        """The evaluator of robustness and, if the tolerance is 0, the evaluator of truth values."""
         return (self.values,) if self.truths is None else (self.values, self.truths)
 
     def grow(self, history: ColumnHistory) -> None:
@@ -189,7 +189,7 @@ class Online:
     # ------------------------------------------------------------------------ samples
 
     def push(self, sample: Sample) -> tuple[Decision, ...]:
-        """Add one sample; returns the verdicts that it decides, in the order of the requirements.
+        """Add one sample; return the verdicts that this sample decides, in the order of the requirements.
 
         NaN is an unknown value.
 
@@ -231,10 +231,10 @@ class Online:
         self._trim()
 
     def _unknown(self, need: Need, values: Floats) -> None:
-        """Count the unknown samples (NaN) of the signal `need`, and add them to `gaps`.
+        """Count the unknown samples (NaN) of the signal `need`, and record the result in `gaps`.
 
-        `values`, (samples,), are the next samples of the signal. Raises TraceError (E604) if a value is
-        infinite.
+        The array `values`, (samples,), contains the next samples of the signal. Raises TraceError (E604) if a
+        value is infinite.
         """
         if np.isinf(values).any():
             first = int(np.argmax(np.isinf(values)))
@@ -302,15 +302,18 @@ class Online:
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
     def _count(self, watched: Watched, judged: JudgedInstants) -> int:
-        """Add the instants of `judged` whose value is final to the summary `tally`; return their number."""
+        """Add the final instants of `judged` to the summary `tally`; return the number of these instants.
+
+        An instant is final if its value can no longer change.
+        """
         count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
         watched.tally.add(judged, count)
         return count
 
     def _count_settled(self, requirements: Sequence[Watched]) -> None:
-        """Pass the latest samples to the evaluators of `requirements`.
+        """Pass the latest samples to the evaluators of `requirements`, and update the summaries.
 
-        Then add the instants whose value can no longer change to the summary of each requirement.
+        The summary of a requirement covers the instants whose value can no longer change.
         """
         for watched in requirements:
             if watched.due(self.samples):
@@ -335,12 +338,12 @@ class Online:
         return self._find(name).rule
 
     def repeats(self, name: str) -> bool:
-        """True if the requirement is evaluated at every sample, False if it is evaluated once."""
+        """True if the requirement `name` is evaluated at every sample, False if it is evaluated once."""
         return self._find(name).everywhere
 
     @property
     def kept(self) -> int:
-        """Number of samples of the signals in memory."""
+        """Number of samples that are stored in memory."""
         return self.samples - self._history.first
 
     @property
@@ -349,9 +352,10 @@ class Online:
         return self._history.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
-        """Return bounds on the robustness of the requirement `name`, where it may still change.
+        """Return the bounds on the robustness of the requirement `name` that are not final yet.
 
-        There is one triple (sample, least robustness, greatest robustness) for each of these samples.
+        There is one triple (sample, least robustness, greatest robustness) for each sample at which the
+        robustness may still change.
         """
         watched = self._find(name)
         if watched.over or not self.samples:
@@ -386,7 +390,9 @@ class Online:
         return True if found <= {"satisfied"} else None
 
     def finish(self) -> dict[str, Tally]:
-        """End the trace; returns the summary of each requirement by name, equal to that of `Monitor.check`.
+        """End the trace, and return the summary of each requirement by name.
+
+        The summaries agree with the verdicts of `Monitor.check`.
 
         Raises:
             TraceError: E306, `end` is "strict" and the trace is too short; E605, there was no sample.

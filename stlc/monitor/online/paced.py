@@ -47,8 +47,8 @@ _FROZEN = 500
 def span(formula: ir.Formula) -> Reach:
     """Return the lookback and the lookahead of a formula in samples.
 
-    Those of nested operators are added. If an operator has several operands, the greatest value counts. An
-    unbounded window `[a, inf)` counts as `a` samples.
+    The values of nested operators are added. If an operator has several operands, the greatest value counts.
+    An unbounded window `[a, inf)` counts as `a` samples.
     """
     below = [Reach(0, 0), *map(span, operands(formula))]
     own = own_span(formula)
@@ -109,7 +109,7 @@ def _unbounded(formula: ir.Formula) -> bool:
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
     """Return a copy of the formula with shorter windows, which has the same value on short streams.
 
-    A short stream has at most `samples` samples. Nothing is known far after its last sample: there, each
+    A short stream has at most `samples` samples. Far after its last sample, nothing is known, and each
     sub-formula has the same value at all instants. A future window needs only one of these instants. A past
     window need not reach back beyond the first sample.
 
@@ -126,7 +126,10 @@ def cut(formula: ir.Formula, samples: int) -> ir.Formula:
 
 
 def _cut(formula: ir.Formula, most: Reach) -> ir.Formula:
-    """Shorten windows and shifts to `most` (lookback, lookahead) samples, except inside a `freeze`."""
+    """Return the formula with windows and shifts of at most `most` (lookback, lookahead) samples.
+
+    Formulas inside a `freeze` are not changed.
+    """
     if isinstance(formula, (ir.Freeze, ir.AtStart)):
         return formula
     if isinstance(formula, ir.Windowed):
@@ -151,8 +154,8 @@ class PacedTracker:
             with shorter windows.
         everywhere: whether the requirement is evaluated at every instant or only at the first one.
         stores_all: whether the evaluator stores and reads all samples.
-        window: number of samples from each instant to the end of its planning window; None if no planning
-            window moves with the instant.
+        window: number of samples from each instant to the end of its planning window; None if the instants
+            have no planning windows of their own.
         samples: number of samples received at the last evaluation.
     """
 
@@ -203,15 +206,15 @@ class PacedTracker:
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change."""
+        """Index of the first instant whose value later samples may still change."""
         return self._inner.settled
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
+        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
         return self._inner.live(start, stop)
 
     def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, as no more samples follow."""
+        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:

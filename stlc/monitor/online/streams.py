@@ -20,7 +20,7 @@ RecursiveOp: TypeAlias = Literal["once", "historically", "since", "trigger"]
 
 
 class EndlessError(Exception):
-    """The formula cannot be evaluated in bounded memory; the whole trace must be stored."""
+    """Error: a formula cannot be evaluated in bounded memory, because it needs the whole trace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class RecursiveColumn:
     Attributes:
         name: name of the column.
         op: the past operator.
-        parts: operands of the operator, over other columns.
+        parts: operands of the operator, as formulas over other columns.
         back: lookback of the operands in rows.
         ahead: lookahead of the operands in rows.
     """
@@ -101,7 +101,7 @@ def endless(formula: ir.Formula) -> bool:
 
 
 def column(name: str) -> ir.Predicate:
-    """Return a predicate whose value is that of a column (time series)."""
+    """Return a predicate whose value is the value of the column (time series) `name`."""
     return ir.Predicate(ir.Signal(name))
 
 
@@ -180,8 +180,9 @@ class _Planner:
 
 
 def looks_on(formula: ir.Formula) -> int:
-    """Return how many samples ahead of their own instant the predicates of a formula read signals.
+    """Return how far ahead the predicates of a formula read signals, in samples.
 
-    This is the greatest number over all predicates.
+    The distance is counted from the instant at which a predicate is evaluated. The result is the greatest
+    distance over all predicates.
     """
     return max((farthest(num).future for num in numbers(formula)), default=0)

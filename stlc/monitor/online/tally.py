@@ -39,7 +39,8 @@ class Tally:
         instants: number of counted instants.
         holds: number of instants at which the requirement is certainly satisfied.
         fails: number of instants at which the requirement is certainly violated.
-        low: minimum over the instants of the least robustness over all continuations; +inf without instants.
+        low: minimum over the instants of the least robustness over all continuations; +inf if there are no
+            instants.
         high: minimum over the instants of the greatest robustness over all continuations.
         low_at: instant of `low`.
         high_at: instant of `high`.
@@ -109,7 +110,7 @@ class Tally:
 
     @property
     def worst(self) -> int:
-        """The instant of `high` if the requirement is violated, else that of `low`."""
+        """The instant of `high` if the requirement is violated, else the instant of `low`."""
         return self.high_at if self.fails else self.low_at
 
     @property

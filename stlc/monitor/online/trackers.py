@@ -46,9 +46,9 @@ def worst(
         formula: the formula to bound.
         end: "lower" or "upper" bound.
         ending: "truncate" if windows are clipped at the end of the trace, else "open".
-        window: length in samples of the planning window that the requirement refers to; None without one.
-            With a planning window and `ending` "open", `formula` itself is returned, since the trace will
-            contain the whole window.
+        window: length in samples of the planning window that the requirement refers to; None without a
+            planning window. With a planning window and `ending` "open", `formula` itself is returned, since
+            the trace will contain the whole window.
     """
     cut = ending == "truncate"
     return prefix_bound(formula, end, cut=cut) if cut or window is None else formula
@@ -99,7 +99,7 @@ class _CutTracker(ABC):
     @property
     @abstractmethod
     def settled(self) -> int:
-        """The first instant at which a later sample may still change the robustness."""
+        """Index of the first instant at which a later sample may still change the robustness."""
 
     @property
     @abstractmethod
@@ -116,13 +116,13 @@ class _CutTracker(ABC):
 
     @abstractmethod
     def either(self, start: int, stop: int) -> Bounds:
-        """Return bounds at the instants from `start` to `stop` (exclusive), without clipped windows.
+        """Return bounds at the instants from `start` to `stop` (exclusive), with windows of full length.
 
         Samples outside the trace are unknown.
         """
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Return bounds over all continuations of the trace at the instants `start` to `stop` (exclusive).
+        """Return bounds at the instants `start` to `stop` (exclusive), over all continuations of the trace.
 
         A predicate that reads a signal before the first sample is false if windows are clipped at the end of
         the trace, and unknown otherwise.
@@ -134,7 +134,7 @@ class _CutTracker(ABC):
         return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
     def ended(self, starts: range) -> Bounds:
-        """Return final bounds on the robustness at the instants `starts`, as no more samples follow."""
+        """Return final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
@@ -183,8 +183,8 @@ class _ColumnTracker(_CutTracker):
     def _values(self, which: int, start: int, stop: int) -> Floats:
         """Return one bound at the instants from `start` to `stop` (exclusive), (instants,).
 
-        `which` selects the bound: 0 is the lower and 1 the upper bound. With clipped windows, 2 is the lower
-        and 3 the upper bound.
+        `which` selects the bound: 0 is the lower and 1 the upper bound. If windows are clipped at the end of
+        the trace, 2 is the lower and 3 the upper bound with clipped windows.
         """
 
 
@@ -198,7 +198,7 @@ def _plans(formula: ir.Formula, ending: Ending, window: int | None) -> ColumnPla
 
 @dataclass(slots=True)
 class BoundedTracker(_ColumnTracker):
-    """Evaluator, at consecutive instants, of a formula whose windows are all bounded."""
+    """Evaluator of a formula whose windows are all bounded; it returns values at consecutive instants."""
 
     _readers: list[ColumnReader] = field(default_factory=list, init=False)
     _ahead: int = field(default=0, init=False)
@@ -211,11 +211,14 @@ class BoundedTracker(_ColumnTracker):
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change."""
+        """Index of the first instant whose value later samples may still change."""
         return max(self.samples - self._ahead - self.planned.lag, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
+        """Add new samples.
+
+        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
+        """
         for side in self._sides:
             side.grow(signals, first, samples)
         self.samples = samples
@@ -320,21 +323,24 @@ class IntervalTracker:
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change."""
+        """Index of the first instant whose value later samples may still change."""
         return max(self.shared.samples - self.ahead, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
+        """Add new samples.
+
+        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
+        """
         self.shared.grow(signals, first, samples)
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
+        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         return Bounds(*self.shared.values(self.which, start, stop).T)
 
     def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, as no more samples follow.
+        """Final bounds on the robustness at the instants `starts`, now that the trace has ended.
 
         If the formula reads samples after the end of the trace, these stay unknown.
         """
@@ -343,7 +349,8 @@ class IntervalTracker:
     def drop(self, start: int) -> int:
         """Free the memory of instants before `start`; return the index of the first sample still needed.
 
-        The index is that of the next sample to arrive: the stored samples are not needed any more.
+        The result is the index of the next sample to arrive, because the stored samples are not needed any
+        more.
         """
         self.shared.drop(self.which, start)
         return self.shared.samples
@@ -351,7 +358,7 @@ class IntervalTracker:
 
 @dataclass(slots=True)
 class PlanningWindowTracker(_ColumnTracker):
-    """Evaluator, at consecutive instants, of a formula whose `end` is the end of a planning window.
+    """Evaluator, at consecutive instants, of a formula in which `end` is the end of a planning window.
 
     The planning window of instant k ends with sample k + `window`. The value at k depends only on samples up
     to k + `window`.
@@ -361,7 +368,7 @@ class PlanningWindowTracker(_ColumnTracker):
     samples are processed one by one: the value at k is stored as soon as sample k + `window` arrives.
 
     Attributes:
-        window: samples from an instant to the end of its planning window.
+        window: number of samples from an instant to the end of its planning window.
     """
 
     window: int = field(kw_only=True)
@@ -378,11 +385,14 @@ class PlanningWindowTracker(_ColumnTracker):
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change."""
+        """Index of the first instant whose value later samples may still change."""
         return max(self.samples - self.window, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
+        """Add new samples.
+
+        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
+        """
         for now in range(self.samples + 1, samples + 1) if self._beyond else (samples,):
             known = {name: values[: now - first] for name, values in signals.items()}
             for side in self._sides:
@@ -447,7 +457,7 @@ def _remembers(planned: ColumnPlan) -> bool:
 
 @dataclass(slots=True)
 class UnboundedTracker:
-    """Evaluator, at one instant, of a formula with windows that extend to the end of the trace."""
+    """Evaluator of a formula with windows that extend to the end of the trace, at a single instant."""
 
     plans: ColumnPlans
     options: TrackingOptions
@@ -469,25 +479,31 @@ class UnboundedTracker:
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change: always 0, as any later sample may change it."""
+        """Index of the first instant whose value may still change.
+
+        This is always 0, because any later sample may change the value.
+        """
         return 0
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
+        """Add new samples.
+
+        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
+        """
         self.samples = samples
         for front in self._fronts:
             front.side.grow(signals, first, samples)
             front.advance(samples - self._lag)
 
     def live(self, start: int, stop: int) -> Bounds:
-        """Bounds over all continuations of the trace at the instants from `start` to `stop` (exclusive)."""
+        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
         if stop <= start:
             return Bounds(np.zeros(0), np.zeros(0))
         low, high = self._fronts[:2]
         return Bounds(low.value(self.samples)[0], high.value(self.samples)[0])
 
     def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, as no more samples follow."""
+        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         fronts = self._fronts[-2:]
         last = [replace(front, side=front.side.over()) for front in fronts]
         found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
@@ -524,19 +540,22 @@ class RecomputeTracker(_CutTracker):
 
     @property
     def window(self) -> int | None:
-        """Samples from an instant to the end of its planning window; None without a planning window."""
+        """Number of samples from an instant to the end of its planning window; None without such a window."""
         return window_of(self.rule, self.horizon)
 
     @property
     def settled(self) -> int:
-        """The first instant whose value may still change."""
+        """Index of the first instant whose value later samples may still change."""
         if self.window is None and endless(self.rule.formula):
             return 0
         ahead = self.rule.reach if self.window is None else self.window
         return max(self.samples - ahead - looks_on(self.rule.formula), 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
-        """Add samples: `signals` contains the stored ones, from sample `first` to `samples` - 1."""
+        """Add new samples.
+
+        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
+        """
         self._signals, self.samples = signals, samples
 
     @property
@@ -554,9 +573,9 @@ class RecomputeTracker(_CutTracker):
         return Bounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
-        """Return the least and the greatest robustness at `starts`, each (instants, traces).
+        """Return the least and the greatest robustness over all continuations of the traces.
 
-        They are taken over all continuations of the traces.
+        Each array, (instants, traces), has one row per instant in `starts`.
         """
         record, window = Record.of(with_seen(self._signals), NUMPY), self.window
         lower, upper = self._ends["lower"], self._ends["upper"]
@@ -575,7 +594,7 @@ class RecomputeTracker(_CutTracker):
         return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, as no more samples follow."""
+        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
         return Bounds(low[:, 0], high[:, 0])
 

@@ -4,11 +4,12 @@ The trace is divided at a sample called the frontier. Example: the robustness of
 two numbers. The first is the least robustness of p before the frontier. It is known, and takes constant
 memory. The second is the robustness of `always p` from the frontier on. It may still change.
 
-In general, the value of the formula is a function of such unknown numbers, the variables: the values that the
-unbounded operators have from the frontier on. The function consists of minima and maxima only. It is
-therefore determined by its values, called coefficients, for variables that are +inf or -inf. There is one
-coefficient for each subset of the variables: the variables in the subset are +inf, and all others are -inf.
-The coefficients depend only on the samples before the frontier, so these samples can be dropped.
+In general, the value of the formula is a function of several unknown numbers, called variables. Each variable
+is the value that one of the unbounded operators has from the frontier on. The function consists of minima and
+maxima only. It is therefore determined by its values, called coefficients, for variables that are +inf or
+-inf. There is one coefficient for each subset of the variables: the variables in the subset are +inf, and all
+others are -inf. The coefficients depend only on the samples before the frontier, so these samples can be
+dropped.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class UnboundedOperators:
 
     @property
     def reach(self) -> int:
-        """Greatest number of samples by which a subformula or an operator reads ahead.
+        """Greatest number of samples that a subformula or an operator reads ahead.
 
         Unbounded windows are not counted.
         """
@@ -88,7 +89,7 @@ class UnboundedOperators:
 
     @property
     def back(self) -> int:
-        """Greatest number of rows by which a subformula without unbounded windows reads back."""
+        """Greatest number of rows that a subformula without unbounded windows reads back."""
         return max((history(part.formula) for part in self.parts.values()), default=0)
 
 
@@ -146,7 +147,7 @@ def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
 
 
 def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], prefix: str) -> str:
-    """Return the name of the column of `formula`; if it is missing in `columns`, it is added.
+    """Return the name of the column of `formula`; a missing column is added to `columns`.
 
     The name of a new column begins with `prefix`.
     """
@@ -289,7 +290,7 @@ class UnboundedState:
         return ColumnReader([plain], self.side.end)(env, at - first, 1)[0]
 
     def _columns(self, count: int) -> dict[str, Floats]:
-        """Values (count, traces) of the subformulas without unbounded windows at the samples from `at` on."""
+        """Values (count, traces) of all subformulas without unbounded windows, from sample `at` on."""
         env = {NOTHING: np.zeros((count, self.side.rows[NOTHING].shape[1]))}
         for steps, (names, reader) in self._parts.items():
             env |= zip(names, self.side.values(reader, self.at + steps, count), strict=True)

@@ -48,7 +48,7 @@ def read(path: Path) -> Recording:
 
 @dataclass(frozen=True, slots=True)
 class _Topic:
-    """A ROS topic and the decoder of its messages; the decoder is None if they cannot be decoded."""
+    """A ROS topic and the decoder of its messages; None if the messages cannot be decoded."""
 
     name: str
     decode: Decode | None
@@ -93,7 +93,7 @@ Bytes: TypeAlias = bytes | mmap
 
 
 def _records(data: Bytes, at: int) -> Iterator[tuple[int, dict[bytes, bytes], bytes]]:
-    """Yield the records of a file: record type, header fields and data."""
+    """Yield (record type, header fields, data) of each record in `data`, from byte `at` on."""
     while at < len(data):
         head, at = _sized(data, at)
         content, at = _sized(data, at)
@@ -251,7 +251,7 @@ def _definitions(database: sqlite3.Connection) -> dict[str, str]:
 
 
 def _usual(kind: str) -> str | None:
-    """Definition of a standard ROS 2 message type; None if it is not a standard type."""
+    """Definition of the ROS 2 message type `kind`; None if this is not a standard type."""
     store = _usual_ones()
     try:
         return str(store.generate_msgdef(kind, ros_version=2)[0])

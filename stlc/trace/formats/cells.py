@@ -1,8 +1,8 @@
 """Conversion of the cells of a table to numbers: one cell at a time or, for large files, all at once.
 
 There are three readers of large texts. `cells.c` is used if there is a C compiler (`stlc.native`), else Arrow
-if it is installed, else NumPy in blocks. All give the same numbers. All reject texts with unusual cells,
-which a slower reader then reads.
+if it is installed, else NumPy in blocks. All give the same numbers. All reject texts with unusual cells. A
+slower reader then reads these texts.
 """
 
 from __future__ import annotations

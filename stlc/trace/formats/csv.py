@@ -186,7 +186,8 @@ def delimiter_of(header: str) -> str:
 def head_cells(header: str, delimiter: str) -> list[str]:
     """Split a header into its cells, without quotes.
 
-    `write_csv` puts an apostrophe before a name like `=1+1`, which would be a formula. It is removed here.
+    `write_csv` puts an apostrophe before a name such as `=1+1`, which a spreadsheet program would run as a
+    formula. The apostrophe is removed here.
     """
     return [_head(raw) for raw in _raw_heads(header, delimiter)]
 
@@ -264,7 +265,7 @@ def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
 
 
 def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> list[Array] | None:
-    """Read whole lines at once with NumPy's reader; None if a cell is unusual."""
+    """Read all lines of `body` at once with NumPy's reader; None if a cell is unusual."""
     if len(texts) == width or (texts and '"' in body):
         return None
     numbers = [i for i in range(width) if i not in texts]

@@ -1,6 +1,6 @@
 """Variables in a MATLAB `.mat` file; files of version 7.3 are HDF5 and need the extra `mat`.
 
-Numeric and logical arrays are signals; `t` is the time. The fields of a structure `s` are called `s.x`, and
+Numeric and logical arrays are signals; `t` is the time. The field `x` of a structure `s` is called `s.x`, and
 the columns of a matrix (samples, k) are the components of a vector. Texts, cell arrays and objects are left
 out. Complex numbers are not signals: it is an error to request one as a signal.
 """

@@ -35,7 +35,7 @@ _DEEPEST = 16
 
 
 class _DamageError(Exception):
-    """The bytes violate the file format."""
+    """Error in a file: its bytes violate the file format."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,7 @@ Decode = Callable[[bytes], Iterable[MessageNumber]]
 
 
 class DamageError(Exception):
-    """The bytes violate the file format."""
+    """Error in a file or a message: its bytes violate the format."""
 
 
 @dataclass(slots=True)
@@ -73,7 +73,11 @@ class _Topic:
     whole: set[str] = field(default_factory=set)
 
     def arrays(self) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Return increasing times in ns, and the signals that occur in every message: name -> (messages,)."""
+        """Return the times of all messages in ns, in increasing order, and the signals.
+
+        The signals are a mapping: name -> values, (messages,). Only numbers that every message contains
+        become signals.
+        """
         times = np.array(self.times, dtype=np.int64)
         kept = {n: np.array(x, dtype=np.float64) for n, x in self.values.items() if len(x) == len(times)}
         if (np.diff(times) < 0).any():
@@ -161,7 +165,7 @@ class Log:
         return Recording(str(self.path), tuple(groups), columns, TraceMeta(origin=origin))
 
     def topic(self, name: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """Return the increasing times of one topic in ns, and its signals: name -> (messages,).
+        """Return the times of the topic `name` in ns, increasing, and its signals: name -> (messages,).
 
         Both are empty if there was no message.
         """
@@ -228,7 +232,7 @@ class Room:
     def unpacked(self, how: str, data: bytes, size: int) -> bytes:
         """Decompress `data`, whose decompressed size should be `size` bytes.
 
-        `how` is the compression method: `bz2`, `lz4`, `zstd`, or none.
+        `how` is the compression method: `bz2`, `lz4` or `zstd`; `none` or "" for data that is not compressed.
 
         Raises:
             TraceError: E603, the data exceeds the remaining limit.

@@ -216,7 +216,10 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any
 
 
 def read(path: Path) -> Recording:
-    """Return the content of a trace file. Raises the errors of `read_npz`, and E603 for a bad `meta`."""
+    """Return the content of a trace file.
+
+    Raises the errors of `read_npz`, and E603 if the array `meta` is invalid.
+    """
     arrays = read_npz(path)
     meta, columns = read_meta(path, arrays.pop("meta", None))
     return replace(of_arrays(path, arrays, meta), columns=columns)

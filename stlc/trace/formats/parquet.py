@@ -41,10 +41,7 @@ def read(path: Path) -> Recording:
 
 
 def open_parquet(path: Path, *, whole: bool = True) -> Any:
-    """Open a file. If `whole`, check that all its numbers fit into memory.
-
-    Raises an error if they do not.
-    """
+    """Open a file. If `whole`, raise an error unless all its numbers fit into memory."""
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
         raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))

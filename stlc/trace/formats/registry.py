@@ -50,7 +50,7 @@ class Format:
     folder: bool = False
 
     def function(self, name: str) -> Any:
-        """Import the module and return one of its functions."""
+        """Import the module of the format, and return its function `name`."""
         return getattr(import_module(f"{__package__}.{self.module}"), name)
 
 
@@ -69,7 +69,10 @@ _PACKAGES = {"google": "protobuf"}
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file by its suffix; the first format of `FORMATS` if the suffix is unknown."""
+    """Return the format that the suffix of `path` indicates.
+
+    A folder has a format of its own. For an unknown suffix, the first format of `FORMATS` is returned.
+    """
     if path.is_dir():
         return next(each for each in FORMATS if each.folder)
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])

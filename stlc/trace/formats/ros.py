@@ -83,7 +83,10 @@ def decoder(definition: str, form: Form) -> Decoder:
 
 
 def _short(name: str) -> str:
-    """Message type as `package/Type`: ROS 2 adds a folder `msg`, `action` or `srv`, which is removed."""
+    """Return the message type `name` as `package/Type`.
+
+    In ROS 2, a name also contains a folder `msg`, `action` or `srv`, which is removed.
+    """
     return name.replace("/msg/", "/").replace("/action/", "/").replace("/srv/", "/")
 
 
@@ -215,7 +218,7 @@ class _Cursor:
     def numbers(self, name: str, kind: str, count: int, *, wanted: bool) -> Iterator[MessageNumber]:
         """Yield the numbers of an array if `wanted`, and move the read position past the array.
 
-        Large arrays such as images and point clouds are only skipped.
+        Otherwise the array is only skipped, for example an image or a point cloud.
         """
         size = struct.calcsize(_CODES[kind])
         if count and self.form == "cdr":

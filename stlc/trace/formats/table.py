@@ -83,7 +83,10 @@ def _in_seconds(path: Path, name: str, clock: Array, unit: str) -> Array:
 
 
 def clock_scale(trace: str, name: str, unit: str) -> float:
-    """Return the number of seconds per unit of a time column. Raises TraceError (E605) for other units."""
+    """Return the number of seconds in the unit of a time column.
+
+    Raises TraceError (E605) for a unit that is not a unit of time.
+    """
     text = _SPELLINGS.get(unit.lower(), unit) or ("ns" if name == ROSTOPIC else "s")
     try:
         time = parse_unit(text)

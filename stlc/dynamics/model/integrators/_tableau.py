@@ -1,7 +1,7 @@
-"""Explicit Runge-Kutta methods as Butcher tableaux, applied to numeric expressions of the IR.
+"""Explicit Runge-Kutta methods as Butcher tableaux, applied to symbolic expressions.
 
-The result of a step is an expression, so one tableau serves rollouts in torch, NumPy programs and generated
-C.
+The result of a step is an expression in the compiler's intermediate representation. One tableau therefore
+serves rollouts in torch, NumPy programs and generated C.
 """
 
 from __future__ import annotations
