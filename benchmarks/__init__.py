@@ -1,1 +1,1 @@
-"""Tables of the documentation: `python -m benchmarks` measures and writes them."""
+"""Benchmarks: `python -m benchmarks` measures the tables of the documentation and writes them."""

@@ -1,4 +1,4 @@
-"""The program `python -m benchmarks`: a command for each table, a module each in `benchmarks/tables/`."""
+"""The program `python -m benchmarks`: each module in `benchmarks/tables/` is a command that makes a table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ PROGRAM = Program(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; the arguments are by default those of the process."""
+    """Run a command line and return its exit code.
+
+    `argv` are the arguments, by default those of the process.
+    """
     return PROGRAM.run(argv)
 
 

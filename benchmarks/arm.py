@@ -1,8 +1,10 @@
-"""Random tasks of an arm among objects on a table, in the manner of TeLoGraF (Meng & Fan 2025).
+"""Random planning tasks for a robot arm among objects on a table, as in TeLoGraF (Meng & Fan 2025).
 
-Sizes, windows and shapes of formulas are those of its generator (https://github.com/mengyuest/TeLoGraF,
-commit e37bece, `code/generate_panda_scene.py`), windows cut at the end of a plan of 64 steps. A goal is a
-ball above a box on the table, to be reached with the hand pointing down; the flange avoids larger balls.
+The sizes of the objects, the time windows and the shapes of the formulas are those of TeLoGraF's generator
+(https://github.com/mengyuest/TeLoGraF, commit e37bece, `code/generate_panda_scene.py`). A plan has 64 steps.
+Time windows that would extend beyond the end of the plan are cut there. A goal is a ball above a box on the
+table. The arm must reach the goal with the hand pointing down. The flange must avoid the obstacles, which are
+larger balls.
 """
 
 from __future__ import annotations
@@ -30,27 +32,27 @@ TABLE = ((0.0, 0.9), (-0.75, 0.75))
 HEIGHT = 0.02
 """Height of the table above the foot of the arm."""
 EDGE, INNER = 0.05, 0.2
-"""Distances that objects keep from the edge of the table; goals, but alternatives, keep both."""
+"""Distance (m) of all objects from the table's edge; extra distance of goals that are not alternatives."""
 BOXES, BALLS = (0.03, 0.05), (0.05, 0.1)
 """Half the widths of goals and of obstacles."""
 GAP, GAP_ARM = 0.01, 0.3
 ABOVE, HIGHEST = 0.1, 0.5
-"""Height of the flange above a goal, and greatest height of an obstacle above the table."""
+"""Height of the flange above a goal; greatest height of an obstacle above the table (m)."""
 HAND, UPRIGHT = 0.107, 0.9
-"""Length of the hand's axis; cosine of its greatest angle with the vertical."""
+"""Length of the hand's axis (m); least cosine of its angle with the vertical."""
 LINKS = tuple(f"panda_link{i}" for i in range(9))
 BETWEEN = 5
-"""Points between two links that count as parts of the arm."""
+"""Number of points between two links that are treated as parts of the arm."""
 PART = tuple(PATTERNS[i] for i in (0, 1, 2, 3, 8))
 
 
 def draw_arm(seed: int, kind: str | None = None) -> DrawnTask:
-    """Draw a task of the arm; the kind by `RATIOS` if None."""
+    """Draw a task of the arm; if `kind` is None, the kind is drawn with the probabilities `RATIOS`."""
     return _ArmDraw(default_rng(seed)).task(kind)
 
 
 class _ArmDraw(Draw):
-    """One drawing, whose objects are (x, y, z, half the width)."""
+    """Generator of one random task of the arm; an object is a tuple (x, y, z, half of its width)."""
 
     patterns = PART
     most = 3
@@ -78,7 +80,15 @@ class _ArmDraw(Draw):
         return self._object(BALLS, 0.0, HIGHEST)
 
     def _object(self, sizes: tuple[float, float], margin: float, highest: float = 0.0) -> int | None:
-        """A new object apart from the others and from the arm, half of them on the table if `highest`."""
+        """Add a random object away from the other objects and from the arm; return its index.
+
+        The object is a cube. The result is None if no free place was found.
+
+        Args:
+            sizes: least and greatest half-width of the object.
+            margin: distance to the edge of the table, in addition to `EDGE`.
+            highest: greatest height above the table. If it is not 0, half of the objects are above the table.
+        """
         for _ in range(TRIES):
             size = float(self._random.uniform(*sizes))
             ends = [(low + margin + EDGE + size, high - margin - EDGE - size) for low, high in TABLE]
@@ -115,7 +125,7 @@ class _ArmDraw(Draw):
 
 @cache
 def _arm() -> tuple[Point, ...]:
-    """Points of the arm in its initial position."""
+    """Points along the links of the arm in its initial position, as tuples (x, y, z)."""
     text = read_urdf(find_system("examples/panda.yaml").with_name("panda.urdf"))
     places = np.array([_position(text, link) for link in LINKS])
     shares = np.arange(BETWEEN + 1)[:, None, None] / (BETWEEN + 1)

@@ -1,4 +1,4 @@
-"""Figures of the comparison: bars with intervals, and accuracy over the processor time of a plan."""
+"""Figures of the comparison: plan accuracy as bars, and plan accuracy over the processor time per plan."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PALETTE = (BLUE, ORANGE, GREEN, PINK, SKY, INK, MUTED)
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """Accuracy of one contender, with its interval."""
+    """Plan accuracy of one method, with its confidence interval; `plans` is True for a planner."""
 
     label: str
     accuracy: float
@@ -33,7 +33,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Accuracy of one contender at one budget: `ms` of processor time a plan."""
+    """Plan accuracy of one method with one time budget; `ms` is the processor time per plan."""
 
     label: str
     ms: float
@@ -42,7 +42,10 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Facet:
-    """A benchmark: its bars, its points, and its known feasible share, or None."""
+    """Data of one benchmark in the figures: its bars and points.
+
+    `feasible` is the share of initial states from which a satisfying plan is known, or None.
+    """
 
     title: str
     bars: tuple[Bar, ...]
@@ -51,7 +54,10 @@ class Facet:
 
 
 def draw(facets: Sequence[Facet], folder: Path) -> tuple[Picture, ...]:
-    """Draw both figures below `folder` as SVG files; none if matplotlib is missing or nothing is measured."""
+    """Draw both figures, write them as SVG files below `folder`, and return them.
+
+    The result is empty if matplotlib is missing or nothing is measured.
+    """
     shown = [each for each in facets if each.bars]
     if not shown or not available():
         return ()

@@ -1,4 +1,7 @@
-"""Cells of the paper's comparison that a command asks for: trainings, plans, drives."""
+"""Choice of the measurements that a command asks for: training runs, plans, and closed-loop runs (drives).
+
+One measurement of a table is called a cell.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,12 @@ from benchmarks.store import Result
 from benchmarks.training import Cell, Length, Place
 
 BUDGETS = (60.0, 300.0)
-"""Of trainings, in seconds, if none is given."""
+"""Training times in seconds if no budget is given."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Benchmarks, contenders and options of one command."""
+    """Benchmarks, methods (contenders) and options of one command."""
 
     benchmarks: tuple[str, ...]
     contenders: tuple[Contender, ...]
@@ -27,7 +30,7 @@ class Selection:
     comparing: Comparing
 
     def trainings(self) -> list[Cell]:
-        """Trainings, ordered by length, then seed, then benchmark."""
+        """Return the requested training runs, ordered by length, seed, method and benchmark."""
         if not self.comparing.asks("learners"):
             return []
         lengths = self.training.seeds_and_lengths(BUDGETS)
@@ -42,7 +45,7 @@ class Selection:
         ]
 
     def plans(self) -> list[PlanCell]:
-        """Planner cells, short budgets first."""
+        """Return the requested measurements of planners, those with a short time budget first."""
         if not self.comparing.asks("plans"):
             return []
         timed = [each for each in self.contenders if each.plans and not each.evaluations]
@@ -53,7 +56,7 @@ class Selection:
         return [PlanCell(name, each, seconds, starts) for seconds, each in cells for name in self.benchmarks]
 
     def policies(self, place: Place) -> list[PlanCell]:
-        """The plans of every trained policy whose run still exists."""
+        """Return the measurements of trained policies, one for each policy whose run folder still exists."""
         if not self.comparing.asks("plans"):
             return []
         return [each for result in place.valid() for each in self._policy(result, place)]
@@ -67,7 +70,11 @@ class Selection:
         return [] if run is None else [PlanCell(cell.benchmark, *own, run, label)]
 
     def drives(self, place: Place) -> list[Drive]:
-        """Closed-loop cells: planners at one budget, and the best policy of every learner."""
+        """Return the requested closed-loop measurements.
+
+        They are those of each planner at one time budget, and those of the best policy of each training
+        method.
+        """
         if not self.comparing.asks("drives"):
             return []
         decision, starts = self.comparing.seconds_of_decision, self.comparing.starts

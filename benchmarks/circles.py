@@ -1,8 +1,10 @@
-"""Random tasks over circles in the plane, in the manner of TeLoGraF (Meng & Fan 2025, arXiv 2504.03015).
+"""Random planning tasks with circles in the plane, as in TeLoGraF (Meng & Fan 2025, arXiv 2504.03015).
 
-Sizes, windows and shapes of formulas are those of its generator (https://github.com/mengyuest/TeLoGraF,
-commit e37bece, `code/generate_scene_v1.py`): reach or stay, nested `and`/`or`, sequences, until, each with up
-to six obstacles. As published, windows are cut at the last sample of a plan of 64 steps.
+The sizes of the circles, the time windows and the shapes of the formulas are those of TeLoGraF's generator
+(https://github.com/mengyuest/TeLoGraF, commit e37bece, `code/generate_scene_v1.py`). There are four kinds of
+task: reach (and possibly stay), nested `and`/`or`, sequences, and until. Each task has up to six obstacles. A
+plan has 64 steps. As published, time windows that would extend beyond the last sample of the plan are cut
+there.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ TRIES = 1_000
 OBSTACLES = (0.2, 0.15, 0.15, 0.15, 0.15, 0.1, 0.1)
 KINDS = ("reach", "nested", "sequence", "until")
 RATIOS = (1, 3, 2, 4)
-"""Share of each kind in the published tests, `--type_ratios`."""
+"""Relative frequency of each kind in the published tests, `--type_ratios`."""
 PATTERNS = (
     ("AB", "A"),
     ("AB", "BC", "A"),
@@ -35,17 +37,18 @@ PATTERNS = (
     ("AB", "BC", "DE", "A", "D"),
     ("AB", "CE", "DE", "A", "C", "D"),
 )
-"""Until-tasks: `AB` is not A until B, `A` is to reach A."""
+"""Shapes of until-tasks: `AB` means "not A until B", and `A` means "reach A"."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnTask:
-    """A drawn task.
+    """A random task.
 
     Attributes:
         kind: one of `KINDS`.
-        text: specification, without a system; its windows are cut at the end of the plan.
-        x0: initial state; for circles position, heading and speed.
+        text: text of the specification, which names no system. Its time windows are cut at the end of the
+            plan.
+        x0: initial state; for circles (x, y, heading, speed).
     """
 
     kind: str
@@ -55,7 +58,10 @@ class DrawnTask:
 
 @dataclass(frozen=True, slots=True)
 class _Visit:
-    """To be in a circle `stay + 1` samples long, beginning in a window of samples from now."""
+    """Visit of a circle: be inside it for `stay + 1` consecutive samples.
+
+    The visit begins between `first` and `last` samples after the instant at which its formula is evaluated.
+    """
 
     circle: int
     first: int
@@ -63,7 +69,10 @@ class _Visit:
     stay: int
 
     def then(self, rest: str = "") -> str:
-        """Formula of this visit, and from its begin on of the `rest`."""
+        """Return the formula of this visit.
+
+        If the formula `rest` is given, it must hold at the beginning of the visit.
+        """
         inside = f"at_{self.circle}"
         held = f"always[0, {self.stay} steps] {inside}" if self.stay else inside
         follow = f"({held} and {rest})" if rest else held
@@ -71,15 +80,17 @@ class _Visit:
 
 
 def draw(seed: int, kind: str | None = None) -> DrawnTask:
-    """Draw a task; the kind by `RATIOS` if None."""
+    """Draw a task; if `kind` is None, the kind is drawn with the probabilities `RATIOS`."""
     return Draw(default_rng(seed)).task(kind)
 
 
 class Draw:
-    """One drawing: its random numbers and the objects so far, here circles (x, y, radius).
+    """Generator of one random task: a random number generator and the objects drawn so far.
+
+    The objects are circles (x, y, radius).
 
     Attributes:
-        patterns: until-tasks, as in `PATTERNS`.
+        patterns: possible shapes of a task of kind `until`, as in `PATTERNS`.
         most: greatest number of visits in a sequence.
     """
 
@@ -91,7 +102,7 @@ class Draw:
         self._objects: list[tuple[float, ...]] = []
 
     def task(self, kind: str | None) -> DrawnTask:
-        """Draw a task; the kind by `RATIOS` if None."""
+        """Draw a task; if `kind` is None, the kind is drawn with the probabilities `RATIOS`."""
         shares = [each / sum(RATIOS) for each in RATIOS]
         kind = kind or KINDS[int(self._random.choice(len(KINDS), p=shares))]
         kinds: Mapping[str, Callable[[], str]] = {
@@ -120,7 +131,12 @@ class Draw:
         return self._branch(0, "and" if self._random.random() < 0.5 else "or")
 
     def _branch(self, depth: int, word: str) -> str:
-        """A tree of `and` and `or` whose leaves, marked r, are visits; deeper branches end sooner."""
+        """Return a random formula that joins visits by nested `and` and `or`.
+
+        `word` is the operator at this level, "and" or "or"; the levels below alternate between the two.
+        `depth` is the number of levels above; there are at most three levels. In the shapes, `r` stands for a
+        visit and `_` for a formula of the next level.
+        """
         shapes = (
             ("rr", "rrr", "_r", "__"),
             ("rr",) if word == "and" else ("rr", "_r", "__"),
@@ -133,7 +149,10 @@ class Draw:
         )
 
     def _sequence(self) -> str:
-        """Two to four visits, each within its window after the one before began."""
+        """Return the formula of a random sequence of 2 to `most` visits.
+
+        The time window of each visit counts from the beginning of the visit before it.
+        """
         visits = [
             self._visit(int(self._random.integers(8)), int(self._random.integers(STEPS - 8, STEPS)))
             for _ in range(int(self._random.integers(2, self.most + 1)))
@@ -160,7 +179,11 @@ class Draw:
     # ------------------------------------------------------------------- parts
 
     def _visit(self, first: int | None = None, stop: int | None = None) -> _Visit:
-        """A visit of a new circle, its window drawn if not given."""
+        """Draw a visit of a new circle.
+
+        The visit begins at least `first` and less than `stop` samples from now. If either of the two is None,
+        both are drawn at random.
+        """
         circle = self._goal()
         if first is None or stop is None:
             first = int(self._random.integers(STEPS - 1))
@@ -176,11 +199,14 @@ class Draw:
         return number
 
     def _obstacle(self) -> int | None:
-        """A new obstacle; None where no place was found."""
+        """Add a random obstacle and return its index; None if no free place was found."""
         return self._circle(MIDDLE, LARGE)
 
     def _circle(self, least: float, most: float) -> int | None:
-        """A new circle apart from the others; None where no place was found."""
+        """Add a random circle away from the other circles, and return its index.
+
+        The radius lies between `least` and `most`. The result is None if no free place was found.
+        """
         for _ in range(TRIES):
             radius = float(self._random.uniform(least, most))
             limit = ARENA - 1.05 * radius
@@ -191,7 +217,10 @@ class Draw:
         return None
 
     def _start(self) -> tuple[float, ...]:
-        """A position apart from the circles, the last one tried if there is none, heading and speed."""
+        """Draw an initial state (x, y, heading, speed) whose position is away from the circles.
+
+        If no such position is found, the last position that was tried is returned.
+        """
         for _ in range(TRIES):
             limit = ARENA - MARGIN
             x, y = (float(each) for each in self._random.uniform(-limit, limit, 2))
@@ -200,7 +229,10 @@ class Draw:
         return x, y, float(self._random.uniform(-pi, pi)), float(self._random.uniform(0, 1))
 
     def _spec(self, requirements: Mapping[str, str], goals: int) -> str:  # noqa: ARG002 - all are circles
-        """The specification; the first `goals` objects are goals, the others obstacles."""
+        """Return the text of the specification, with the formulas `requirements` (name -> formula).
+
+        The first `goals` objects are goals, and the others are obstacles.
+        """
         lines = ["spec circles", "state signal x, y [m]"]
         for number, (x, y, r) in enumerate(self._objects):
             margin = f"({r:.4f} m)^2 - (x - ({x:.4f} m))^2 - (y - ({y:.4f} m))^2"

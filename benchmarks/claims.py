@@ -1,7 +1,7 @@
-"""The paper's claims about its comparison, each beside what the measured cells say.
+"""The paper's claims about its comparison of methods, each with a verdict by the measured results.
 
-A claim of the form "better than every baseline" is refuted by one measured baseline, and holds only against
-those that are measured.
+The paper is Meng & Fan (2023). A claim of the form "better than every baseline" is refuted by one measured
+baseline. If it is not refuted, it is confirmed only for those baselines that are measured.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ RL = ("sac:task", "sac:robustness", "sac:accuracy", "mbpo", "pets")
 CLASSICAL = ("plan:milp", "plan:mpc", "plan:gradient:paper")
 CEM = "plan:cem:paper"
 BASELINES = (*RL, *CLASSICAL)
-"""The paper's baselines but CEM, which it excepts."""
+"""Baselines of the paper, without CEM, to which the paper's claims do not apply."""
 LEADS = {"ship_track": 0.20, "navigation": 0.45, "manipulation": 0.08}
 """Benchmark -> lead of the paper's policy over the best baseline."""
 SIMPLE = ("traffic", "reach_n_avoid", "ship_safe")
 BEHIND = 0.03
 """Largest gap of the paper's policy to the best baseline on the simple benchmarks."""
 SLOWER = (10.0, 100.0)
-"""Factors by which MPC and MILP are slower."""
+"""Least and largest factor by which MPC and MILP are slower, according to the paper."""
 STL_M, NEAR = 0.83, 0.02
 CEM_SLOWER = 3.0
 HOLDS, FAILS, OPEN = "holds", "does not hold", "not measured"
@@ -29,14 +29,15 @@ HOLDS, FAILS, OPEN = "holds", "does not hold", "not measured"
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Measured results of a contender on a benchmark.
+    """Measured results of one method on one benchmark.
 
     Attributes:
         benchmark: name of the specification.
-        method: name of the contender.
-        accuracy: plan accuracy at its largest measured budget.
-        decision_ms: median processor time of a plan from one start; None if not measured.
-        guarded_ms: the same with the paper's backup policy, in closed loop.
+        method: name of the method, such as `guided` or `plan:milp`.
+        accuracy: plan accuracy with the longest training, or with the largest time budget per plan.
+        decision_ms: median processor time of a plan from one initial state; None if not measured.
+        guarded_ms: median processor time of a closed-loop decision with the paper's backup policy; None if
+            not measured.
     """
 
     benchmark: str
@@ -48,13 +49,13 @@ class Standing:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A claim of the paper.
+    """A claim of the paper, with a verdict.
 
     Attributes:
-        claim: in a sentence.
-        here: what is measured.
+        claim: the claim as a sentence.
+        here: the measured results, as text.
         verdict: `holds`, `does not hold` or `not measured`.
-        why: reason where it does not hold; "" where it does.
+        why: reason for the verdict `does not hold`, if one is known, else "".
     """
 
     claim: str
@@ -64,7 +65,7 @@ class Claim:
 
 
 def claims(standings: Iterable[Standing]) -> list[Claim]:
-    """All claims, with their verdicts from the standings."""
+    """Return all claims of the paper, with verdicts by the measured results `standings`."""
     known = {(each.benchmark, each.method): each for each in standings}
     return [
         *(_lead(known, name, lead) for name, lead in LEADS.items()),
@@ -89,7 +90,10 @@ def _against(rivals: Sequence[Standing]) -> str:
 
 
 def _compared(known: Known, benchmark: str) -> tuple[Standing, Standing, str] | None:
-    """Our standing, that of the best baseline, and both in words; None if either is not measured."""
+    """Return the result of our method on a benchmark, that of the best baseline, and a text with both.
+
+    None is returned if either of the two is not measured.
+    """
     ours, rivals = known.get((benchmark, OURS)), _rivals(known, benchmark)
     if ours is None or not rivals:
         return None
@@ -178,18 +182,18 @@ def _cem(known: Known) -> Claim:
 
 @dataclass(frozen=True, slots=True)
 class Upset:
-    """A benchmark on which a planner beats a trained policy.
+    """A benchmark on which a planner reaches a higher accuracy than the best trained policy.
 
     Attributes:
         benchmark: name of the specification.
-        planner: name of the contender.
-        budget: of its plan, such as `10 ms`.
-        accuracy: of the planner.
-        policy: label of the best policy.
-        policy_accuracy: of that policy.
-        decision_ms: median processor time of the planner's decision.
-        policy_ms: that of the policy.
-        overlap: whether the 95 % intervals of the accuracies overlap.
+        planner: name of the planner.
+        budget: time budget of the planner per plan, such as `10 ms`.
+        accuracy: plan accuracy of the planner.
+        policy: label of the best trained policy, such as `guided-60s-seed0`.
+        policy_accuracy: plan accuracy of that policy.
+        decision_ms: median processor time of a decision of the planner.
+        policy_ms: median processor time of a decision of the policy.
+        overlap: whether the 95 % intervals of the two accuracies overlap.
     """
 
     benchmark: str
@@ -204,7 +208,7 @@ class Upset:
 
     @property
     def text(self) -> str:
-        """In one line."""
+        """The two results in one line of text."""
         first = f"{self.benchmark}: {self.planner} at {self.budget} a plan {self.accuracy:.3f}"
         second = f"{self.policy} {self.policy_accuracy:.3f}"
         if self.decision_ms is None or self.policy_ms is None:

@@ -1,6 +1,6 @@
-"""The paper's comparison as tables: a line for each method and budget, a column for each benchmark.
+"""The paper's comparison as tables: one line per method and time budget, one column per benchmark.
 
-A cell that is not measured is empty, and its line names the command that fills it.
+An entry that is not measured stays empty. The last column of its line shows the command that measures it.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ PROGRAM = "python -m benchmarks paper"
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """Accuracy of a learner on held-out starts.
+    """Plan accuracy of policies trained by one method, on held-out initial states (never used in training).
 
     Attributes:
         benchmark: name of the specification.
-        method: name of the contender.
-        budget: such as `60 s of processor time`.
-        accuracy: mean over seeds.
-        interval: its 95 % interval.
-        seconds: of training, mean over seeds.
-        outdated: whether an input has changed since.
+        method: name of the training method.
+        budget: length of the training as text, such as `60 s of processor time`.
+        accuracy: plan accuracy, mean over seeds.
+        interval: 95 % confidence interval of the accuracy.
+        seconds: training time, mean over seeds.
+        outdated: whether an input, such as the specification, has changed since the measurement.
     """
 
     benchmark: str
@@ -49,10 +49,10 @@ class Line:
     """A line of a table.
 
     Attributes:
-        method: name of the contender.
-        budget: in words.
-        cells: benchmark -> text; "" where not measured.
-        command: that fills the empty cells; "" if there is none.
+        method: name of the method.
+        budget: time budget as text.
+        cells: benchmark -> text of the entry; "" if not measured.
+        command: command that measures the empty entries; "" if there are none.
     """
 
     method: str
@@ -62,7 +62,7 @@ class Line:
 
 
 def markdown(lines: Iterable[Line], *, filled: bool = True) -> list[str]:
-    """Lines as Markdown; `filled`: with the column of commands."""
+    """Return a Markdown table of `lines`; `filled` says whether it has the column of commands."""
     columns: Columns[Line] = {
         **{"method": "{method}", "budget": "{budget}"},
         **{name: _cell(name) for name in BENCHMARKS},
@@ -79,7 +79,15 @@ def accuracies(
     learners: Sequence[Contender], planners: Sequence[Contender], learned: Iterable[Learned],
     plans: Iterable[PlanRow], budgets: Sequence[float],
 ) -> list[Line]:  # fmt: skip
-    """Plan accuracy of every contender at every budget, measured or not."""
+    """Return the table of plan accuracies: one line per method and time budget, even if nothing is measured.
+
+    Args:
+        learners: methods that train a policy.
+        planners: methods that plan without training.
+        learned: measured accuracies of trained policies.
+        plans: measured accuracies of planners.
+        budgets: training times in seconds.
+    """
     found = {(each.method, each.budget, each.benchmark): each for each in learned}
     rows = {(row.method, row.seconds, row.benchmark): row for row in plans if not row.label}
     lines = []
@@ -120,7 +128,16 @@ def _command(contender: Contender, missing: Sequence[str], options: str) -> str:
 def _spared(
     rows: Mapping[tuple[str, float | None, str], PlanRow], method: str, limit: float | None, name: str
 ) -> bool:
-    """True if a long budget is not measured because ten times the time found no more plans before."""
+    """True if a planner was not measured with the time budget `limit` on purpose.
+
+    A long budget is skipped if, between two shorter budgets, ten times the time did not raise the accuracy.
+
+    Args:
+        rows: (planner, time budget, benchmark) -> measured result.
+        method: name of the planner.
+        limit: time budget per plan in seconds; None for the planner's own settings.
+        name: name of the benchmark.
+    """
     if limit is None or limit < LONG or (method, limit, name) in rows:
         return False
     few, many = rows.get((method, SECONDS[1], name)), rows.get((method, SECONDS[2], name))
@@ -149,7 +166,7 @@ def _interval(value: float, interval: tuple[float, float]) -> str:
 
 
 def refusals(plans: Iterable[PlanRow]) -> list[str]:
-    """Reasons for which planners refuse tasks, as bullets."""
+    """Return the reasons for which planners cannot solve some benchmarks, as Markdown bullets."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in plans:
         if row.refused:
@@ -161,7 +178,10 @@ def refusals(plans: Iterable[PlanRow]) -> list[str]:
 
 
 def latencies(plans: Iterable[PlanRow]) -> list[Line]:
-    """Median and 99 % of the processor time of a decision, one start at a time, in milliseconds."""
+    """Return lines with the processor time of a decision in milliseconds: median / 99th percentile.
+
+    Each decision is for a single initial state.
+    """
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for row in plans:
         if row.median_ms is not None and row.p99_ms is not None:
@@ -171,7 +191,7 @@ def latencies(plans: Iterable[PlanRow]) -> list[Line]:
 
 
 def deployments(drives: Iterable[DriveRow]) -> list[Line]:
-    """Accuracy and safety in closed loop, without a guard and with the paper's backup."""
+    """Return lines with accuracy and safety in closed loop, one line per method and guard."""
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for row in drives:
         backup = "with backup" if row.guard == "paper" else "no guard"
@@ -191,7 +211,11 @@ def _with_half(value: float | None, half: float | None) -> str:
 def standings(
     learned: Iterable[Learned], plans: Sequence[PlanRow], drives: Iterable[DriveRow]
 ) -> list[Standing]:
-    """The current standing of every contender: at its longest training or largest budget."""
+    """Return the results by which the paper's claims are judged: one per method and benchmark.
+
+    Each is the result with the longest training, or with the largest time budget per plan. Outdated results
+    are left out.
+    """
     found: dict[tuple[str, str], Standing] = {}
     policies = [row for row in plans if row.label and not row.outdated]
     guarded = {
@@ -217,7 +241,11 @@ def standings(
 
 
 def upsets(plans: Sequence[PlanRow]) -> list[Upset]:
-    """Benchmarks where search beats the best `guided` policy on the same starts, at its least budget."""
+    """Return the benchmarks on which search without training beats the best policy trained by `guided`.
+
+    Both are measured on the same initial states. The reported time budget is the least with which search is
+    better.
+    """
     found = []
     current = [row for row in plans if not row.outdated]
     for name in BENCHMARKS:

@@ -1,4 +1,7 @@
-"""Accuracy of the benchmarks over training time, a panel each, below the known feasible share."""
+"""Figure of plan accuracy over training time, one panel per benchmark.
+
+A dashed line shows the share of initial states from which a satisfying plan is known.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +28,13 @@ COLUMNS = 3
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Learning curve of one training.
+    """Learning curve of one training run.
 
     Attributes:
-        method: of training.
+        method: name of the training method.
         seconds: training time at each point.
-        accuracies: at each point, on fresh states.
-        end: seconds and final accuracy on held-out states.
+        accuracies: plan accuracy at each point, on new random initial states.
+        end: (training time in seconds, final accuracy on held-out initial states).
     """
 
     method: str
@@ -41,7 +44,7 @@ class Curve:
 
     @classmethod
     def of(cls, result: Result) -> Curve:
-        """The learning curve in the result of a training."""
+        """Return the learning curve that is stored in the result of a training run."""
         points = [(float(point["seconds"]), float(point["accuracy"])) for point in result["curve"]]
         times, accuracies = zip(*points, strict=True) if points else ((), ())
         return cls(result["key"]["method"], times, accuracies, (result["seconds"], result["accuracy"]))
@@ -49,12 +52,12 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One benchmark.
+    """Data of one panel of the figure, which shows one benchmark.
 
     Attributes:
-        title: of the panel.
-        curves: one per training.
-        feasible: known feasible share, or None.
+        title: title of the panel.
+        curves: one curve per training run.
+        feasible: share of initial states from which a satisfying plan is known, or None.
     """
 
     title: str
@@ -63,9 +66,11 @@ class Panel:
 
 
 def draw_results(results: Sequence[Result], known: Mapping[str, KnownFeasible | None], path: Path) -> bool:
-    """Draw the longest training of each method and seed, a panel per benchmark of `known`, as an SVG file.
+    """Draw the longest training run of each method and seed, and write the figure as an SVG file to `path`.
 
-    Returns False if matplotlib is missing or nothing was measured.
+    The keys of `known` are the benchmarks, each of which gets a panel. Its values are the shares of initial
+    states from which a satisfying plan is known, or None. Returns False if matplotlib is missing or nothing
+    was measured.
     """
     longest: dict[str, dict[tuple[str, int], Result]] = {}
     for each in sorted(results, key=lambda each: float(each["seconds"])):
@@ -82,7 +87,7 @@ def draw_results(results: Sequence[Result], known: Mapping[str, KnownFeasible | 
 
 
 def draw_benchmarks(panels: Sequence[Panel]) -> Picture | None:
-    """Draw all panels, three in a row; None without panels."""
+    """Draw all panels with curves, three in a row; return None if no panel has a curve."""
     shown = [panel for panel in panels if panel.curves]
     if not shown:
         return None

@@ -1,4 +1,4 @@
-"""Deployments behind tables: simulated under guards and scenarios, each stored once."""
+"""Deployments (closed-loop simulations of policies) with guards, in scenarios; each is stored once."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ AGENTS = 5
 SCENARIOS = (NOMINAL, *DISTURBED)
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 USUAL = (*GUARDS, "full+auto")
-"""Default guards; after a `+` the safety margin that they request, see `guard.margin_request`."""
+"""Default guards. The text after a `+` is the safety margin that the guard requests; see `guard_of`."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeploymentOptions:
-    """Options of deployments."""
+    """Command-line options for deployments (closed-loop simulations of a policy)."""
 
     seeds: SeedsOption = "0..9"
     agents: Annotated[
@@ -68,7 +68,11 @@ class DeploymentOptions:
     runs_folder: TrainedOption = Path("runs/benchmarks")
 
     def setting(self, run: Run, ceiling: int) -> Setting:
-        """The setting of a run's deployments, at most as large as its system's default."""
+        """Return the settings of the deployments of a run, such as the numbers of agents and steps.
+
+        These numbers are at most the default numbers of the system. `ceiling` is the number of visited states
+        that are checked for a satisfying plan.
+        """
         test = run.task.system.decl.test
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
@@ -76,7 +80,11 @@ class DeploymentOptions:
         return Setting(parse_seeds(self.seeds), agents, steps, test.replan, limit, ceiling)
 
     def runs(self, names: Sequence[str] | None) -> list[RunDir]:
-        """The named runs, else those of the most accurate policies. Raises UsageError (U101)."""
+        """Return the runs called `names`; without names, the most accurate run of each benchmark.
+
+        Raises:
+            UsageError: U101, there is no run of a benchmark.
+        """
         if names:
             return [RunDir.open(name) for name in names]
         place = Place(ResultStore("paper", self.out), self.runs_folder)
@@ -91,7 +99,10 @@ class DeploymentOptions:
 
 
 def recorded(guard: Guard, setting: Setting) -> DeploymentRecording:
-    """Record a deployment under a guard in the world of its system."""
+    """Simulate a policy with its guard in the world of its system, and return the recording.
+
+    The world is the simulated environment.
+    """
     recorder = Recorder(setting.agents)
     simulate(guard, world_type(guard.task.system.decl), setting, recorder)
     recording = recorder.recording()
@@ -102,11 +113,13 @@ def recorded(guard: Guard, setting: Setting) -> DeploymentRecording:
 def sampled_states(
     guard: Guard, seeds: tuple[int, ...], samples: int
 ) -> tuple[DeploymentRecording, NDArray[np.int64], NDArray[np.int64]]:
-    """A deployment of few agents, and indices (row, step) of some of its states.
+    """Simulate a deployment of few agents, and choose some of the visited states.
+
+    A chosen state is given by its index (row, step) in the recording. A row is one agent with one seed.
 
     Returns:
-        The recording; `samples / 2` evenly chosen states, (k, 2); at most as many of the states with an
-        intervention of the guard, (l, 2), which are rare for a good policy.
+        The recording; the indices of `samples / 2` states, evenly chosen from all, (k, 2); the indices of at
+        most as many states in which the guard intervened, (l, 2). A good policy has few such states.
     """
     test = guard.task.system.decl.test
     recording = recorded(guard, Setting(seeds, min(AGENTS, test.agents), test.steps, test.replan))
@@ -114,7 +127,7 @@ def sampled_states(
 
 
 def picked(recording: DeploymentRecording, samples: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The indices of `sampled_states`."""
+    """Return the indices of the states that `sampled_states` chooses from a recording."""
     every = np.argwhere(np.ones_like(recording.source, dtype=bool))
     acted = np.argwhere(recording.source > 0)
     half = max(samples // 2, 1)
@@ -125,7 +138,7 @@ def picked(recording: DeploymentRecording, samples: int) -> tuple[NDArray[np.int
 
 
 def guard_of(name: str) -> tuple[Mode, MarginRequest]:
-    """Parse a name such as `full`, `full+0.2` or `full+auto` into a guard and its margin request.
+    """Parse a name such as `full`, `full+0.2` or `full+auto` into a guard and its requested safety margin.
 
     Raises:
         UsageError: U101, there is no such guard.
@@ -141,15 +154,17 @@ def guard_of(name: str) -> tuple[Mode, MarginRequest]:
 
 @dataclass(slots=True)
 class Deployments:
-    """Deployments of one table; each is stored when it ends and is never repeated.
+    """All deployments (closed-loop simulations) of one table.
+
+    Each deployment is stored when it ends. A stored deployment is not simulated again.
 
     Attributes:
-        store: of the results.
-        options: seeds and sizes.
-        ceiling: number of visited states to search for feasible plans.
+        store: file of the stored results.
+        options: command-line options, such as seeds and numbers of agents.
+        ceiling: number of visited states that are checked for a satisfying plan.
         driven: number of new deployments.
-        kept: number of stored ones.
-        results: of all, in order.
+        kept: number of deployments whose result was already stored.
+        results: results of all deployments, in order.
     """
 
     store: ResultStore
@@ -161,10 +176,10 @@ class Deployments:
     _viable: list[tuple[Tensor, Tensor]] = field(default_factory=list)
 
     def add(self, folder: RunDir, scenarios: Sequence[str], guards: Sequence[str]) -> None:
-        """Deploy the policy of a run under scenarios and guards.
+        """Simulate the policy of the run `folder` with each guard in each scenario, and append the results.
 
         Raises:
-            RunError, SystemFileError: the run is damaged, or a world fails.
+            RunError, SystemFileError: the run is damaged, or a world (simulated environment) fails.
         """
         for scenario in scenarios:
             run = Run.open(folder.path, scenario=None if scenario == NOMINAL else scenario)
@@ -186,7 +201,7 @@ class Deployments:
         say(f"{key.name}  {'kept' if self.driven == driven else format(result['seconds'], '.0f') + ' s'}")
 
     def _deploy(self, run: Run, name: str, setting: Setting) -> Result:
-        """Simulate a deployment and compute its metrics."""
+        """Simulate the policy of a run with the guard called `name`, and return its metrics."""
         begin = perf_counter()
         mode, asked = guard_of(name)
         margin = asked.of(run.task, run.policy, mode, setting.replan)
@@ -207,7 +222,10 @@ class Deployments:
         }
 
     def viable(self, task: Task, x0: Tensor) -> Tensor:
-        """Mask of viable starts, for which a search finds a safe plan, (rows,); cached per set of starts."""
+        """Return for each initial state whether a search finds a safe plan from there: booleans, (rows,).
+
+        The result is cached for each set of initial states `x0`, (rows, n).
+        """
         for known, found in self._viable:
             if known.shape == x0.shape and bool((known == x0).all()):
                 return found
@@ -217,7 +235,7 @@ class Deployments:
 
 
 def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
-    """The key of a deployment: all its inputs."""
+    """Return the key under which a deployment is stored: its name and all its inputs."""
     folder, decl = run.dir.path, run.task.system.decl
     world, laid = decl.test.world, decl.scenario
     mode, asked = guard_of(guard)
@@ -241,7 +259,7 @@ def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
 
 
 def _policy_of(folder: RunDir) -> dict[str, Any]:
-    """Training method and length of a run's policy, and its held-out accuracy."""
+    """Return facts about the policy of a run: training method, seed, training time and held-out accuracy."""
     record = folder.record()
     result = record.get("result") or {}
     return {
@@ -253,15 +271,15 @@ def _policy_of(folder: RunDir) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Results of a policy under a scenario, by guard.
+    """Results of one policy in one scenario.
 
     Attributes:
         spec: name of the specification.
-        scenario: name.
-        seeds: number of deployments.
-        agents: in each.
-        steps: of each.
-        guards: guard -> its result.
+        scenario: name of the scenario.
+        seeds: number of seeds, that is, of deployments.
+        agents: number of agents in each deployment.
+        steps: number of steps of each deployment.
+        guards: name of a guard -> result of the deployments with this guard.
     """
 
     spec: str
@@ -272,18 +290,24 @@ class Row:
     guards: Mapping[str, Result]
 
     def metric(self, guard: str, name: str) -> Mapping[str, Any] | None:
-        """Mean and interval of a metric under a guard; None if not simulated or undefined."""
+        """Return mean and interval of the metric `name` with a guard.
+
+        The result is None if the guard was not simulated, or if the metric is undefined.
+        """
         found: Mapping[str, Any] | None = (self.guards.get(guard) or {}).get("metrics", {}).get(name)
         return found
 
     @property
     def size(self) -> str:
-        """Seeds x agents x steps."""
+        """Size of the simulations as text: seeds x agents x steps."""
         return f"{self.seeds} x {self.agents} x {self.steps}"
 
 
 def rows_of(results: Iterable[Result]) -> list[Row]:
-    """Rows of results: specifications in the paper's order, then others; scenarios in that of `SCENARIOS`."""
+    """Group results into rows, one per specification, scenario and size, and sort the rows.
+
+    Specifications come in the order of the paper, then others; scenarios come in the order of `SCENARIOS`.
+    """
     groups: dict[tuple[str, str, int, int, int], dict[str, Result]] = {}
     for each in results:
         key = each["key"]
@@ -298,7 +322,7 @@ def _place(row: Row) -> tuple[Any, ...]:
 
 
 def policy_lines(rows: Iterable[Row]) -> list[str]:
-    """Training method and length of each deployment's policy, as bullets."""
+    """Return Markdown bullets with the training method, the training time and the accuracy of each policy."""
     lines = []
     for result in (each for row in rows for each in row.guards.values()):
         known = result["policy"]
@@ -320,7 +344,15 @@ def publish_deployments(
     section: Callable[[Sequence[Result]], list[str]],
     table: Callable[[Sequence[Row]], Table[Any, Any]],
 ) -> None:
-    """Write the page from all stored results, and show the requested ones."""
+    """Write all stored deployments into the documentation page, and print the requested ones.
+
+    Args:
+        what: name of the table.
+        deployments: the requested deployments, with their results.
+        output: the page, and whether JSON is printed.
+        section: function that returns the text of the page for given results.
+        table: function that returns the printed table for given rows.
+    """
     rows = rows_of(deployments.results)
     shown = listed(what, rows, {}) if output.as_json else table(rows)
     counts = {"driven": deployments.driven, "kept": deployments.kept}
@@ -329,7 +361,10 @@ def publish_deployments(
 
 
 def mean_and_half(metric: Mapping[str, Any] | None) -> str:
-    """A mean and the half-width of its interval: `.957 ± .012`; empty without one."""
+    """Return a mean and the half-width of its interval as text: `.957 ± .012`.
+
+    Without an interval, only the mean is shown. If `metric` is None, the result is "".
+    """
     if metric is None:
         return ""
     mean, high = float(metric["mean"]), metric["high"]

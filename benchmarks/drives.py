@@ -1,7 +1,8 @@
-"""Closed-loop cells of the paper's comparison: a contender in the world of a benchmark, guarded or not.
+"""Closed-loop measurements (drives) for the paper's comparison: a policy or planner in a benchmark's world.
 
-The paper's protocol: the size and the replanning of the system's `test:`, without a guard and with the
-paper's backup policy. Each cell is stored when it ends.
+The world is the simulated environment of a benchmark. As in the paper, each method is measured without a
+guard and with the paper's backup policy. The number of agents, of steps, and of steps between two plans are
+those in the section `test` of the system file. Each result is stored as soon as it is measured.
 """
 
 from __future__ import annotations
@@ -35,19 +36,19 @@ from stlc.provenance import sha256
 
 GUARDS: tuple[Mode, ...] = ("none", "paper")
 DECISIONS = 60
-"""Decisions that are timed, one agent each."""
+"""Number of decisions that are timed, each for one agent."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """One closed-loop measurement.
+    """Description of one closed-loop measurement.
 
     Attributes:
-        plan: planner and budget, or the run of a policy.
+        plan: planner with its time budget, or the run of a trained policy.
         guard: `none` or `paper`.
-        seeds: of the worlds.
-        agents: in each at most; None for the system's number.
-        steps: of each at most; None for the system's number.
+        seeds: seeds of the simulations.
+        agents: greatest number of agents in a simulation; None for the number in the system file.
+        steps: greatest number of steps of a simulation; None for the number in the system file.
     """
 
     plan: PlanCell
@@ -58,11 +59,11 @@ class Drive:
 
     @property
     def name(self) -> str:
-        """Of its result, such as `traffic-plan-search-10ms-paper`."""
+        """Name under which the result is stored, such as `traffic-plan-search-10ms-paper`."""
         return f"{self.plan.name}-{self.guard}"
 
     def setting(self, task: Task) -> Setting:
-        """Size and replanning of the deployment."""
+        """Return the settings of the simulation: seeds, agents, steps, and steps between two plans."""
         test = task.system.decl.test
         agents, steps = (
             min(self.agents or test.agents, test.agents),
@@ -72,7 +73,7 @@ class Drive:
 
     @property
     def key(self) -> Key:
-        """The key of its result."""
+        """Key under which the result is stored: its name and all its inputs."""
         task = load(self.plan.benchmark)
         setting, world = self.setting(task), task.system.decl.test.world
         planned = {
@@ -89,7 +90,11 @@ class Drive:
         )
 
     def policy(self, task: Task) -> Policy:
-        """The policy of the run, or the planner as one. Raises UsageError if it refuses the task."""
+        """Return the trained policy, or else the planner wrapped as a policy.
+
+        Raises:
+            UsageError: the planner cannot solve this task.
+        """
         cell = self.plan
         if cell.run is not None:
             return Run.open(cell.run.path).policy.for_task(task)
@@ -98,11 +103,13 @@ class Drive:
 
 
 def drive(cell: Drive) -> Result:
-    """Simulate a closed-loop cell.
+    """Carry out a closed-loop measurement: simulate, judge the closed-loop runs, and time decisions.
+
+    If the planner cannot solve the task, the result contains only the reason, under the key `refused`.
 
     Raises:
         MissingError: R301, a package is missing.
-        RunError, SystemFileError: the run is damaged, or a world fails.
+        RunError, SystemFileError: the run is damaged, or the world (simulated environment) fails.
     """
     task = load(cell.plan.benchmark)
     began = process_time()
@@ -124,7 +131,7 @@ def drive(cell: Drive) -> Result:
 
 
 def _timed(guard: Guard, recording: DeploymentRecording) -> Times:
-    """Processor time of single decisions in evenly spread visited states."""
+    """Measure the processor time of single decisions, in states that are evenly chosen from the recording."""
     rows, steps = recording.actions.shape[:2]
     picked = np.unique(np.linspace(0, rows * steps - 1, DECISIONS).astype(int))
     seconds = []
@@ -141,23 +148,23 @@ def _timed(guard: Guard, recording: DeploymentRecording) -> Times:
 
 @dataclass(frozen=True, slots=True)
 class DriveRow:
-    """A contender in closed loop under a guard.
+    """Results of a policy or planner in closed loop with one guard.
 
     Attributes:
         benchmark: name of the specification.
-        method: name of the contender.
-        label: of a trained policy; "" for a planner.
-        seconds: processor time a plan; None for own settings.
-        guard: name.
-        size: seeds x agents x steps.
+        method: name of the method.
+        label: label of a trained policy, such as `guided-60s-seed0`; "" for a planner.
+        seconds: processor time per plan; None if the planner's own settings end its search.
+        guard: name of the guard.
+        size: seeds x agents x steps, as text.
         accuracy: share of the followed plans that satisfy the specification, mean over seeds.
-        accuracy_half: half of its 95 % interval (Student's t); None with one seed.
-        safety: share of agents whose drive was safe from every start; None where nothing is tagged `@safety`.
-        safety_half: half of its interval.
-        median_ms: processor time of a decision for one agent.
-        p99_ms: its 99th percentile.
-        refused: why the planner refuses the task; "" if it does not.
-        outdated: whether specification, system or a version have changed since.
+        accuracy_half: half-width of the 95 % interval of `accuracy` (Student's t); None with one seed.
+        safety: share of agents that were safe at all instants; None if no requirement is tagged `@safety`.
+        safety_half: half-width of the 95 % interval of `safety`; None with one seed.
+        median_ms: median processor time of a decision for one agent.
+        p99_ms: 99th percentile of the processor time of a decision.
+        refused: reason why the planner cannot solve the task; "" if it can.
+        outdated: whether the specification, the system or a version has changed since the measurement.
     """
 
     benchmark: str
@@ -177,7 +184,7 @@ class DriveRow:
 
     @classmethod
     def of(cls, result: Result) -> DriveRow:
-        """The row of a result."""
+        """Return the row of the table that shows a stored result."""
         key, metrics, decision = result["key"], result.get("metrics", {}), result.get("decision", {})
         accuracy, safety = metrics.get("plan_accuracy", {}), metrics.get("executed_safe", {})
         return cls(
@@ -201,10 +208,13 @@ def is_outdated(result: Result) -> bool:
 def driven(
     cells: Iterable[Drive], store: ResultStore, *, driving: Callable[[Drive], Result] = drive
 ) -> Measured:
-    """Results of closed-loop cells, stored or newly simulated."""
+    """Return the results of closed-loop measurements; those that are not stored yet are measured now.
+
+    `driving` is the function that carries out a measurement.
+    """
     return measured(cells, store, driving, doing="deploying")
 
 
 def budget_text(seconds: float | None) -> str:
-    """The budget of a stored cell, such as `10 ms` or `own settings`."""
+    """Return a time budget per plan as text, such as `10 ms`; None gives `own settings`."""
     return time_text(math.inf if seconds is None else seconds)

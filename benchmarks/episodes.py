@@ -1,4 +1,4 @@
-"""Processor time of the environments of `stlc.gym`."""
+"""Measurement of the processor time that the environments of `stlc.gym` take."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stlc.controller.problem.task import Task
 
 @dataclass(frozen=True, slots=True)
 class EpisodeSpeed:
-    """Speed of the environments of one task.
+    """Measured speed of the environments of one task.
 
     Attributes:
         benchmark: name of the specification.
-        reward: of the steps.
-        environments: numbers of environments in a batch.
-        rates: steps of all environments a second of processor time, for each number.
+        reward: kind of reward: `task`, `robustness` or `accuracy`.
+        environments: tested batch sizes, that is, numbers of environments that run together.
+        rates: for each batch size, steps per second of processor time, summed over all environments.
     """
 
     benchmark: str
@@ -31,14 +31,17 @@ class EpisodeSpeed:
 def episode_speed(
     name: str, task: Task, environments: Sequence[int], *, reward: Reward, seconds: float
 ) -> EpisodeSpeed:
-    """Time whole episodes: steps, observations, rewards, judgement and the next initial states.
+    """Measure the speed of environments over whole episodes.
+
+    An episode includes all steps, observations, rewards, the final verdict, and the sampling of the next
+    initial states.
 
     Args:
-        name: of the benchmark.
-        task: its task.
-        environments: numbers of environments in a batch.
-        reward: of the steps.
-        seconds: of measurement, for each number.
+        name: name of the benchmark.
+        task: task of the benchmark.
+        environments: batch sizes to test.
+        reward: kind of reward.
+        seconds: duration of the measurement for each batch size.
     """
     from stlc.gym import SpecVectorEnv
 

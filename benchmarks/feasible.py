@@ -1,8 +1,9 @@
-"""Known feasible share of a benchmark: a long plan search for the states where every policy failed.
+"""Known feasible share of a benchmark: the share of initial states from which a satisfying plan is known.
 
-It is the share of the held-out states with a known satisfying plan, of a policy or of this search: a lower
-bound of the feasible share. It never decreases; results are stored, so that a search can be continued. Where
-the planner `milp` encodes the benchmark, it proves of most of the other states that no plan exists.
+It is measured on held-out states, which are never used in training. A plan is known if a policy or a long
+search has found it. The share is a lower bound of the true feasible share, and never decreases, because
+results are stored and searches are continued. For benchmarks that the planner `milp` can encode, this planner
+proves for most of the other states that no satisfying plan exists.
 """
 
 from __future__ import annotations
@@ -31,30 +32,30 @@ if TYPE_CHECKING:
 PASSES = 10
 """Default number of search passes over the open states."""
 TRIES = 20_000
-"""Maximum evaluations of a search for one state."""
+"""Maximum number of plans that one search evaluates for one state."""
 LIBRARY = 4096
-"""Maximum size of the plan library."""
+"""Maximum number of plans in the library."""
 PROOF_SECONDS = 5.0
-"""Processor time of a proof."""
+"""Processor time in seconds for one proof."""
 PROVED_AT_ONCE = 20
-"""States between two stored results of proofs."""
+"""Number of states after whose proofs the results are stored."""
 
 _INPUTS = ("spec_sha256", "system_sha256", "held_out", "held_out_seed")
 
 
 @dataclass(frozen=True, slots=True)
 class KnownFeasible:
-    """The known feasible share of one benchmark.
+    """Known feasible share of one benchmark, on its held-out initial states.
 
     Attributes:
-        benchmark: name.
-        share: of the held-out states with a known satisfying plan.
-        interval: its 95 % Wilson interval.
-        open: states without one.
-        proved: of these, states from which no plan exists, by proof; None where none was sought.
-        by_search: states solved only by this search.
-        passes: searches so far.
-        tries: evaluated plans for each open state.
+        benchmark: name of the specification.
+        share: share of the states from which a satisfying plan is known.
+        interval: 95 % Wilson interval of the share.
+        open: number of states from which no satisfying plan is known.
+        proved: number of states from which provably no plan exists; None if no proof was attempted.
+        by_search: number of states from which only the search found a plan, and no policy.
+        passes: number of searches so far.
+        tries: number of plans that were evaluated for each open state.
     """
 
     benchmark: str
@@ -68,14 +69,15 @@ class KnownFeasible:
 
 
 def key_of(result: Result) -> Key:
-    """The key of a result's held-out states: all their inputs."""
+    """Return the key of the held-out initial states of a result: all inputs from which they are made."""
     return Key(result["key"]["benchmark"], {name: result["key"][name] for name in _INPUTS})
 
 
 def known_feasible(store: ResultStore, results: Iterable[Result]) -> dict[str, KnownFeasible]:
-    """The stored known feasible share of each benchmark, without a search.
+    """Return the known feasible share of each benchmark from stored results, without a new search.
 
-    It belongs to the held-out states of the first of the `results` of the benchmark; others are ignored.
+    The share belongs to the held-out states of the first result of each benchmark. Results with other
+    held-out states are ignored.
     """
     groups: dict[str, list[Result]] = {}
     for result in results:
@@ -89,13 +91,14 @@ def known_feasible(store: ResultStore, results: Iterable[Result]) -> dict[str, K
 def search_on(
     own: Sequence[Result], store: ResultStore, *, passes: int = PASSES, run: RunDir | None = None
 ) -> None:
-    """Search for plans of the states that no policy solves; store the results after every pass.
+    """Search for plans from the states that no policy solves; store what is found after every pass.
 
     Args:
         own: results of one benchmark, at least one, all on the same held-out states.
-        store: of search results.
-        passes: total number, earlier calls included.
-        run: its policy gives the initial plans; without one they are constant mid-range controls.
+        store: file of the search results.
+        passes: total number of passes, including those of earlier calls.
+        run: run whose policy gives the initial plans. With None, initial plans hold every control at the
+            middle of its range.
     """
     key = key_of(own[0])
     entry: Mapping[str, Any] = store.find(key) or _blank(own[0])
@@ -115,18 +118,18 @@ def search_on(
 
 
 def prove_on(own: Sequence[Result], store: ResultStore, *, seconds: float = PROOF_SECONDS) -> None:
-    """Plan by `milp` from the states without a known plan; store proofs that none exists, and plans found.
+    """Plan with `milp` from the states without a known plan; store the plans and proofs that it finds.
 
-    A benchmark without a mixed-integer linear form is left as it is. States that were tried before with as
-    much time are not tried again.
+    A proof shows that no satisfying plan exists. Nothing is done for a benchmark that `milp` cannot encode as
+    a mixed-integer linear program. States that were already tried with at least this much time are skipped.
 
     Args:
         own: results of one benchmark, at least one, all on the same held-out states.
-        store: of search results.
-        seconds: processor time of a state.
+        store: file of the search results.
+        seconds: processor time per state.
 
     Raises:
-        MissingError: R301, HiGHS is not installed.
+        MissingError: R301, the solver HiGHS is not installed.
     """
     key = key_of(own[0])
     entry: Mapping[str, Any] = store.find(key) or _blank(own[0])
@@ -155,15 +158,17 @@ def prove_on(own: Sequence[Result], store: ResultStore, *, seconds: float = PROO
 
 @dataclass(slots=True)
 class _Search:
-    """State of a search: the open states and the best plan of each.
+    """State of a search for satisfying plans.
+
+    An open state is an initial state for which no satisfying plan has been found.
 
     Attributes:
-        task: of the benchmark.
-        states: all of them, (n, dim) float64.
-        open: indices of those without a satisfying plan, (k,).
-        plans: the best so far of each open one, (k, T, m) float32.
-        rho: robustness of these, (k,).
-        library: plans of solved states, (b, T, m) float32.
+        task: task of the benchmark.
+        states: all initial states, (n, dim) float64.
+        open: indices of the open states, (k,).
+        plans: best plan so far for each open state, (k, T, m) float32.
+        rho: robustness of these plans, (k,).
+        library: satisfying plans of other states, (b, T, m) float32.
     """
 
     task: Task
@@ -175,16 +180,25 @@ class _Search:
 
     @classmethod
     def begin(cls, task: Task, states: Tensor, known: Tensor, run: RunDir | None, proved: Tensor) -> _Search:
-        """Initialise a search; the states that were `proved` infeasible are not open."""
+        """Begin a search from the initial states `states`.
+
+        Args:
+            task: task of the benchmark.
+            states: initial states, (n, dim).
+            known: whether a satisfying plan from each state is known, (n,).
+            run: run whose policy gives the initial plans, or None.
+            proved: whether it is proved that no plan exists from each state, (n,).
+        """
         still = (~known & ~proved).nonzero()[:, 0]
         plans = _first_plans(task, states, run)
         rho = task.judge(states[still], plans[still].double(), states=False).rho
         return cls(task, states, still, plans[still].float(), rho, plans[known][:LIBRARY].float())
 
     def go_on(self, number: int) -> Tensor:
-        """Run one pass; return the indices of the newly solved states.
+        """Carry out pass number `number`; return the indices of the states that it solved.
 
-        Every other pass starts at plans of other states instead of the best so far, to leave local optima.
+        Passes with an even number begin with plans of other states instead of the best plans so far. This
+        helps to leave local optima.
         """
         if not len(self.open):
             return self.open
@@ -205,7 +219,11 @@ class _Search:
 
 
 def _first_plans(task: Task, states: Tensor, run: RunDir | None) -> Tensor:
-    """Initial plans, (n, T, m): a policy's, else the middle of every control."""
+    """Return initial plans, (n, T, m), for the initial states `states`, (n, dim).
+
+    They are the plans of the policy of `run`. If there is no such policy, every control is constant at the
+    middle of its range.
+    """
     if run is not None:
         try:
             return Run.open(run.path).policy.plan(states)
@@ -220,7 +238,7 @@ def _blank(result: Result) -> Result:
 
 
 def _facts(entry: Mapping[str, Any]) -> Result:
-    """The entries of a stored result on search and proof."""
+    """Return the entries of a stored result that concern the search and the proofs."""
     names = ("passes", "tries", "found", "infeasible", "asked", "proof_seconds")
     return {name: entry[name] for name in names if name in entry}
 
@@ -230,12 +248,12 @@ def _mask(digits: str, count: int) -> Tensor:
 
 
 def _union(digits: Iterable[str], count: int) -> list[bool]:
-    """Element-wise or of packed sets of `count` truth values."""
+    """Unpack several texts, each with `count` truth values, and combine them by an element-wise or."""
     return [any(flags) for flags in zip(*(unpack(each, count) for each in digits), strict=True)]
 
 
 def _solved(entry: Mapping[str, Any], own: Sequence[Result]) -> list[bool]:
-    """Mask of the states with a plan of the search or of any policy."""
+    """Return for each held-out state whether the search or any policy has found a satisfying plan."""
     return _union((entry["found"], *(each["solved"] for each in own)), int(own[0]["key"]["held_out"]))
 
 

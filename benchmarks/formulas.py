@@ -1,6 +1,6 @@
-"""Formulas and the time of their robustness; each formula is also written by hand in plain torch.
+"""Formulas whose robustness is timed; each formula is also written by hand in plain torch.
 
-Arrays are `(time, batch)`; windows are clipped at the end of the trace.
+Arrays have the shape (time, batch). Time windows are cut at the end of the trace.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ Plain: TypeAlias = Callable[[Tensor, Tensor, int], Tensor]
 """Signals x and y `(time, batch)` and the width of a window in steps -> robustness at every sample."""
 
 _FEW = 1 << 12
-"""Number of array elements up to which windows are unfolded."""
+"""Number of array elements up to which windows are laid out side by side in memory."""
 
 
 def plain_always_to_end(x: Tensor) -> Tensor:
-    """Minimum from every sample to the end."""
+    """Return at each sample the minimum of `x` from this sample to the end."""
     return torch.cummin(x.flip(0), dim=0).values.flip(0)
 
 
 def plain_always(x: Tensor, width: int) -> Tensor:
-    """Minimum over every sample and the `width` samples after it."""
+    """Return at each sample the minimum of `x` over this sample and the `width` samples after it."""
     if x.numel() * (width + 1) <= _FEW:
         return _beside(x, width, math.inf).amin(-1)
     return -_van_herk(-x, width + 1)
 
 
 def plain_eventually(x: Tensor, width: int) -> Tensor:
-    """Maximum over every sample and the `width` samples after it."""
+    """Return at each sample the maximum of `x` over this sample and the `width` samples after it."""
     if x.numel() * (width + 1) <= _FEW:
         return _beside(x, width, -math.inf).amax(-1)
     return _van_herk(x, width + 1)
 
 
 def plain_until(left: Tensor, right: Tensor, width: int) -> Tensor:
-    """`left` until `right` within `width` samples."""
+    """Return the robustness of "`left` until `right` within `width` samples" at each sample."""
     if left.numel() * (width + 1) <= _FEW:
         held = torch.cummin(_beside(left, width, math.inf), -1).values
         return torch.minimum(held, _beside(right, width, -math.inf)).amax(-1)
@@ -59,7 +59,7 @@ def plain_until(left: Tensor, right: Tensor, width: int) -> Tensor:
 
 
 def plain_conjunction(x: Tensor, thresholds: Sequence[float]) -> Tensor:
-    """`x` above every threshold."""
+    """Return the robustness of "`x` is above every threshold" at each sample."""
     return torch.stack([x - threshold for threshold in thresholds]).amin(0)
 
 
@@ -68,7 +68,11 @@ def _beside(x: Tensor, width: int, fill: float) -> Tensor:
 
 
 def _van_herk(x: Tensor, rows: int) -> Tensor:
-    """Sliding maxima over `rows` samples by van Herk's algorithm: block maxima forwards and backwards."""
+    """Return the maxima over sliding windows of `rows` samples by van Herk's algorithm.
+
+    The samples are divided into blocks of `rows` samples. A window extends over at most two blocks. So its
+    maximum is that of a running maximum from the end of the first block and one from the start of the second.
+    """
     samples, batch = x.shape
     blocks = -(-(samples + rows - 1) // rows)
     padded = torch.nn.functional.pad(x, (0, 0, 0, blocks * rows - samples), value=-math.inf)
@@ -80,12 +84,12 @@ def _van_herk(x: Tensor, rows: int) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A formula over the signals `x` and `y`.
+    """A formula over the signals `x` and `y`, whose robustness is timed.
 
     Attributes:
-        name: as it is printed; `w` stands for the width of its windows.
-        formula: as a function of the window width in steps.
-        plain: the same in plain torch.
+        name: name as printed; `w` stands for the width of its time windows.
+        formula: function that returns the formula for a given window width in steps.
+        plain: function that computes the same robustness in plain torch.
     """
 
     name: str
@@ -141,22 +145,22 @@ CASES = (
 # ------------------------------------------------------------------------------- timing
 
 _MOST_PLAIN = 1 << 21
-"""Number of elements from which on plain torch is omitted: it takes minutes, or exhausts the memory."""
+"""Number of array elements above which plain torch is not timed: it takes minutes, or exhausts the memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """One formula at one size.
+    """Measured time of the robustness of one formula on traces of one size.
 
     Attributes:
-        formula: name.
-        samples: of a trace.
-        traces: their number.
-        width: of its windows, in steps.
-        gradient: with the backward pass.
+        formula: name of the formula.
+        samples: number of samples per trace.
+        traces: number of traces.
+        width: width of the time windows in steps.
+        gradient: whether the backward pass is included.
         seconds: processor time.
-        passes: time as a multiple of one pass over memory.
-        plain: time of plain torch as a multiple of ours; None if omitted.
+        passes: processor time divided by that of one pass over a signal in memory.
+        plain: processor time of plain torch divided by `seconds`; None if plain torch was not timed.
     """
 
     formula: str
@@ -170,17 +174,20 @@ class Timing:
 
     @property
     def time(self) -> str:
-        """The seconds with a unit."""
+        """Processor time as text with its unit."""
         return f"{self.seconds * 1e3:.2f} ms" if self.seconds >= 1e-3 else f"{self.seconds * 1e6:.0f} us"
 
 
 def width_of(samples: int) -> int:
-    """Steps of a window: a tenth of the trace, and at least 5."""
+    """Return the width of a time window in steps: a tenth of the number of samples, and at least 5."""
     return max(samples // 10, 5)
 
 
 def timing_of(case: Case, shape: tuple[int, int], *, gradient: bool, seconds: float) -> Timing:
-    """Time a formula on arrays of shape (samples, traces), for about `seconds`."""
+    """Measure the time of a formula on arrays of shape (samples, traces), for about `seconds`.
+
+    With `gradient`, the backward pass is included.
+    """
     x, y, data, weights = _arrays(shape)
     width = width_of(shape[0])
     formula = case.formula(width)

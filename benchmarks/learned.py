@@ -1,4 +1,7 @@
-"""Learner rows of the paper's comparison: trainings over seeds and budgets, on held-out states."""
+"""Training methods in the paper's comparison: one row for each benchmark, method and training time.
+
+The policies are judged on held-out initial states, which are never used in training.
+"""
 
 from __future__ import annotations
 
@@ -27,20 +30,20 @@ infeasible` no plan exists, by the planner `milp` (traffic and reach_n_avoid, wh
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A benchmark by one method for one length, over all seeds.
+    """Results of one method on one benchmark with one training time, over all seeds.
 
     Attributes:
-        benchmark: name.
-        method: name of the contender.
-        length: such as `60 s`.
-        seeds: of the trainings, in order.
-        accuracies: one per seed, on the same held-out states.
-        interval: 95 % Wilson interval of the mean, over the states of all seeds.
-        known_feasible: share of those states with a known satisfying plan; None before a search.
-        requirements: share per requirement, mean over seeds.
-        seconds: of training, mean over seeds.
-        steps: mean over seeds.
-        outdated: inputs that have changed since the trainings.
+        benchmark: name of the specification.
+        method: name of the method.
+        length: training time as text, such as `60 s`.
+        seeds: seeds of the training runs, in order.
+        accuracies: plan accuracy for each seed, on the same held-out initial states.
+        interval: 95 % Wilson interval of the mean accuracy, over the held-out states of all seeds.
+        known_feasible: share of these states from which a satisfying plan is known; None before a search.
+        requirements: name of a requirement -> share of plans that satisfy it, mean over seeds.
+        seconds: training time, mean over seeds.
+        steps: number of training steps, mean over seeds.
+        outdated: inputs that have changed since the training runs.
     """
 
     benchmark: str
@@ -57,22 +60,25 @@ class Row:
 
     @property
     def accuracy(self) -> float:
-        """Mean over all seeds."""
+        """Mean of the plan accuracy over all seeds."""
         return fmean(self.accuracies)
 
     @property
     def share(self) -> float | None:
-        """Accuracy over the known feasible states."""
+        """Mean accuracy divided by `known_feasible`; None if that is unknown."""
         return self.accuracy / self.known_feasible if self.known_feasible else None
 
     @property
     def worst_share(self) -> float | None:
-        """Accuracy of the worst seed over the known feasible states."""
+        """Accuracy of the worst seed divided by `known_feasible`; None if that is unknown."""
         return min(self.accuracies) / self.known_feasible if self.known_feasible else None
 
 
 def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
-    """The row of the results of a benchmark, method and length."""
+    """Return the row with the mean results of `group`: training runs that differ only in the seed.
+
+    `known` maps the name of a benchmark to the share of states from which a satisfying plan is known.
+    """
     cell, results = group.cell, group.results
     found = known.get(cell.benchmark)
     return Row(
@@ -114,7 +120,10 @@ FEASIBLE: Columns[KnownFeasible] = {
 
 
 def tables(results: Sequence[Result], known: Mapping[str, KnownFeasible]) -> dict[str, Table[Any, Any]]:
-    """The table of benchmarks, methods and lengths, and that of the known feasible shares."""
+    """Return two tables: the training results (`rows`), and the known feasible shares (`known_feasible`).
+
+    The known feasible share of a benchmark is the share of states from which a satisfying plan is known.
+    """
     groups = sorted(
         grouped(results),
         key=lambda group: (
@@ -132,7 +141,7 @@ def tables(results: Sequence[Result], known: Mapping[str, KnownFeasible]) -> dic
 
 
 def detailed(results: Sequence[Result], known: Mapping[str, KnownFeasible], page: Path) -> list[str]:
-    """Subsection on the trainings; its picture is written into the page's folder."""
+    """Return the lines of the page's subsection on training runs, and write its figure beside `page`."""
     made = tables(results, known)
     rows = made["rows"].rows
     names = dict.fromkeys(row.benchmark for row in rows)
@@ -151,7 +160,7 @@ def _place(method: str) -> int:
 
 
 def learned(results: Sequence[Result]) -> list[Learned]:
-    """The accuracies of all trainings, outdated ones first."""
+    """Return the accuracies of all training runs, one for each group of seeds; outdated ones come first."""
     rows = [row_of(group, {}) for group in grouped(results)]
     rows.sort(key=lambda row: not row.outdated)
     return [

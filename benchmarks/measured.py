@@ -1,4 +1,4 @@
-"""Cells of a table, each measured once and stored when it ends."""
+"""Measurements of a table: each measurement (cell) is carried out once, and stored as soon as it ends."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ from stlc.diagnostics import StlcError, UsageError
 
 
 class Measurable(Protocol):
-    """A cell of a table: its name, and the key of its inputs."""
+    """Interface of a measurement that can be stored: its name, and the key of its inputs."""
 
     @property
     def name(self) -> str:
-        """Of its result."""
+        """Name under which the result is stored."""
 
     @property
     def key(self) -> Key:
-        """Of its result. Raises UsageError, SpecError, SystemFileError for a bad file."""
+        """Key under which the result is stored: its name and all its inputs.
+
+        Raises:
+            UsageError, SpecError, SystemFileError: an input file is missing or invalid.
+        """
 
 
 C = TypeVar("C", bound=Measurable)
@@ -28,12 +32,12 @@ C = TypeVar("C", bound=Measurable)
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Outcome of the cells of a table.
+    """Results of all measurements (cells) of a table.
 
     Attributes:
-        results: stored or new, in the order of the cells.
-        new: number of new ones.
-        failed: name and reason of cells that could not be measured.
+        results: stored and new results, in the order of the cells.
+        new: number of new results.
+        failed: name and reason of each cell that could not be measured.
     """
 
     results: tuple[Result, ...]
@@ -49,17 +53,20 @@ def measured(
     doing: str,
     told: Callable[[Result], str] = lambda _: "",
 ) -> Measured:
-    """Results of cells, stored or newly measured, each stored at once; prints progress.
+    """Return the results of all cells: stored results, or else new ones, which are then stored.
+
+    Progress is printed.
 
     Args:
-        cells: may be drawn one by one, each when the results before it are stored.
-        store: of the results.
-        measure: measures a cell.
-        doing: what is done with a cell, such as `planning`.
-        told: summary of a new result; "" for none.
+        cells: measurements of the table. The next cell is taken from the iterator only after the results of
+            the cells before it are stored.
+        store: file of the results.
+        measure: function that measures a cell and returns its result.
+        doing: verb for messages, such as `planning`.
+        told: function that returns a summary of a new result to print; "" for no summary.
 
     Raises:
-        UsageError: from `measure`. Other errors of stlc cost their own cell only.
+        UsageError: `measure` raised this error. If it raises another error of stlc, only this cell fails.
     """
     results, failed, new = [], [], 0
     for cell in cells:
@@ -82,7 +89,7 @@ def measured(
 
 
 def reason(error: StlcError) -> str:
-    """The message of an error, in one line."""
+    """Return the messages of an error in one line."""
     return "; ".join(each.message for each in error.diagnostics)
 
 

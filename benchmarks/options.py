@@ -1,4 +1,4 @@
-"""Option groups that tables share: a dataclass each, whose fields are the options."""
+"""Groups of options that several tables share: one dataclass per group, whose fields are the options."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PageOption = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Output options of a table."""
+    """Options for the output of a table."""
 
     page: PageOption = None
     as_json: JsonOption = False
@@ -40,7 +40,7 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """Options of the trainings behind a table."""
+    """Options for the training runs of a table."""
 
     budget: Annotated[
         list[str] | None,
@@ -84,7 +84,9 @@ class Training:
     runs: TrainedOption = Path("runs/benchmarks")
 
     def seeds_and_lengths(self, usual: Sequence[float]) -> list[tuple[int, Length]]:
-        """Seed and length of each training, ordered by length, then seed, so that a table fills evenly.
+        """Return (seed, length) for each training run, ordered by length, then by seed.
+
+        `usual` are the training times in seconds if neither budgets nor steps are given.
 
         Raises:
             UsageError: U101, budgets and steps are both given.
@@ -101,7 +103,7 @@ class Training:
         return [(seed, length) for length in lengths for seed in parse_seeds(self.seeds)]
 
     def place(self, table: str) -> Place:
-        """Store, run folder and parallelism of a table's trainings."""
+        """Return the place of a table's training runs: result file, run folder and number of processes."""
         from benchmarks.store import ResultStore
         from benchmarks.training import Place
 
@@ -110,12 +112,12 @@ class Training:
 
 
 PARTS = ("learners", "plans", "drives")
-"""Parts of the comparison of the paper."""
+"""Parts of the paper's comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparing:
-    """Options of the comparison of the paper."""
+    """Options for the paper's comparison."""
 
     methods: Annotated[
         str | None,
@@ -170,33 +172,43 @@ class Comparing:
 
     @property
     def seconds(self) -> tuple[float, ...]:
-        """Processor times a plan."""
+        """Time budgets of planners: processor time per plan in seconds."""
         from benchmarks.plannings import SECONDS
 
         return tuple(parse_seconds(text) for text in dict.fromkeys(self.plan_time or ())) or SECONDS
 
     @property
     def seconds_of_decision(self) -> float:
-        """Processor time of a planner in closed loop."""
+        """Processor time in seconds that a planner has for each decision in closed loop."""
         return parse_seconds(self.decision)
 
     @property
     def worlds(self) -> tuple[int, ...]:
-        """Seeds of the worlds in closed loop."""
+        """Seeds of the closed-loop simulations."""
         return parse_seeds(self.drives)
 
     def check(self) -> None:
-        """Read all options, before anything is measured. Raises UsageError (U101)."""
+        """Parse all options, so that an error is found before any measurement. Raises UsageError (U101)."""
         self.asks(PARTS[0])
         self.seconds, self.seconds_of_decision, self.worlds  # noqa: B018
 
     def asks(self, part: str) -> bool:
-        """True if a part is to be measured. Raises UsageError (U101) for an unknown part."""
+        """True if the part `part` (`learners`, `plans` or `drives`) is to be measured.
+
+        Raises:
+            UsageError: U101, the option `--parts` contains an unknown name.
+        """
         return part in chosen(self.parts, PARTS, "part") and not self.show
 
 
 def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]:
-    """Names in a comma-separated list (default: all). Raises UsageError (U101) for unknown ones."""
+    """Return the names in the comma-separated list `text`; if it is None, return all of `known`.
+
+    `what` is the noun for a name in error messages.
+
+    Raises:
+        UsageError: U101, a name is not in `known`, or the list is empty.
+    """
     if text is None:
         return tuple(known)
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
@@ -211,7 +223,7 @@ def chosen(text: str | None, known: Sequence[str], what: str) -> tuple[str, ...]
 
 
 def opened(names: Sequence[str] | None) -> list[RunDir]:
-    """The named runs, else the newest one."""
+    """Open the runs called `names`; without names, open the newest run."""
     from stlc.rundir import RunDir
 
     return [RunDir.open(name) for name in names or ["latest"]]

@@ -1,4 +1,4 @@
-"""Section of the page on the paper's comparison, from all stored results."""
+"""Section of the documentation page on the paper's comparison, written from all stored results."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ DRIVES_COMMAND = "`python -m benchmarks paper --parts drives` fills the cells th
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """All stored results of the comparison.
+    """Files with all stored results of the comparison.
 
     Attributes:
-        place: of the trainings.
-        feasible: searches on held-out states.
-        plans: planner cells.
-        drives: closed-loop cells.
+        place: results and runs of training.
+        feasible: results of the search for plans from held-out initial states.
+        plans: results of planners.
+        drives: results of closed-loop simulations.
     """
 
     place: Place
@@ -77,25 +77,25 @@ class Stored:
 
     @classmethod
     def of(cls, place: Place) -> Stored:
-        """The stores beside that of the trainings."""
+        """Return the result files that lie in the same folder as those of training."""
         folder = place.store.folder
         return cls(place, *(ResultStore(name, folder) for name in ("feasible", "plans", "drives")))
 
     def plan_rows(self) -> list[PlanRow]:
-        """Rows of all planner cells."""
+        """Return the table rows of all stored results of planners."""
         return _ordered(PlanRow.of(each) for each in self.plans.all().values())
 
     def drive_rows(self) -> list[DriveRow]:
-        """Rows of all closed-loop cells."""
+        """Return the table rows of all stored closed-loop results."""
         return _ordered(DriveRow.of(each) for each in self.drives.all().values())
 
     def claims(self) -> list[Claim]:
-        """The paper's claims beside what is measured."""
+        """Return the paper's claims, with verdicts by the stored results."""
         return claims(standings(learned(self.place.all()), self.plan_rows(), self.drive_rows()))
 
 
 def _ordered(rows: Iterable[Row]) -> list[Row]:
-    """Policies first, then planners in the order of the roster, by budget."""
+    """Sort rows: trained policies first, then planners in the order of `roster`, by time budget."""
     names = [*roster()]
     place = {name: index for index, name in enumerate(names)}
     return sorted(
@@ -111,7 +111,7 @@ def _ordered(rows: Iterable[Row]) -> list[Row]:
 
 
 def section(stored: Stored, page: Path) -> list[str]:
-    """The section; its figures are written into the page's folder."""
+    """Return the lines of the section, and write its figures beside `page`."""
     results = stored.place.all()
     known = known_feasible(stored.feasible, results)
     plans, drives, trained = stored.plan_rows(), stored.drive_rows(), learned(results)
@@ -160,7 +160,10 @@ def _lines(lines: Sequence[Line]) -> list[str]:
 
 
 def _search_first(plans: Sequence[PlanRow]) -> list[str]:
-    """Benchmarks on which search beats the policy, which the page shows first."""
+    """Return the text on benchmarks on which search beats the trained policy.
+
+    The section begins with this text.
+    """
     found = upsets(plans)
     if not found:
         return []
@@ -171,7 +174,10 @@ def _search_first(plans: Sequence[PlanRow]) -> list[str]:
 
 
 def facets(trained: Iterable[Learned], plans: Sequence[PlanRow], ceiling: dict[str, Ceiling]) -> list[Facet]:
-    """A facet of each benchmark: current results, each method at its largest budget."""
+    """Return the data of the figures, one `Facet` per benchmark; outdated results are left out.
+
+    The bar of each method shows its result with the longest training, or with the largest time budget.
+    """
     names = [*roster()]
     bars: dict[str, dict[str, Bar]] = {name: {} for name in BENCHMARKS}
     points: dict[str, list[Point]] = {name: [] for name in BENCHMARKS}

@@ -1,7 +1,8 @@
-"""Planner cells: one planner, one benchmark, one budget a plan, on the same starts for all.
+"""Measurements of planners: one planner on one benchmark with one time budget per plan.
 
-Each is stored when it ends; a planner that refuses a task is stored with its reason. A trained policy is such
-a cell, too: its plans from the same starts, and how long one takes.
+All planners plan from the same initial states (starts). Each result is stored as soon as it is measured. If a
+planner cannot solve a task, the reason is stored instead. Trained policies are measured in the same way:
+their plans are judged, and the time of a plan is measured.
 """
 
 from __future__ import annotations
@@ -28,27 +29,27 @@ from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
 SEED = 12_345
-"""Of the starts; for reporting only."""
+"""Seed of the initial states; they serve only for reports, never for training."""
 STARTS = 1_000
 SECONDS = (0.001, 0.01, 0.1, 1.0)
-"""Processor time a plan."""
+"""Time budgets: processor time per plan in seconds."""
 LONG = 1.0
-"""From this budget on a cell is measured only if more time has found more plans before."""
+"""A time budget (s) from which on a planner is measured only if more time has found more plans before."""
 ALONE = 100
-"""Starts that are planned one at a time, for the time of a decision."""
+"""Number of initial states from which plans are computed singly, to time a decision."""
 
 
 @dataclass(frozen=True)
 class PlanCell:
-    """One measurement of a planner.
+    """Description of one measurement of a planner or of a trained policy.
 
     Attributes:
         benchmark: name of the specification.
         contender: the planner and its options.
-        seconds: processor time a plan; inf if the planner's own settings end the search.
+        seconds: processor time per plan; inf if the planner's own settings end its search.
         starts: number of initial states.
-        run: of the trained policy whose plans are judged; None for a planner.
-        label: of that policy, such as `guided-60s-seed0`.
+        run: run of the trained policy whose plans are judged; None for a planner.
+        label: label of that policy, such as `guided-60s-seed0`; "" for a planner.
     """
 
     benchmark: str
@@ -60,7 +61,7 @@ class PlanCell:
 
     @property
     def name(self) -> str:
-        """Of its result, such as `traffic-plan-search-10ms`."""
+        """Name under which the result is stored, such as `traffic-plan-search-10ms`."""
         own = (
             self.label
             or f"{self.contender.name.replace(':', '-')}-{time_text(self.seconds).replace(' ', '')}"
@@ -69,7 +70,11 @@ class PlanCell:
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """All options of the planner, those by default too. Raises UsageError for one that does not fit."""
+        """All options of the planner, including defaults; for a trained policy, the hash of its checkpoint.
+
+        Raises:
+            UsageError: an option is invalid.
+        """
         if self.run is not None:
             return {
                 "policy_sha256": sha256((self.run.path / "ckpt" / "last.json").read_text(encoding="utf-8"))
@@ -79,12 +84,16 @@ class PlanCell:
 
     @property
     def evaluations(self) -> int | None:
-        """Judged plans a start at most."""
+        """Largest number of plans that the planner evaluates per initial state; None without such a limit."""
         return None if math.isfinite(self.seconds) else self.contender.evaluations.get(self.benchmark)
 
     @property
     def key(self) -> Key:
-        """The key of its result. Raises UsageError, SpecError, SystemFileError for a bad file."""
+        """Key under which the result is stored: its name and all its inputs.
+
+        Raises:
+            UsageError, SpecError, SystemFileError: an input file is missing or invalid.
+        """
         return Key(
             self.name,
             {
@@ -98,24 +107,31 @@ class PlanCell:
         )
 
     def solver(self, task: Task) -> Solver:
-        """The planner, prepared. Raises UsageError if it refuses the task, MissingError without a package."""
+        """Return the planner, prepared for `task`.
+
+        Raises:
+            UsageError: the planner cannot solve this task.
+            MissingError: a package is missing.
+        """
         if self.run is not None:
             return planner_named(REPLAYED, run=str(self.run.path)).prepare(task)
         return planner_named(self.contender.method, **self.contender.options_on(self.benchmark)).prepare(task)
 
 
 def time_text(seconds: float) -> str:
-    """A budget a plan, such as `10 ms`; `own settings` without a limit."""
+    """Return a time budget per plan as text, such as `10 ms`; inf gives `own settings`."""
     if math.isinf(seconds):
         return "own settings"
     return f"{1e3 * seconds:g} ms" if seconds < 1.0 else f"{seconds:g} s"
 
 
 def measure(cell: PlanCell) -> Result:
-    """Plan from all starts, then from some of them one at a time.
+    """Measure a planner or policy: plan from all initial states in one batch, then from some of them singly.
+
+    If the planner cannot solve the task, the result contains only the reason, under the key `refused`.
 
     Raises:
-        MissingError: R301, a package is missing; nothing is known then.
+        MissingError: R301, a package is missing.
     """
     task = load(cell.benchmark)
     states = task.sample(cell.starts, seed=SEED, dtype=torch.float64)
@@ -152,23 +168,25 @@ def _planned(task: Task, solver: Solver, states: Tensor, budget: PlanBudget) -> 
 
 @dataclass(frozen=True, slots=True)
 class PlanRow:
-    """A planner, or a trained policy, on the starts of a benchmark.
+    """Results of a planner, or of a trained policy, on the initial states (starts) of a benchmark.
 
     Attributes:
         benchmark: name of the specification.
-        method: name of the contender.
-        label: of a trained policy, such as `guided-60s-seed0`; "" for a planner.
-        seconds: processor time a plan; None if its own settings end the search.
+        method: name of the method.
+        label: label of a trained policy, such as `guided-60s-seed0`; "" for a planner.
+        seconds: processor time per plan; None if the planner's own settings end its search.
         starts: number of initial states.
-        accuracy: share with a satisfying plan; None if the planner refuses the task.
-        interval: its 95 % Wilson interval.
-        infeasible: share of the starts proved to have no satisfying plan.
-        mean_ms: processor time a plan, all starts in one batch.
-        median_ms: of a decision, one start at a time.
-        p99_ms: its 99th percentile.
-        evaluations: judged plans a start.
-        refused: why the planner refuses the task; "" if it does not.
-        outdated: whether specification, system or version have changed since.
+        accuracy: share of the starts for which a satisfying plan was found; None if the planner cannot solve
+            the task.
+        interval: 95 % Wilson interval of `accuracy`.
+        infeasible: share of the starts from which provably no satisfying plan exists.
+        mean_ms: mean processor time per plan, with all starts in one batch.
+        median_ms: median processor time of a plan from a single start.
+        p99_ms: 99th percentile of the processor time of a plan from a single start.
+        evaluations: mean number of plans that were evaluated per start.
+        refused: reason why the planner cannot solve the task; "" if it can.
+        outdated: whether the specification, the system or the planners' version has changed since the
+            measurement.
     """
 
     benchmark: str
@@ -188,7 +206,7 @@ class PlanRow:
 
     @classmethod
     def of(cls, result: Result) -> PlanRow:
-        """The row of a result."""
+        """Return the row of the table that shows a stored result."""
         key, alone = result["key"], result.get("alone", {})
         accuracy, starts = result.get("accuracy"), int(key["starts"])
         proved = unpack(result["infeasible"], starts) if "infeasible" in result else []
@@ -206,20 +224,22 @@ class PlanRow:
 
 
 def is_outdated(result: Result) -> bool:
-    """True if the specification, the system or the version of planning has changed since a measurement."""
+    """True if the specification, the system or the planners' version has changed since a measurement."""
     return has_changed(result, {"planner_version": PLANNING_VERSION})
 
 
 @dataclass(frozen=True, slots=True)
 class Ceiling:
-    """Shares of feasible and infeasible starts of a benchmark that all plans together show.
+    """Shares of the initial states (starts) of one benchmark with known and with impossible plans.
+
+    They are computed from the stored results of all planners and policies together.
 
     Attributes:
         benchmark: name of the specification.
         starts: number of initial states.
-        known: share with a known satisfying plan, a lower bound of the feasible share.
-        proved: share proved to have none.
-        contradictions: starts proved to have none for which a plan is known: a defect if there are any.
+        known: share of the starts from which a satisfying plan is known; a lower bound of the feasible share.
+        proved: share of the starts from which provably no satisfying plan exists.
+        contradictions: number of starts with both a known plan and a proof that none exists. This must be 0.
     """
 
     benchmark: str
@@ -230,7 +250,10 @@ class Ceiling:
 
 
 def ceilings(results: Iterable[Result]) -> dict[str, Ceiling]:
-    """Known and proved shares of each benchmark, on the starts that most of its cells share."""
+    """Return for each benchmark the shares of starts with a known plan, and with a proof that no plan exists.
+
+    Of each benchmark, only the results with the greatest number of starts are used.
+    """
     groups: dict[str, list[Result]] = {}
     for each in results:
         if "solved" in each and not is_outdated(each):
@@ -249,7 +272,11 @@ def ceilings(results: Iterable[Result]) -> dict[str, Ceiling]:
 
 
 def improves(cell: PlanCell, store: ResultStore) -> bool:
-    """True if a cell is worth its time: a long one only if ten times the time has found more plans before."""
+    """True if a measurement is worth its time.
+
+    A measurement with a short time budget always is. One with a long time budget is worth its time if,
+    between two shorter budgets, ten times the time found more plans.
+    """
     if cell.seconds < LONG or math.isinf(cell.seconds):
         return True
     shorter = [
@@ -265,7 +292,11 @@ def improves(cell: PlanCell, store: ResultStore) -> bool:
 def planned(
     cells: Iterable[PlanCell], store: ResultStore, *, measuring: Callable[[PlanCell], Result] = measure
 ) -> Measured:
-    """Results of cells, stored or newly measured; those that are not worth their time are left out."""
+    """Return the results of the measurements `cells`; those that are not stored yet are carried out now.
+
+    Measurements that are not worth their time (see `improves`) are left out. `measuring` is the function that
+    carries out a measurement.
+    """
     worth = (cell for cell in cells if improves(cell, store))
     return measured(worth, store, measuring, doing="planning", told=_summary)
 

@@ -1,4 +1,7 @@
-"""Repair methods for rejected plans, run one agent at a time in states of a deployment."""
+"""Methods that repair rejected plans, compared in the same states of a deployment, one agent at a time.
+
+A deployment is a closed-loop simulation. Its guard rejects plans that violate the specification.
+"""
 
 from __future__ import annotations
 
@@ -23,27 +26,27 @@ from stlc.controller.training.local_search import Searcher
 from stlc.controller.training.run import Run
 
 SHORT, LONG = 2000, 32_000
-"""Evaluations of a local search for each of its two initial guesses."""
+"""Number of plans that a short and a long local search evaluate for each of two initial guesses."""
 
 Rejected: TypeAlias = tuple[Tensor, Tensor, Tensor]
 """A state (1, n), and its rejected plans (1, T, m): the policy's and the previous one."""
 Method: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""`Rejected` -> plans (k, T, m)."""
+"""Function that maps the three parts of `Rejected` to plans (k, T, m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mended:
-    """Success of one repair method in the rejected states of one deployment.
+    """Success of one repair method in the states of one deployment in which plans were rejected.
 
     Attributes:
         benchmark: name of the specification.
-        scenario: of the system; empty for the nominal system.
-        way: name of the method.
+        scenario: scenario of the system; "" for the system without a scenario.
+        way: name of the repair method.
         states: number of states.
-        solvable: states with a plan for phi, found by any of the methods or a search.
-        mended: solvable states solved by this method.
-        savable: viable states, with a plan for phi_safe.
-        saved: viable states for which this method finds such a plan.
+        solvable: number of states with a satisfying plan, found by any of the methods or by a search.
+        mended: number of these states for which this method finds a satisfying plan.
+        savable: number of states with a plan that satisfies the requirements tagged `@safety`.
+        saved: number of these states for which this method finds such a plan.
         times: processor time per state.
     """
 
@@ -59,7 +62,14 @@ class Mended:
 
 
 def repairs(run: Run, samples: int, seeds: tuple[int, ...], scenario: str = "") -> Iterator[Mended]:
-    """The success of every repair method in the same rejected states of a deployment."""
+    """Yield the success of every repair method in the same states, in which plans were rejected.
+
+    Args:
+        run: run of the policy.
+        samples: greatest number of states.
+        seeds: seeds of the deployment (closed-loop simulation) from which the states are taken.
+        scenario: name of the scenario, for the results.
+    """
     task, states = run.task, _rejected(run, samples, seeds)
     if not states:
         return
@@ -75,7 +85,10 @@ def repairs(run: Run, samples: int, seeds: tuple[int, ...], scenario: str = "") 
 
 
 def methods_of(task: Task, backup: StagedSearch) -> dict[str, Method]:
-    """The repair methods by name."""
+    """Return the repair methods: name -> function.
+
+    `backup` is the search of the full guard, which is one of the methods.
+    """
     enough = TO_SPARE * task.system.decl.objective.gamma
     ascent = GradientAscent(task, torch.Generator().manual_seed(SEED), enough=enough)
     searcher = Searcher(task, torch.Generator().manual_seed(SEED), enough=enough)
@@ -99,7 +112,7 @@ def methods_of(task: Task, backup: StagedSearch) -> dict[str, Method]:
 
 
 def _rejected(run: Run, samples: int, seeds: tuple[int, ...]) -> list[Rejected]:
-    """States with an intervention in which both the policy's and the previous plan violate."""
+    """Return states in which the guard intervened, and both the policy's plan and the previous plan fail."""
     task, guard = run.task, Guard(run.task, run.policy, "paper")
     recording, _, acted = sampled_states(guard, seeds, 2 * samples)
     found = []
@@ -112,7 +125,12 @@ def _rejected(run: Run, samples: int, seeds: tuple[int, ...]) -> list[Rejected]:
 
 
 def _tried(task: Task, method: Method, states: list[Rejected]) -> tuple[Tensor, Tensor, Times | None]:
-    """Masks of the states for which a method finds a plan for phi, and for phi_safe; and its times."""
+    """Apply a repair method to all states.
+
+    Returns:
+        Whether it finds a satisfying plan, (states,); whether it finds a plan that satisfies the safety
+        requirements, (states,); and its processor times.
+    """
 
     def attempt(state: Rejected) -> tuple[bool, bool, float]:
         begin = process_time()

@@ -1,7 +1,8 @@
-"""Contenders of the paper's comparison: each learner and planner of the registries is a row.
+"""Methods (contenders) in the paper's comparison: every training method and planner that stlc registers.
 
-A contender is named as its method: `guided`, `sac:task` (a learner with an option), `plan:search` (a
-planner), `plan:cem:paper` (with the paper's settings). A new method appears here by its file alone.
+Their names show method and options: `guided`; `sac:task` (training with an option); `plan:search` (a
+planner); `plan:cem:paper` (a planner with the paper's settings). To add a method to the comparison, only its
+own file is needed.
 """
 
 from __future__ import annotations
@@ -14,21 +15,22 @@ from stlc.registry import METHODS, PLANNERS
 Options = Mapping[str, str]
 PLAN, PAPER = "plan", "paper"
 REPLAYED = "policy"
-"""The planner that replays a trained policy: it is no contender of its own."""
+"""The planner that replays a trained policy. It has no row of its own in the comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """A method with its options.
+    """A method with its options, one row of the comparison.
 
     Attributes:
-        name: of the row.
-        method: name in `METHODS`, or in `PLANNERS` if `plans`.
-        options: of the method, as on a command line.
-        plans: whether it plans without training.
-        evaluations: benchmark -> plans after which its own settings end; empty if its budget is a time.
-        special: benchmark -> options that differ there.
-        hour: whether it is also trained for an hour.
+        name: name of the row, such as `sac:task`.
+        method: name of the training method, or of the planner if `plans` is True.
+        options: options of the method, as on a command line.
+        plans: whether the method plans without training.
+        evaluations: benchmark -> number of plans after which the planner's own settings end its search. Empty
+            if the planner has a time budget instead.
+        special: benchmark -> options that differ for this benchmark.
+        hour: whether the method is also trained for an hour.
     """
 
     name: str
@@ -40,7 +42,7 @@ class Contender:
     hour: bool = False
 
     def options_on(self, benchmark: str) -> dict[str, str]:
-        """All options on a benchmark."""
+        """Return all options of the method for a benchmark."""
         return {**self.options, **self.special.get(benchmark, {})}
 
 
@@ -50,14 +52,14 @@ def _usual(count: int, **others: int) -> dict[str, int]:
 
 
 REWARDS = ("task", "robustness", "accuracy")
-"""RL_R, RL_S and RL_A of the paper."""
+"""Rewards of the methods that the paper calls RL_R, RL_S and RL_A."""
 LEARNERS: dict[str, tuple[Contender, ...]] = {
     "sac": tuple(
         Contender(f"sac:{reward}", "sac", {"reward": reward}, hour=reward == "robustness")
         for reward in REWARDS
     ),
 }
-"""Learners with several rows instead of one."""
+"""Training methods that have several rows in the comparison."""
 PLANNERS_OF_PAPER: dict[str, Contender] = {
     "cem": Contender(
         "plan:cem:paper",
@@ -76,22 +78,22 @@ PLANNERS_OF_PAPER: dict[str, Contender] = {
         special={"ship_safe": {"steps": "200"}, "manipulation": {"steps": "200"}},
     ),
 }
-"""Settings of the authors' scripts, rows beside those with a time budget."""
+"""Planners with the settings of the authors' scripts; they have rows besides those with a time budget."""
 
 
 def learners() -> tuple[Contender, ...]:
-    """All learners."""
+    """Return all training methods."""
     trained = [name for name in METHODS.names if METHODS.get(name).trains]
     return tuple(each for name in trained for each in LEARNERS.get(name, (Contender(name, name),)))
 
 
 def planners() -> tuple[Contender, ...]:
-    """All planners, those with the paper's settings behind the others."""
+    """Return all planners; those with the paper's settings come last."""
     names = [name for name in PLANNERS.names if name != REPLAYED]
     usual = [Contender(f"{PLAN}:{name}", name, plans=True) for name in names]
     return (*usual, *(each for name, each in PLANNERS_OF_PAPER.items() if name in names))
 
 
 def roster() -> dict[str, Contender]:
-    """All contenders by name."""
+    """Return all methods of the comparison: name -> method."""
     return {each.name: each for each in (*learners(), *planners())}

@@ -1,4 +1,4 @@
-"""Processor time of the parts of a training step, and of rollouts with verdicts and gradients."""
+"""Measurement of processor times: the parts of a training step, and rollouts with verdicts and gradients."""
 
 from __future__ import annotations
 
@@ -28,19 +28,20 @@ rollout, smooth robustness, backward and optimiser."""
 
 @dataclass(frozen=True, slots=True)
 class StepTiming:
-    """Milliseconds of processor time of one training step and of its parts.
+    """Processor time of one training step and of its parts, in milliseconds.
 
     Attributes:
         benchmark: name of the specification.
-        batch: states of a step.
-        plans: of the network for each of them.
-        forward: of the network.
-        verdict: rollout, robustness and cost of all plans, and the choice among them.
+        batch: number of states in a step.
+        plans: number of plans that the network proposes for each state.
+        forward: forward pass of the network.
+        verdict: rollout, robustness and cost of all plans, and the choice of the best plan for each state.
         gradient: rollout and robustness of the chosen plans, with gradients.
-        backward: of the network.
-        optimiser: clipping, Adam, and the average of the weights.
-        whole: the step, with parts not listed above.
-        search: a search round, in its own thread, divided by the steps between two rounds.
+        backward: backward pass of the network.
+        optimiser: gradient clipping, Adam, and the running average of the weights.
+        whole: the whole step, including parts that are not listed here.
+        search: a round of the search that runs beside the training, divided by the number of steps between
+            two rounds.
     """
 
     benchmark: str
@@ -57,15 +58,16 @@ class StepTiming:
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """Rollouts, verdicts and gradients of one task.
+    """Speed of rollouts, verdicts and gradients for one task.
 
     Attributes:
         benchmark: name of the specification.
-        steps: of a rollout.
-        native: milliseconds of 2,000 rollouts with robustness and gradient in C; None without a kernel.
-        torch: the same in torch.
-        reported: of a step of the authors' code with the same number of states.
-        verdicts: rollouts with verdict a second, without gradient.
+        steps: number of steps of a rollout.
+        native: milliseconds for 2,000 rollouts with robustness and gradient in C; None without compiled C
+            code.
+        torch: milliseconds for the same rollouts in torch.
+        reported: milliseconds for a training step of the paper authors' code with the same number of states.
+        verdicts: number of rollouts with robustness, but without gradient, per second.
     """
 
     benchmark: str
@@ -77,13 +79,20 @@ class Speed:
 
     @property
     def share(self) -> float | None:
-        """Share of the authors' time."""
+        """Our time divided by the time of the authors' code; None if the latter is unknown."""
         ours = self.torch if self.native is None else self.native
         return None if self.reported is None else ours / self.reported
 
 
 def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTiming:
-    """Time the parts of a training step."""
+    """Measure the time of the parts of a training step.
+
+    Args:
+        name: name of the benchmark.
+        task: task of the benchmark.
+        seconds: duration of the measurement.
+        warm: number of training steps before the measurement.
+    """
     engine = resolve_config(task, TrainConfig(seed=0, threads=1))
     trainer = Trainer(task, engine, steps=MOST_STEPS, device=torch.device("cpu"))
     for _ in range(warm):
@@ -106,7 +115,10 @@ def step_timing(name: str, task: Task, *, seconds: float, warm: int) -> StepTimi
 
 
 def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
-    """The parts as functions: forward; verdict; gradient; forward and backward; optimiser."""
+    """Return the parts of a training step for the states `x0`, as functions without arguments.
+
+    They are, in this order: forward pass; verdict; gradient; forward and backward pass; optimiser.
+    """
     task, network, count = trainer.task, trainer.network, trainer.config.plans
     plans = network(x0).detach()
     direction = torch.ones_like(plans)
@@ -137,7 +149,7 @@ def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
 
 
 def _searched(trainer: Trainer) -> float:
-    """Milliseconds of a round of search for the states on which the network fails."""
+    """Return the milliseconds of one search for plans, from states for which the network's plans fail."""
     with torch.no_grad():
         x0 = trainer.supply.take(trainer.config.pool)
         plans, judged = trainer.policy.plan_judged(x0)
@@ -149,7 +161,7 @@ def _searched(trainer: Trainer) -> float:
 
 
 def speed(name: str, task: Task, *, seconds: float) -> Speed:
-    """Time rollouts with verdicts, and with gradients."""
+    """Measure the time of rollouts with verdicts, and of rollouts with gradients, for about `seconds`."""
     x0 = task.sample(VERDICTS, seed=1)
     generator = torch.Generator().manual_seed(2)
     low, high = task.system.control_low, task.system.control_high

@@ -1,4 +1,4 @@
-"""Stored results: a JSON file per table, each result under a key of its inputs."""
+"""Stored results: one JSON file per table, in which each result has a name and a record of its inputs."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ from stlc.rundir import now
 FORMAT = "benchmark-results/1"
 RESULTS = Path("benchmarks/results")
 BENCHMARKS = ("traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "manipulation")
-"""The tasks of the paper, in its order; each is a specification of that name."""
+"""The benchmarks of the paper, in its order. Each is the name of a specification."""
 
 Result = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """The inputs of a result; if they change, the result is computed again.
+    """Name and inputs of a result; if the inputs change, the result is computed again.
 
     Attributes:
-        name: of the result, unique in its file.
-        values: plain data: specification, system, method and its version, version of the guard, seeds, sizes.
+        name: name of the result, unique in its file.
+        values: inputs as plain data: specification, system, method and its version, version of the guard,
+            seeds, sizes.
     """
 
     name: str
@@ -43,34 +44,37 @@ class Key:
 
     @property
     def digest(self) -> str:
-        """Hash of all values, ten hexadecimal digits."""
+        """Hash of all inputs: ten hexadecimal digits."""
         return sha256(dumps(plain(self.values)))[:10]
 
 
 @dataclass(frozen=True, slots=True)
 class ResultStore:
-    """The results of one table, in `FOLDER/TABLE.json`, a line each."""
+    """Stored results of one table, in the file `FOLDER/TABLE.json`, one line per result."""
 
     table: str
     folder: Path = RESULTS
 
     @property
     def path(self) -> Path:
-        """Path of the file."""
+        """Path of the file with the results."""
         return self.folder / f"{self.table}.json"
 
     def get(self, key: Key, compute: Callable[[], Result]) -> Result:
-        """The stored result of `key`, else that of `compute`, which is then stored."""
+        """Return the stored result of `key`; if there is none, call `compute` and store its result."""
         found = self.find(key)
         return found if found is not None else self.put(key, compute())
 
     def find(self, key: Key) -> Result | None:
-        """The stored result of these inputs, or None."""
+        """Return the stored result with the name and inputs of `key`, or None."""
         kept = self.all().get(key.name)
         return kept if kept is not None and kept.get("key") == plain(key.values) else None
 
     def put(self, key: Key, result: Result) -> Result:
-        """Store a result under its name, replacing an older one, with its provenance."""
+        """Store `result`, with its date, versions and machine, under the name in `key`; return it as stored.
+
+        An older result of that name is replaced.
+        """
         document = {"name": key.name, "key": key.values, "made": made_here(), **result}
         kept = {**self.all(), key.name: plain(document)}
         lines = ",\n".join(f"{dumps(name)}: {dumps(each)}" for name, each in kept.items())
@@ -78,7 +82,7 @@ class ResultStore:
         return self.all()[key.name]
 
     def all(self) -> dict[str, dict[str, Any]]:
-        """All results by name, outdated ones included."""
+        """Return all stored results by name, including outdated ones; empty if the file cannot be read."""
         with suppress(OSError, ValueError):
             document = json.loads(self.path.read_text(encoding="utf-8"))
             if isinstance(document, dict) and document.get("format") == FORMAT:
@@ -87,7 +91,7 @@ class ResultStore:
 
 
 def made_here() -> dict[str, Any]:
-    """Date, software, commit and machine."""
+    """Return the provenance of a result that is computed now: date, software versions, commit and machine."""
     return {"date": now(), "versions": versions(), "git": git_state(), "hardware": hardware()}
 
 
@@ -95,7 +99,11 @@ def made_here() -> dict[str, Any]:
 
 
 def spec_path(benchmark: str) -> Path:
-    """The specification of a benchmark: in `specs/`, else the installed one. Raises UsageError (U102)."""
+    """Return the path of a benchmark's specification: in `specs/`, or else among the installed files.
+
+    Raises:
+        UsageError: U102, there is no such benchmark.
+    """
     name = f"{benchmark}.stl"
     for path in (folder / part / name for folder in (Path("specs"), SPECS) for part in ("", "families")):
         if path.is_file():
@@ -104,7 +112,7 @@ def spec_path(benchmark: str) -> Path:
 
 
 def load(benchmark: str, overrides: tuple[tuple[str, str], ...] = ()) -> Task:
-    """The task of a benchmark, compiled once for each set of overrides."""
+    """Return the task of a benchmark; it is compiled once for each set of `overrides` (name, value)."""
     return _load(spec_path(benchmark).resolve(), spec_path(benchmark), overrides)
 
 
@@ -119,7 +127,7 @@ def _load(_where: Path, path: Path, overrides: tuple[tuple[str, str], ...]) -> T
 
 
 def inputs_of(task: Task) -> dict[str, str]:
-    """Hashes of the specification with its imports, and of what a policy learns from in the system file."""
+    """Return hashes of the specification (with imports) and of the system's parts that affect training."""
     spec, decl = task.compiled.spec, task.system.decl
     texts = [spec.source.text, *(f"{key}\n{text}" for key, text in sorted(library_of(spec).items()))]
     named = (f"{name} {sha256(path.read_bytes())}" for name, path in sorted(function_files(decl).items()))

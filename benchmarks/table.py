@@ -1,4 +1,4 @@
-"""Tables for terminal, Markdown and JSON, and the pages that contain them."""
+"""Tables as text, Markdown and JSON, and the documentation pages that contain them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ float64.
 
 
 class _Template(Formatter):
-    """Formats the attributes of one object; None is empty."""
+    """Formatter whose template names attributes of one object; None is written as ""."""
 
     def get_value(self, key: int | str, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
         return getattr(args[0], str(key))
@@ -57,14 +57,15 @@ class _Template(Formatter):
 
 @dataclass(frozen=True)
 class Table(Generic[Cell, Row]):
-    """A table: each cell is measured in turn and gives a row.
+    """A table: each cell is measured in turn and gives one row.
 
     Attributes:
-        name: of the table.
-        cells: to measure.
-        measure: cell -> row, a dataclass; its fields and properties are the JSON values.
-        columns: header -> text of a row, for a terminal and for Markdown.
-        message: printed when a row is measured.
+        name: name of the table.
+        cells: the things to measure.
+        measure: function that measures a cell and returns a row. A row is a dataclass; its fields and
+            properties are the values in JSON.
+        columns: header -> text of a row in this column.
+        message: text printed when a row is measured; None for no message.
     """
 
     name: str
@@ -75,7 +76,7 @@ class Table(Generic[Cell, Row]):
 
     @cached_property
     def rows(self) -> list[Row]:
-        """All rows, measured on first access."""
+        """All rows of the table; they are measured on first access."""
         rows = []
         for cell in self.cells:
             rows.append(self.measure(cell))
@@ -84,35 +85,38 @@ class Table(Generic[Cell, Row]):
         return rows
 
     def texts(self, rows: Iterable[Row] | None = None) -> list[tuple[str, ...]]:
-        """The cells of (some) rows as text."""
+        """Return the texts of `rows`, one tuple per row; by default of all rows."""
         chosen = self.rows if rows is None else rows
         return [tuple(text_of(row, shown) for shown in self.columns.values()) for row in chosen]
 
     def terminal(self) -> str:
-        """Aligned columns."""
+        """Return the table as text with aligned columns."""
         return columns_of_text(self.texts(), header=[*self.columns], indent="")
 
     def markdown(self, rows: Iterable[Row] | None = None) -> list[str]:
-        """(Some) rows as lines of Markdown."""
+        """Return `rows` as a Markdown table, line by line; by default all rows."""
         return markdown([*self.columns], self.texts(rows))
 
     def json(self) -> list[dict[str, Any]]:
-        """Fields and properties of each row."""
+        """Return each row as a dictionary of its fields and properties."""
         return [values(row) for row in self.rows]
 
 
 def listed(name: str, rows: Iterable[Row], columns: Columns[Row]) -> Table[Row, Row]:
-    """A table of known rows."""
+    """Return a table of the given rows, without a measurement."""
     return Table(name, rows, lambda row: row, columns)
 
 
 def text_of(row: Row, shown: str | Callable[[Row], str]) -> str:
-    """The text of a row by a function or a template of `Columns`."""
+    """Return the text of a row in one column; `shown` is the function or template of the column."""
     return _Template().vformat(shown, (row,), {}) if isinstance(shown, str) else shown(row)
 
 
 def values(row: Any) -> Any:
-    """Fields and public properties of a dataclass, recursively; other values unchanged."""
+    """Return a dataclass as a dictionary of its fields and public properties, recursively.
+
+    Other values are returned unchanged.
+    """
     if not hasattr(row, "__dataclass_fields__"):
         return row
     names = [each.name for each in fields(row)]
@@ -127,14 +131,14 @@ def publish(
     tables: Mapping[str, Table[Any, Any]],
     **facts: Any,
 ) -> None:
-    """Write the section of a table's page, then print its tables.
+    """Write the section of a documentation page, then print the tables.
 
     Args:
-        what: name of the table, of the section and in the document.
-        output: the page, if any, and whether the document of `--json` is printed.
-        section: lines of the section.
-        tables: key in the document -> table.
-        facts: further entries of the document; `failed` lists the measurements that failed.
+        what: name of the table, which marks its section in the page.
+        output: the page, if any, and whether JSON is printed.
+        section: function that returns the lines of the section.
+        tables: key in the JSON document -> table.
+        facts: further entries of the JSON document; `failed` lists the measurements that failed.
 
     Raises:
         typer.Exit: 1, a measurement failed.
@@ -151,7 +155,10 @@ def publish(
 def show(
     what: str, tables: Mapping[str, Table[Any, Any]], *, as_json: bool, code: int = 0, **facts: Any
 ) -> None:
-    """Print the tables, or the document of `--json`: `{"what", facts, "rows": […], …}`."""
+    """Print the tables as text, or with `as_json` as a JSON document that also contains `facts`.
+
+    `what` is the name of the table, and `code` the exit code of the command.
+    """
     for table in tables.values():
         table.rows  # noqa: B018 - what is measured is measured before anything is printed
     if as_json:
@@ -164,7 +171,7 @@ def show(
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """A table as lines of Markdown."""
+    """Return a table as lines of Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
 
@@ -173,7 +180,10 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def write_section(page: Path, marker: str, lines: Iterable[str]) -> None:
-    """Write lines at `<!-- marker -->` in `page`, or at its end if it has no marker."""
+    """Replace the section between `<!-- marker -->` and `<!-- /marker -->` in the file `page` by `lines`.
+
+    If the page has no such section, it is added at the end.
+    """
     text = page.read_text(encoding="utf-8") if page.is_file() else HEAD
     start, end = f"<!-- {marker} -->\n", f"<!-- /{marker} -->\n"
     head, found, rest = text.partition(start)
@@ -184,11 +194,13 @@ def write_section(page: Path, marker: str, lines: Iterable[str]) -> None:
 
 
 def provenance(results: Iterable[Result], what: str) -> list[str]:
-    """Provenance bullets: a line for every machine and version, with commits and dates.
+    """Return Markdown bullets on the provenance of results, one per machine and version.
+
+    Each bullet lists commits and dates.
 
     Args:
-        results: shown ones.
-        what: noun for them, in the plural.
+        results: the results that the page shows.
+        what: noun for the results, in the plural.
     """
     groups: dict[str, list[Result]] = {}
     for each in results:
@@ -208,7 +220,7 @@ def provenance(results: Iterable[Result], what: str) -> list[str]:
 
 
 def measured_here() -> str:
-    """Machine, software and commit of the present measurement, as a bullet."""
+    """Return a Markdown bullet with the machine, the software and the commit of the present measurement."""
     made = made_here()
     return f"- {_machine(made)}; {made['date'][:10]}; commit `{_commit(made)}`"
 
@@ -220,11 +232,11 @@ def _machine(made: Result) -> str:
 
 
 def _commit(made: Result) -> str:
-    """Commit of the source tree that made a result, with `+` for uncommitted changes."""
+    """Return the commit of the source tree that produced a result; a `+` marks uncommitted changes."""
     git = made.get("git") or {}
     return str(git.get("commit") or "unknown")[:10] + ("+" if git.get("dirty") else "")
 
 
 def _counted(count: int, what: str) -> str:
-    """A count with its noun, such as `1 core`."""
+    """Return a count with its noun as text, such as `1 core`; `what` is the noun in the plural."""
     return f"{count} {what if count != 1 else what.removesuffix('s')}"

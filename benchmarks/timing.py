@@ -1,4 +1,4 @@
-"""Timing of functions, interleaved so that other load affects all of them alike."""
+"""Timing of functions that take turns, so that other load on the machine affects all of them alike."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ Measured = TypeVar("Measured")
 _SLICE = 0.01
 """Minimum duration of one measurement in seconds."""
 WARM = 5
-"""Number of first measurements that are repeated, as they warm the caches."""
+"""Number of measurements that are made twice, because the first ones warm the caches."""
 
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Milliseconds of decisions.
+    """Statistics of measured decision times, in milliseconds.
 
     Attributes:
-        median: of them.
-        p99: 99th percentile.
-        samples: how many.
+        median: median of the times.
+        p99: 99th percentile of the times.
+        samples: number of measured times.
     """
 
     median: float
@@ -39,7 +39,7 @@ class Times:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Times | None:
-        """Statistics of times in seconds; None for an empty list."""
+        """Return the statistics of times in seconds; None for an empty list."""
         if not seconds:
             return None
         median, p99 = np.quantile(1e3 * np.asarray(seconds), (0.5, 0.99))
@@ -47,11 +47,14 @@ class Times:
 
 
 def interleaved(functions: Sequence[Callable[[], object]], seconds: float) -> list[list[float]]:
-    """Processor times of each function in seconds, one per round.
+    """Measure the processor time of each function, in rounds in which the functions take turns.
 
     Args:
-        functions: to time.
+        functions: the functions to time.
         seconds: total duration; at least three rounds are made.
+
+    Returns:
+        For each function, its processor time per call in seconds, one number per round.
     """
     often = [_repeats(function) for function in functions]
     samples: list[list[float]] = [[] for _ in functions]
@@ -63,17 +66,23 @@ def interleaved(functions: Sequence[Callable[[], object]], seconds: float) -> li
 
 
 def after_warm_up(measure: Callable[[Item], Measured], items: Sequence[Item]) -> list[Measured]:
-    """Measurements of all items; the first few are measured twice, as their first time warms the caches."""
+    """Call `measure` for each of `items` and return the results.
+
+    The first few items are measured twice, because their first measurement warms the caches.
+    """
     return [measure(item) for item in (*items[:WARM], *items)][min(WARM, len(items)) :]
 
 
 def ratio(some: Sequence[float], others: Sequence[float]) -> float:
-    """Median over rounds of the ratio of two functions' times."""
+    """Return the median of the ratios `some[i] / others[i]` of two functions' times in the same round."""
     return median(a / b for a, b in zip(some, others, strict=True))
 
 
 def _repeats(function: Callable[[], object]) -> int:
-    """Number of calls of a function per measurement, after warm-up calls."""
+    """Return the number of calls of a function per measurement, so that a measurement is not too short.
+
+    The function is called twice to warm up.
+    """
     function()
     once = _timed(function, 1)
     return max(int(_SLICE / max(once, 1e-9)), 1)
@@ -88,7 +97,7 @@ def _timed(function: Callable[[], object], repeats: int) -> float:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Use one thread of torch and keep freed memory, so that page faults are not timed."""
+    """Context in which torch uses one thread, and freed memory is kept so that page faults are not timed."""
     keep_freed_memory()
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,4 +1,7 @@
-"""Trainings behind tables: stored results, resumed and new trainings, in parallel."""
+"""Training runs of the tables: results are stored, interrupted runs are resumed, and new runs are started.
+
+Several runs can proceed in parallel.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ CURVE_POINTS = 80
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """Length of a training: a budget in seconds of a clock, or a number of steps."""
+    """Length of a training run: a time budget in seconds of `clock`, or a number of steps."""
 
     seconds: float | None = None
     steps: int | None = None
@@ -41,19 +44,19 @@ class Length:
 
     @property
     def name(self) -> str:
-        """Such as `60s` or `200steps`."""
+        """Length in file names, such as `60s` or `200steps`."""
         return f"{self.steps}steps" if self.steps is not None else f"{self.seconds:g}s"
 
     @property
     def text(self) -> str:
-        """Readable form, such as `60 s`."""
+        """Length as text for readers, such as `60 s`."""
         if self.steps is not None:
             return f"{self.steps:,} steps"
         return f"{self.seconds:g} s" + (" of processor time" if self.clock == "processor" else "")
 
     @property
     def options(self) -> tuple[str, ...]:
-        """For `stlc train`."""
+        """Options of `stlc train` that set this length."""
         if self.steps is not None:
             return ("--steps", str(self.steps))
         return ("--budget", f"{self.seconds:g}s", "--clock", self.clock)
@@ -61,18 +64,19 @@ class Length:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One training of a benchmark.
+    """Description of one training run for a benchmark.
 
     Attributes:
         benchmark: name of the specification.
-        method: of training.
-        seed: of training.
-        length: of training.
-        held_out: number of held-out states that the policy is judged on.
-        axis: hyperparameter that an ablation varies here; "" outside of ablations.
-        value: of that hyperparameter.
-        overrides: of the system file.
-        options: of the method, as on a command line; `reward` has an option of its own there.
+        method: name of the training method.
+        seed: seed of the run.
+        length: length of the run.
+        held_out: number of held-out states (never used in training) on which the policy is judged.
+        axis: hyperparameter that an ablation varies in this run; "" outside of ablations.
+        value: value of that hyperparameter.
+        overrides: name of a field in the system file -> new value.
+        options: options of the method, as on a command line. `reward` becomes `--reward`, and any other
+            becomes `--option`.
     """
 
     benchmark: str
@@ -87,19 +91,23 @@ class Cell:
 
     @property
     def contender(self) -> str:
-        """The method with its options, such as `guided` or `sac:task`."""
+        """Name of the method with its options, such as `guided` or `sac:task`."""
         return ":".join((self.method, *self.options.values()))
 
     @property
     def name(self) -> str:
-        """Of its result, such as `traffic-guided-60s-seed0`."""
+        """Name under which the result is stored, such as `traffic-guided-60s-seed0`."""
         own = self.contender.replace(":", "-")
         first = ("ablation", self.axis, self.value) if self.axis else (self.benchmark, own)
         return "-".join([*filter(None, first), self.length.name, f"seed{self.seed}"])
 
     @property
     def key(self) -> Key:
-        """The key of its result. Raises UsageError, SpecError, SystemFileError for a bad file."""
+        """Key under which the result is stored: its name and all its inputs.
+
+        Raises:
+            UsageError, SpecError, SystemFileError: an input file is missing or invalid.
+        """
         return Key(
             self.name,
             {
@@ -114,7 +122,7 @@ class Cell:
 
     @classmethod
     def of(cls, result: Result) -> Cell:
-        """The cell of a result."""
+        """Return the description of the training run that produced a stored result."""
         key = result["key"]
         length = Length(key["budget"], key["steps"], key["clock"])
         return cls(
@@ -123,7 +131,7 @@ class Cell:
         )
 
     def config(self) -> TrainConfig:
-        """The configuration of `stlc train`."""
+        """Return the options of the training run as a `TrainConfig`."""
         return TrainConfig(
             method=self.method,
             budget=self.length.seconds,
@@ -137,14 +145,14 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Store, run folder and parallelism of trainings.
+    """Place of training runs: the file of their results, their folders, and the computers that train.
 
     Attributes:
-        store: of the results.
-        runs: folder of the runs behind them.
-        jobs: processes at a time.
-        threads: of torch in each.
-        cluster: address of a Ray cluster to train on.
+        store: file of the results.
+        runs: folder in which the run folders are created.
+        jobs: number of runs at a time, each in its own process.
+        threads: number of torch threads per process.
+        cluster: address of a Ray cluster to train on; None for this machine.
     """
 
     store: ResultStore
@@ -154,11 +162,14 @@ class Place:
     cluster: str | None = None
 
     def runs_of(self, key: Key) -> Path:
-        """The folder of the runs of one cell, distinct for other inputs."""
+        """Return the folder for runs with the inputs `key`; other inputs have another folder."""
         return self.runs / f"{key.name}-{key.digest}"
 
     def newest_run(self, key: Key) -> RunDir | None:
-        """The newest run of a cell that can be collected or resumed."""
+        """Return the newest run with the inputs `key`, whose result can be read or which can be resumed.
+
+        The result is None if there is no run, or if the newest run failed or has no checkpoint.
+        """
         runs = every_run(self.runs_of(key))
         if not runs or not (runs[-1].path / "ckpt" / "last.json").is_file():
             return None
@@ -168,31 +179,31 @@ class Place:
             return None
 
     def best_run(self, results: Sequence[Result]) -> RunDir | None:
-        """The run of the most accurate result, if it still exists."""
+        """Return the run with the highest accuracy among `results`, or None if that run no longer exists."""
         best = max(results, key=lambda result: float(result["accuracy"]))
         return self.newest_run(Cell.of(best).key)
 
     def valid(self) -> list[Result]:
-        """The results whose specification, system and method are unchanged."""
+        """Return the stored results whose specification, system and method are unchanged."""
         return [each for each in self.store.all().values() if not outdated(each)]
 
     def all(self) -> list[Result]:
-        """All results, the valid ones first."""
+        """Return all stored results; those with unchanged inputs come first."""
         return sorted(self.store.all().values(), key=lambda each: bool(outdated(each)))
 
 
 INPUTS = {"spec_sha256": "specification", "system_sha256": "system", "method_version": "method"}
-"""Inputs of a training that can change while its result is stored, in words."""
+"""Name of an input of a training run that can change while the result is stored -> the input in words."""
 
 
 def outdated(result: Result) -> tuple[str, ...]:
-    """Inputs of a stored training that have changed since; empty if its result is valid."""
+    """Return the inputs of a stored training result that have changed since; empty if there are none."""
     now, then = Cell.of(result).key.values, result["key"]
     return tuple(INPUTS.get(name, name) for name in now if now[name] != then.get(name))
 
 
 def inputs_text(changed: Sequence[str]) -> str:
-    """Cell of a table on the inputs of its row: `current`, or those that have changed since."""
+    """Return the text of a table's column on inputs: `current`, or `outdated` with the changed inputs."""
     return f"outdated: {', '.join(changed)}" if changed else "current"
 
 
@@ -204,13 +215,13 @@ and are shown until they are measured again.
 
 @dataclass(frozen=True, slots=True)
 class Filling:
-    """Outcome of the trainings of a table.
+    """Results of the training runs of a table.
 
     Attributes:
-        results: in the order of the cells.
-        trained: number of new trainings.
-        kept: number of stored results.
-        failed: name and reason of failed trainings.
+        results: stored and new results, in the order of the cells (requested runs).
+        trained: number of new results.
+        kept: number of results that were already stored.
+        failed: name and reason of each run that failed.
     """
 
     results: tuple[Result, ...]
@@ -219,13 +230,21 @@ class Filling:
     failed: tuple[dict[str, str], ...]
 
     def facts(self, valid: int, failed: Sequence[dict[str, str]] = ()) -> dict[str, Any]:
-        """Entries of the JSON document: `valid` results in the store, trainings, and all failures."""
+        """Return entries for the JSON document: counts of results, and all failures.
+
+        Args:
+            valid: number of stored results with unchanged inputs.
+            failed: failures in addition to those of the training runs.
+        """
         counts = {"results": valid, "trained": self.trained, "kept": self.kept}
         return {**counts, "failed": [*self.failed, *failed]}
 
 
 def filled(cells: Sequence[Cell], place: Place) -> Filling:
-    """Results of cells, stored or newly trained; prints progress."""
+    """Return the results of the training runs `cells`; runs without a stored result are trained now.
+
+    Progress is printed.
+    """
     found: dict[str, Result] = {}
     failed: list[dict[str, str]] = []
     kept = 0
@@ -245,7 +264,15 @@ def filled(cells: Sequence[Cell], place: Place) -> Filling:
 
 
 def remaining(cells: Sequence[Cell], done: Sequence[str], jobs: int) -> str:
-    """Estimated remaining time of the other trainings, by their budgets; "" for step counts."""
+    """Return a text with the number of remaining runs and an estimate of their time.
+
+    The text is "" if nothing remains, or if a remaining run has no time budget.
+
+    Args:
+        cells: all training runs.
+        done: names of the runs that have ended.
+        jobs: number of runs at a time.
+    """
     lengths = [cell.length.seconds for cell in cells if cell.name not in done]
     if not lengths or None in lengths:
         return ""
@@ -254,7 +281,11 @@ def remaining(cells: Sequence[Cell], done: Sequence[str], jobs: int) -> str:
 
 
 def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | None, str]]:
-    """Yield (cell, result, "kept" or "") or (cell, None, reason of the failure) when each cell is done."""
+    """Yield a triple for each training run in `cells` when it has ended.
+
+    It is (cell, result, "kept") for a stored result, (cell, result, "") for a new one, and (cell, None,
+    reason) if the run failed.
+    """
     wanted: dict[str, Cell] = {}
     for cell in cells:
         kept = place.store.find(cell.key)
@@ -280,7 +311,10 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
 
 
 def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
-    """A training as a job: a new or resumed `stlc train`, with its input files for another machine."""
+    """Return the job of a training run: the arguments of `stlc train`, and input files for another machine.
+
+    If the interrupted run `run` is given, the job resumes it.
+    """
     runs = place.runs_of(cell.key)
     if run is not None:
         arguments: tuple[str, ...] = ("--resume", str(run.path), "--no-pictures")
@@ -304,7 +338,10 @@ def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
 
 
 def collect(run: RunDir, *, cores: int | None = None) -> Result:
-    """Collect the result of a training from its run."""
+    """Return the result of a finished training run, with its learning curve and its provenance.
+
+    `cores` is the number of cores that the run used, if known.
+    """
     record = run.record()
     held = load_held_out(run.path / "eval" / "held_out.npz")
     solved = [] if held is None else [rho >= -TOLERANCE for rho in held.rho.tolist()]
@@ -321,9 +358,9 @@ def collect(run: RunDir, *, cores: int | None = None) -> Result:
 
 
 def training_accuracy(folder: RunDir) -> float | None:
-    """Training accuracy: share of the training states on which a run's policy satisfies the specification.
+    """Return the share of the training states from which the policy's plan satisfies the specification.
 
-    None if training drew fresh states in every step.
+    The result is None if training drew new states in every step.
     """
     saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
     states = saved.tensors.get("training.states")
@@ -334,7 +371,7 @@ def training_accuracy(folder: RunDir) -> float | None:
 
 
 def _curve(run: RunDir) -> list[dict[str, float | None]]:
-    """Accuracy on fresh states over time, at most `CURVE_POINTS` points."""
+    """Return at most `CURVE_POINTS` points of the learning curve: accuracy on new random states over time."""
     rows = [row for row in run.rows() if row.get("accuracy") is not None]
     every = max(1, -(-len(rows) // CURVE_POINTS))
     kept = rows[::-1][::every][::-1]
@@ -343,10 +380,10 @@ def _curve(run: RunDir) -> list[dict[str, float | None]]:
 
 @dataclass(frozen=True, slots=True)
 class SeedGroup:
-    """Results of the same training with several seeds.
+    """Results of training runs that differ only in the seed.
 
     Attributes:
-        results: sorted by seed.
+        results: results in the order of their seeds.
         outdated: inputs that have changed since; the same for all results.
     """
 
@@ -355,26 +392,26 @@ class SeedGroup:
 
     @property
     def cell(self) -> Cell:
-        """The training with the first seed."""
+        """Description of the training run with the first seed."""
         return Cell.of(self.results[0])
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """The seeds."""
+        """Seeds of the training runs."""
         return tuple(int(each["key"]["seed"]) for each in self.results)
 
     @property
     def accuracies(self) -> tuple[float, ...]:
-        """Accuracy on the held-out states, one per seed."""
+        """Accuracy on the held-out states, one number per seed."""
         return tuple(float(each["accuracy"]) for each in self.results)
 
     def mean(self, name: str) -> float:
-        """Mean over the seeds of a number in the results."""
+        """Return the mean over the seeds of the number that the results store under `name`."""
         return fmean(float(each[name]) for each in self.results)
 
 
 def grouped(results: Iterable[Result]) -> list[SeedGroup]:
-    """Results that differ in nothing but the seed, together; current and outdated results apart."""
+    """Group results that differ only in the seed; current and outdated results form separate groups."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for result in sorted(results, key=lambda each: int(each["key"]["seed"])):
         cell = Cell.of(result)
@@ -384,16 +421,16 @@ def grouped(results: Iterable[Result]) -> list[SeedGroup]:
 
 
 def benchmark_order(name: str) -> tuple[int, str]:
-    """Sort key: the paper's order, then others by name."""
+    """Return the sort key of a benchmark: the paper's benchmarks first, in its order, then others by name."""
     return BENCHMARKS.index(name) if name in BENCHMARKS else len(BENCHMARKS), name
 
 
 def pack(flags: Sequence[bool]) -> str:
-    """Pack truth values into hexadecimal digits, the first one in the highest bit."""
+    """Pack truth values into a text of hexadecimal digits; the first value is the highest bit."""
     bits = "".join("1" if flag else "0" for flag in flags)
     return f"{int(bits or '0', 2):0{-(-len(flags) // 4)}x}"
 
 
 def unpack(digits: str, count: int) -> list[bool]:
-    """The `count` truth values that `pack` wrote."""
+    """Return the `count` truth values that `pack` wrote into `digits`."""
     return [bit == "1" for bit in f"{int(digits or '0', 16):0{count}b}"]

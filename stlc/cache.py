@@ -192,7 +192,7 @@ def why_not() -> str:
 
 
 def opened() -> Cache:
-    """Open the user's cache folder, which is created if missing.
+    """Open the user's cache folder and return it; it is created if missing.
 
     Raises:
         Unusable: the folder cannot be created, or another user could have changed its content.
@@ -205,7 +205,7 @@ _descriptors: dict[Path, int] = {}
 
 
 def private(path: Path) -> Cache:
-    """Open the folder `path` as a cache, to which only the user can write; it is created if missing.
+    """Open the folder `path` as a cache to which only the user can write; it is created if missing.
 
     Raises:
         Unusable: the folder cannot be created, or another user could have changed its content.

@@ -1,8 +1,8 @@
 """Escaping of untrusted text for C, markup, tables, terminals, shells and paths.
 
-Names, comments, units and file names come from untrusted files. Each target has one function here, through
-which every text for that target passes. If the target can represent every character, reading it restores the
-text exactly; if not (a comment, a terminal, a picture), the characters that it cannot represent become
+Names, comments, units and file names come from untrusted files. For each kind of output there is one function
+here, and every text for this output passes through it. If the output can represent every character, reading
+it restores the text exactly. If it cannot (a comment, a terminal, a picture), the other characters become
 visible symbols.
 """
 
@@ -100,7 +100,7 @@ def _ansi(char: str) -> str:
 
 
 def _raw(char: str) -> bool:
-    """True for a character by which Python represents an invalid UTF-8 byte in a file name."""
+    """True for a character that stands for an invalid UTF-8 byte in a file name, as Python represents it."""
     return "\udc80" <= char <= "\udcff"
 
 

@@ -260,10 +260,10 @@ def _shown(path: Path) -> str:
 
 
 def beside(home: Path, name: str) -> Path:
-    """Return the path of the file `name` to which a file in the folder `home` refers.
+    """Return the path of the file `name`, to which a file in the folder `home` refers.
 
-    For `systems/car.yaml` it is `home/systems/car.yaml`. If only `home/car.yaml` exists, it is that file: run
-    folders hold copies of the files without their subfolders.
+    For `systems/car.yaml` it is `home/systems/car.yaml`. If that file does not exist but `home/car.yaml`
+    does, the latter is returned, because run folders hold copies of the files without their subfolders.
     """
     there, here = home / name, home / Path(name).name
     return here if here.is_file() and not there.is_file() else there

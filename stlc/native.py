@@ -46,7 +46,7 @@ FLAGS = ("-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-
 VECTOR_FLAGS = ("-DVECTOR_MATH", *(f"-fno-builtin-{name}" for name in ("sin", "cos", "exp", "log")))
 """Flags for the vector functions of the GNU C library: sine and cosine are not merged into one call."""
 LONG = 80_000
-"""Characters of a C text from which on `-O3` takes too long for its gain."""
+"""Number of characters of C code from which on the option `-O3` takes too much time for what it gains."""
 GRAIN = 16
 """Rows that a kernel evaluates together (SIMD lanes)."""
 SMALL = 512
@@ -72,8 +72,9 @@ class SearchOptions:
     Attributes:
         bounds: three numbers for each control, (3, m). They are its lowest value, its highest value, and 1 if
             the control is a periodic angle, else 0.
-        factors: weight / scale of each requirement, (R,). The search multiplies each robustness by its
-            factor, and maximises the least product.
+        factors: one factor for each requirement, (R,). It is the weight of the requirement (tag `@weight`)
+            divided by its scale (tag `@scale`). The search multiplies each robustness by its factor, and
+            maximises the least product.
         bank: plans that satisfied the specification from other states, (k, T, m). The search may replace the
             last steps of a plan, or all of its steps, by those of a plan in the bank.
         generations: largest number of iterations, in each of which several changes of the best plan are
@@ -297,10 +298,11 @@ class Advance:
 def _share(
     rows: Callable[[int, int], int], batch: int, threads: int, *, grain: int = GRAIN, stop: Stop = never
 ) -> None:
-    """Call `rows(first, last)` for consecutive short ranges of the rows of a batch, on several threads.
+    """Process the rows of a batch in short consecutive ranges, on several threads.
 
-    The work ends early if the process is interrupted, or if `stop` returns True between two calls; the
-    remaining rows are then not processed. The number of rows per call is a multiple of `grain`.
+    For each range, `rows(first, last)` is called; the number of rows is a multiple of `grain`. The work ends
+    early if the process is interrupted, or if `stop` returns True between two calls. The remaining rows are
+    then not processed.
 
     Raises:
         MemoryError: a call returned a value other than 0.

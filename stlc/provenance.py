@@ -34,7 +34,8 @@ def versions() -> dict[str, str]:
 def git_state(folder: Path | None = None) -> dict[str, Any] | None:
     """Return the commit of a git repository, and whether the repository has uncommitted changes.
 
-    The repository is that of `folder`, by default the current folder. The result is None if there is none.
+    The repository is that of `folder`, by default the current folder. The result is None if there is no
+    repository.
     """
     commit = _git(folder, "rev-parse", "HEAD")
     if commit is None:

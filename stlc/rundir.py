@@ -1,8 +1,8 @@
 """Folder of a run, `runs/<spec>/<number>-<words>`, with everything needed to repeat the run.
 
-A run is never overwritten: a new one takes the next number. `runs/latest` and `runs/<spec>/latest` are links
-to the newest. Whole files are written atomically; rows are appended so that a kill loses at most the last
-one.
+A run is never overwritten; a new run takes the next number. `runs/latest` and `runs/<spec>/latest` are links
+to the newest run. Files are written atomically. Files of rows are an exception: rows are appended, so that at
+most the last row is lost if the process is killed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _KINDS: Mapping[str, type] = {
     **dict.fromkeys(("seed", "threads"), int),
     "overrides": dict,
 }
-"""Expected type of each entry of a record, if present."""
+"""Expected type of each entry of a run's record, if the entry is present."""
 
 _NUMBERED = re.compile(r"(\d{4,})-(.+)")
 
@@ -166,7 +166,7 @@ class RunDir:
         return record
 
     def update(self, facts: Mapping[str, object]) -> dict[str, Any]:
-        """Set the entries `facts` in `run.json` (created if missing) and return its whole content."""
+        """Set the entries `facts` in `run.json` (created if missing), and return the file's whole content."""
         before = self.record() if (self.path / RECORD).exists() else {}
         after = {**before, **facts}
         self.write_json(RECORD, after)
@@ -194,7 +194,7 @@ class RunDir:
     def append_row(self, row: Mapping[str, object], name: str = ROWS) -> None:
         """Append `row` to the file of JSON lines `name`, in a single write.
 
-        An incomplete last line, left by a kill, is removed first.
+        First, an incomplete last line is removed; it is left if a process was killed.
         """
         data = (dumps(row) + "\n").encode()
         with reported(f"write `{self.shown}/{name}`"), (self.path / name).open("ab+") as file:

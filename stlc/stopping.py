@@ -18,9 +18,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 PATIENCE = 0.9
-"""Seconds for an interrupted command to unwind."""
+"""Seconds that an interrupted command has to end by itself."""
 LAST = 0.3
-"""Seconds for the clean-up afterwards."""
+"""Seconds for the clean-up after that."""
 CHILD = "STLC_PATIENCE"
 """Environment variable that gives child processes a shorter `PATIENCE` than their parent's."""
 

@@ -1,7 +1,7 @@
 """The system's C compiler: search, version, and execution under resource limits.
 
-A compiler that hangs, or takes too much time or memory, is killed with its child processes. One that hangs is
-not started again by this process, nor for `REMEMBERED` seconds by other processes of the user.
+A compiler that hangs, or takes too much time or memory, is killed with its child processes. A compiler that
+hung is not started again by this process, nor for `REMEMBERED` seconds by other processes of the user.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from stlc.stopping import leaving
 IDLE = 10.0
 """Seconds without processor use after which a program counts as hung."""
 BUSY = 40.0
-"""Limit of processor time of a program, seconds; of wall time where that is unknown."""
+"""Limit of a program's processor time in seconds; if that is unknown, of its elapsed time."""
 MEMORY = 2_000_000_000
-"""Memory limit of a program in bytes, where its use is known."""
+"""Limit of a program's memory in bytes, if its use is known."""
 REMEMBERED = 600.0
 """Seconds for which other processes do not start a hung compiler again."""
 LONG_REMEMBERED = 86_400.0
@@ -48,7 +48,7 @@ class CompilerError(Exception):
 
 
 class TooMuchError(CompilerError):
-    """Error: the compiler exceeds its time or memory limit for a text."""
+    """Error: the compiler exceeds its time or memory limit for a C source."""
 
 
 class HangsError(Exception):
@@ -329,7 +329,7 @@ class _Use:
 
 
 def _use(session: int) -> _Use | None:
-    """Return the resources used by the processes of the POSIX session `session`, ended children included.
+    """Return the resources used by the processes of the POSIX session `session`, including ended children.
 
     The result is None if they are unknown, as on systems without `/proc`.
     """

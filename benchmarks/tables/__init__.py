@@ -1,1 +1,1 @@
-"""Tables, a module each: measurement, options, columns and text."""
+"""Tables of the documentation: each module measures one table and defines its options, columns and text."""

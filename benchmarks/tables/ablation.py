@@ -1,7 +1,8 @@
-"""The paper's ablations of gamma, k, network size and number of samples on traffic, repeated.
+"""The paper's ablations on traffic, repeated: gamma, k, network size and number of training samples.
 
-Every row changes one of a set of defaults: gamma = 0.5, k = 500, a 256x3 network, 50,000 samples. The plain
-gradient method trains on a fixed set of states, as in the paper.
+In every row, one of these numbers differs from its default: gamma = 0.5, k = 500, a network of 3 layers with
+256 neurons, 50,000 samples. As in the paper, the plain gradient method trains on a fixed set of initial
+states.
 """
 
 from __future__ import annotations
@@ -29,14 +30,15 @@ _TRAINING, _OUTPUT = Training(), Output(Path("docs/results.md"))
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A hyperparameter that is varied.
+    """A hyperparameter that the ablation varies.
 
     Attributes:
-        name: for options and files.
-        title: for people.
-        key: of the system file.
-        default: value while another one is varied.
-        table: `VALUE TRAINING VALIDATION, …`: the accuracies that the paper reports.
+        name: name in options and files.
+        title: heading of its table.
+        key: name of the hyperparameter in the system file.
+        default: value while another hyperparameter is varied.
+        table: accuracies that the paper reports, as a text of entries `VALUE TRAINING VALIDATION` with commas
+            between them.
     """
 
     name: str
@@ -47,12 +49,12 @@ class Axis:
 
     @property
     def reported(self) -> dict[str, tuple[float, float]]:
-        """Value -> training and validation accuracy in the paper."""
+        """Accuracies in the paper: value of the hyperparameter -> (training, validation) accuracy."""
         rows = (row.split() for row in self.table.split(","))
         return {value: (float(training), float(validation)) for value, training, validation in rows}
 
     def setting(self, value: str) -> str:
-        """`value` as `--set` takes it."""
+        """Return `value` in the notation of the option `--set`: `256x3` becomes `[256, 256, 256]`."""
         width, _, layers = value.partition("x")
         return "[" + ", ".join([width] * int(layers)) + "]" if layers else value
 
@@ -81,17 +83,17 @@ AXES = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One value of a hyperparameter for one length, over all seeds.
+    """Results for one value of a hyperparameter and one training time, over all seeds.
 
     Attributes:
         axis: name of the hyperparameter.
-        value: of the hyperparameter.
-        length: of a training, such as `60 s`.
-        seeds: number of trainings.
+        value: value of the hyperparameter.
+        length: training time as text, such as `60 s`.
+        seeds: number of training runs.
         training: accuracy on the training states, mean over seeds.
-        accuracies: on the held-out states, one per seed.
-        reported: training and validation accuracy in the paper; None if it has no such row.
-        outdated: inputs that have changed since the trainings.
+        accuracies: accuracy for each seed on held-out states, which are never used in training.
+        reported: training and validation accuracy in the paper; None if the paper has no such row.
+        outdated: inputs that have changed since the training runs.
     """
 
     axis: str
@@ -105,12 +107,12 @@ class Row:
 
     @property
     def accuracy(self) -> float:
-        """Mean over all seeds."""
+        """Mean of the accuracy on held-out states over all seeds."""
         return fmean(self.accuracies)
 
     @property
     def spread(self) -> str:
-        """Mean, and with several seeds minimum and maximum."""
+        """Mean of the accuracy as text; with several seeds, minimum and maximum follow."""
         spread = f" ({min(self.accuracies):.3f} to {max(self.accuracies):.3f})" if self.seeds > 1 else ""
         return f"{self.accuracy:.3f}{spread}"
 
@@ -125,7 +127,13 @@ COLUMNS: Columns[Row] = {
 
 
 def cells_of(axes: Sequence[str], trainings: Sequence[tuple[int, Length]], held_out: int) -> list[Cell]:
-    """The trainings of the tables; a training that several tables show is listed once."""
+    """Return the training runs of the tables; a run that several tables show is listed once.
+
+    Args:
+        axes: names of the hyperparameters to vary.
+        trainings: (seed, length) pairs.
+        held_out: number of held-out states.
+    """
     chosen_axes = [axis for axis in AXES if axis.name in axes]
     varied = [(axis.name, value) for axis in chosen_axes for value in axis.reported if value != axis.default]
     return [
@@ -139,7 +147,7 @@ def cells_of(axes: Sequence[str], trainings: Sequence[tuple[int, Length]], held_
 
 
 def table(results: Sequence[Result], axes: Sequence[str]) -> Table[Any, Row]:
-    """The rows, axis by axis, each with the row of the defaults."""
+    """Return the table of the hyperparameters `axes`: a row for each value, including the default value."""
     groups = grouped(results)
     cells = [
         (axis, value, group)
@@ -161,7 +169,10 @@ def _row(axis: Axis, value: str, group: SeedGroup) -> Row:
 
 
 def section(results: Sequence[Result]) -> list[str]:
-    """The section of the page, without axes for which only the default is known."""
+    """Return the lines of the page's section, one table per hyperparameter.
+
+    A hyperparameter is left out if only its default value was measured.
+    """
     lines = ["## Ablation", "", TEXT.rstrip()]
     for axis in AXES:
         made = table(results, [axis.name])
@@ -176,8 +187,8 @@ def section(results: Sequence[Result]) -> list[str]:
 def ablation(only: OnlyOption = None, training: Training = _TRAINING, output: Output = _OUTPUT) -> None:
     """Repeat the paper's tables for gamma, k, network size and number of samples on traffic.
 
-    60 s if no budget is given. Stored results with the same inputs are reused; interrupted trainings are
-    resumed. Exit code 1 if a training failed.
+    The training time is 60 s if no budget is given. Stored results with the same inputs are reused.
+    Interrupted training runs are resumed. Exit code: 0, or 1 if a training run failed.
     """
     axes = chosen(only, [axis.name for axis in AXES], "table")
     place = training.place("ablation")

@@ -1,4 +1,4 @@
-"""Policies under model mismatch, disturbances and noise, without a guard and with one."""
+"""Trained policies under model mismatch, disturbances and noise, without a guard and with several guards."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ event that no plan accounts for. Results for the starts whose window contains no
 MOST = 0.95
 """Share of safe starts below which unsafe drives are attributed to the world if the model is exact."""
 METRICS = {"safe agents": "saved", "safe starts": "saved_starts", "satisfied": "executed_starts"}
-"""Columns of each guard."""
+"""Columns of the table for each guard: title -> name of the metric."""
 TITLES = {"none": "no guard", "paper": "paper's", "full": "full"}
 _OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
 
 def table(rows: Sequence[Row]) -> Table[Row, Row]:
-    """A row for every policy and scenario, a column for every metric and guard."""
+    """Return the table: one row per policy and scenario, one column per metric and guard."""
     guards = _guards(rows)
     first = [next(group) for _, group in groupby(rows, lambda row: row.spec)]
     columns: Columns[Row] = {
@@ -66,7 +66,7 @@ def table(rows: Sequence[Row]) -> Table[Row, Row]:
 
 
 def _guards(rows: Sequence[Row]) -> list[str]:
-    """All guards, in their order."""
+    """Return the names of all guards in `rows`, in the order of the columns."""
     found = {guard.partition("+") for row in rows for guard in row.guards}
     ordered = sorted(found, key=lambda parts: ([*TITLES].index(parts[0]), parts[2]))
     return ["".join(parts) for parts in ordered]
@@ -82,7 +82,10 @@ def _shown(metric: str, guard: str) -> Callable[[Row], str]:
 
 
 def section(results: Sequence[Result]) -> list[str]:
-    """The section of the page: all deployments, starts without exogenous events, policies and machines."""
+    """Return the lines of the page's section.
+
+    A second table shows results for initial states without exogenous events, if such events make runs unsafe.
+    """
     rows = rows_of(results)
     lost = [row.spec for row in rows if row.scenario == NOMINAL and _lost_to_the_world(row)]
     columns: Columns[Row] = {
@@ -100,7 +103,10 @@ def section(results: Sequence[Result]) -> list[str]:
 
 
 def _lost_to_the_world(row: Row) -> bool:
-    """True if unsafe drives are due to the world: the model is exact, and the full guard is active."""
+    """True if unsafe runs with the full guard are caused by exogenous events, which no plan accounts for.
+
+    This is so if safety is clearly higher for initial states without such events.
+    """
     every, uneventful = row.metric("full", "saved_starts"), row.metric("full", "quiet_safe_starts")
     if every is None or uneventful is None:
         return False
@@ -132,9 +138,9 @@ def disturbed(
     options: DeploymentOptions = _OPTIONS,
     output: Output = _OUTPUT,
 ) -> None:
-    """Deploy policies under model mismatch, disturbances and noise, without a guard and with one.
+    """Simulate policies under model mismatch, disturbances and noise, without a guard and with several.
 
-    Stored deployments are reused if run, world, guard and size are unchanged.
+    Stored simulations are reused if run, world (simulated environment), guard and size are unchanged.
     """
     modes = [name for name in map(str.strip, guards.split(",")) if guard_of(name)]
     laid = tuple(name.strip() for name in scenarios.split(",")) if scenarios else SCENARIOS

@@ -1,7 +1,7 @@
-"""One policy for all values of a parameter, validated at values inside and outside its range.
+"""One policy for all values of a parameter, validated at values inside and outside its training range.
 
-A family is a specification in `specs/families/`: that of a benchmark with one constant made a `param`. A
-policy is trained once, on values drawn from the declared range.
+A family is a specification in `specs/families/`. It equals a benchmark's specification, except that one
+constant is a parameter (`param`). Its policy is trained once, on values drawn from the declared range.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class Family:
     """A specification with one parameter, and the values at which its policy is validated.
 
     Attributes:
-        name: of the specification in `specs/families/`.
-        parameter: its name.
-        unit: of the parameter and of `values`.
+        name: name of the specification in `specs/families/`.
+        parameter: name of the parameter.
+        unit: unit of the parameter and of `values`.
         title: description of the parameter.
-        values: in order, some inside and some outside the training range.
+        values: values in ascending order, some inside and some outside the training range.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Family:
     values: tuple[float, ...]
 
     def sampled(self) -> tuple[float, float]:
-        """The range that training draws from, as the specification declares it."""
+        """Return the (low, high) range from which training draws values, as the specification declares it."""
         (each,) = load(self.name).compiled.parameters
         assert each.column.low is not None
         assert each.column.high is not None
@@ -73,18 +73,18 @@ FAMILIES = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A family at one value of its parameter for one length of training, over all seeds.
+    """Results of a family at one value of its parameter and one training time, over all seeds.
 
     Attributes:
-        family: name.
-        value: of the parameter, in the family's unit.
-        inside: whether the value is in the training range.
-        length: of training, such as `60 s`.
-        seeds: of training.
-        accuracy: mean over seeds.
-        interval: its 95 % Wilson interval, over the states of all seeds.
-        feasible: share of the states with a known satisfying plan, mean over seeds.
-        outdated: inputs that have changed since the trainings.
+        family: name of the specification.
+        value: value of the parameter, in the unit of the family.
+        inside: whether the value lies in the training range.
+        length: training time as text, such as `60 s`.
+        seeds: seeds of the training runs.
+        accuracy: plan accuracy, mean over seeds.
+        interval: 95 % Wilson interval of the accuracy, over the held-out states of all seeds.
+        feasible: share of the states from which a satisfying plan is known, mean over seeds.
+        outdated: inputs that have changed since the training runs.
     """
 
     family: str
@@ -99,7 +99,7 @@ class Row:
 
     @property
     def share(self) -> float | None:
-        """Accuracy over the known feasible states."""
+        """Accuracy divided by `feasible`; None if `feasible` is 0."""
         return self.accuracy / self.feasible if self.feasible else None
 
 
@@ -119,13 +119,25 @@ def _named(name: str) -> Family:
 
 
 def key_of(training: Result, value: float) -> Key:
-    """The key of the verdict on a trained policy at one value: its inputs."""
+    """Return the key under which the validation of a trained policy at one parameter value is stored.
+
+    `training` is the stored result of the training run.
+    """
     values = {"training": training["key"], "trained": training["made"]["date"], "value": value}
     return Key(f"{training['name']} at {value:g}", values)
 
 
 def judge_all(trainings: Sequence[Result], place: Place, verdicts: ResultStore) -> list[dict[str, str]]:
-    """Validate policies at values without a stored verdict; return name and reason of failures."""
+    """Validate trained policies at all values for which no result is stored.
+
+    Args:
+        trainings: stored results of the training runs.
+        place: folder of the training runs.
+        verdicts: file of the validation results.
+
+    Returns:
+        Name and reason of each training run whose policy is no longer available.
+    """
     failed = []
     for training in trainings:
         cell = Cell.of(training)
@@ -144,13 +156,13 @@ def judge_all(trainings: Sequence[Result], place: Place, verdicts: ResultStore) 
 
 
 def _verdict(run: Path, family: Family, value: float, held_out: int) -> Mapping[str, Any]:
-    """Held-out accuracy of a policy at one value of the parameter."""
+    """Return the held-out accuracy of the policy in the folder `run`, for one value of the parameter."""
     opened = Run.open(run, overrides={family.parameter: f"{value}{family.unit}"})
     return score(opened.task, opened.policy, n=held_out).summary()
 
 
 def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]:
-    """The rows, ordered by family, length and value."""
+    """Return the table, with rows ordered by family, training time and value."""
     cells = [
         (family, value, group, found)
         for group in sorted(grouped(trainings), key=lambda group: group.cell.length.text)
@@ -176,7 +188,7 @@ def _row(family: Family, value: float, group: SeedGroup, verdicts: Sequence[Resu
 
 
 def section(trainings: Sequence[Result], made: Table[Any, Row]) -> list[str]:
-    """The section of the page: a table for each family."""
+    """Return the lines of the page's section, which has one table per family."""
     lines = ["## One policy for a family", "", TEXT.rstrip()]
     for family in FAMILIES:
         if own := [row for row in made.rows if row.family == family.name]:
@@ -197,8 +209,8 @@ def section(trainings: Sequence[Result], made: Table[Any, Row]) -> list[str]:
 def family(only: OnlyOption = None, training: Training = _TRAINING, output: Output = _OUTPUT) -> None:
     """Train one policy for all values of a parameter, and validate it inside and outside its range.
 
-    60 s if no budget is given. Stored results and verdicts with the same inputs are reused; interrupted
-    trainings are resumed. Exit code 1 if a training failed.
+    The training time is 60 s if no budget is given. Stored results with the same inputs are reused.
+    Interrupted training runs are resumed. Exit code: 0, or 1 if a training run failed.
     """
     names = chosen(only, [each.name for each in FAMILIES], "family")
     cells = [

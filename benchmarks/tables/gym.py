@@ -1,7 +1,7 @@
-"""Steps a second of the environments of `stlc.gym`.
+"""Speed of the environments of `stlc.gym`: steps per second of processor time on one thread.
 
-Processor time on one thread. Whole episodes of many environments with random actions that are drawn
-beforehand: steps, observations, rewards, judgement, and the next initial states.
+Many environments run whole episodes together: steps, observations, rewards, final verdicts, and the sampling
+of the next initial states. Their random actions are drawn before the measurement.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def gym(
 ) -> None:
     """Time the environments of `stlc.gym`.
 
-    Steps of all environments a second of processor time, on one thread.
+    The table shows steps per second of processor time on one thread, summed over all environments.
     """
     names, counts = chosen(only, BENCHMARKS, "benchmark"), tuple(envs or COUNTS)
     for name in names:
@@ -59,7 +59,7 @@ def gym(
 
 
 def _columns(counts: tuple[int, ...]) -> Columns[EpisodeSpeed]:
-    """A column for each number of environments."""
+    """Return the columns of the table: one for each number of environments."""
     rates = {f"{count:,}": _rate(i) for i, count in enumerate(counts)}
     return {"benchmark": "{benchmark}", **rates}
 

@@ -1,7 +1,8 @@
-"""Latency of a decision for one agent on one thread, without a guard and with each.
+"""Latency of a decision for one agent on one thread, without a guard and with each guard.
 
-States are taken from deployments under the paper's guard: half evenly from all visited states, half from
-states with an intervention, which are rare for a good policy.
+Decisions are timed in states that were visited in closed-loop simulations under the paper's guard. Half of
+these states are chosen evenly from all visited ones. The others are states in which the guard intervened; a
+good policy has few of them.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ _OUTPUT = Output()
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One policy under one guard.
+    """Latency of the decisions of one policy with one guard.
 
     Attributes:
         benchmark: name of the specification.
         run: name of the policy's run.
-        guard: name; `policy` for the policy's plan, rollout and verdict alone.
-        every: times in evenly chosen visited states.
-        acting: times of decisions with an intervention of the guard; None without any.
+        guard: name of the guard; `policy` if only the policy's plan, its rollout and its verdict are timed.
+        every: times of decisions in states that are chosen evenly from all visited states.
+        acting: times of decisions in which the guard intervened; None if there are none.
     """
 
     benchmark: str
@@ -75,10 +76,10 @@ def latency(
     seeds: SeedsOption = "100,101",
     output: Output = _OUTPUT,
 ) -> None:
-    """Time decisions for one agent, without a guard and with each.
+    """Time decisions for one agent, without a guard and with each guard.
 
-    Milliseconds on one thread, in states of deployments. The full guard has its default limit of 100 ms per
-    decision.
+    The table shows milliseconds on one thread, in states of closed-loop simulations. The full guard has its
+    default time limit of 100 ms per decision.
     """
     opened_runs = (Run.open(folder.path) for folder in opened(runs))
     rows = (row for run in opened_runs for row in rows_of(run, samples, parse_seeds(seeds)))
@@ -90,7 +91,13 @@ def latency(
 
 
 def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
-    """The rows: the policy alone, then every guard."""
+    """Yield the rows of a run: first the policy alone, then each guard.
+
+    Args:
+        run: run of the policy.
+        samples: number of states in which decisions are timed.
+        seeds: seeds of the closed-loop simulations from which the states are taken.
+    """
     guards = {mode: Guard(run.task, run.policy, mode, limits=Limits()) for mode in GUARDS}
     recording, even, acted = sampled_states(guards["paper"], seeds, samples)
 
@@ -111,7 +118,11 @@ def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
 def _timed(
     guard: Guard, recording: DeploymentRecording, indices: NDArray[np.int64]
 ) -> list[tuple[float, int]]:
-    """Seconds and source of each decision in the states at (row, step)."""
+    """Return (seconds, source) of a decision in each state of the recording that `indices` selects.
+
+    An index is a pair (row, step). The source is 0 for the policy, and greater than 0 for a stage of the
+    guard.
+    """
 
     def decide(index: NDArray[np.int64]) -> tuple[float, int]:
         row, step = index

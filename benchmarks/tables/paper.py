@@ -1,4 +1,4 @@
-"""The paper's comparison: six benchmarks by every learner and planner, over seeds and budgets."""
+"""The paper's comparison: all training methods and planners on six benchmarks."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def paper(
     comparing: Comparing = _COMPARING,
     output: Output = _OUTPUT,
 ) -> None:
-    """Compare every learner and planner on the six benchmarks of the paper; write tables and figures.
+    """Compare all training methods and planners on the six benchmarks of the paper; write tables and figures.
 
-    Learners are trained for 60 s and 300 s if no budget is given; planners search for 1 ms to 1 s a plan.
-    Stored results with the same inputs are reused, interrupted trainings resumed, and every result is stored
-    at once. Everything takes many hours; the page names the command of each empty cell. Exit code 1 if a
-    measurement failed.
+    If no budget is given, policies are trained for 60 s and 300 s, and planners search for 1 ms to 1 s per
+    plan. Stored results with the same inputs are reused. Interrupted training runs are resumed. Every result
+    is stored as soon as it is measured. The whole comparison takes many hours. In the page, a line with empty
+    entries shows the command that measures them. Exit code: 0, or 1 if a measurement failed.
     """
     comparing.check()
     known, place = roster(), training.place("paper")

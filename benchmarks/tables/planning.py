@@ -1,8 +1,8 @@
-"""Planning problems of other people: found or not, robustness and processor time, beside published figures.
+"""Planning problems from the literature: success, robustness and processor time, beside published figures.
 
-Problems of stlpy and STLCCP are one start each, whose robustness is maximised up to a target. Circles and arm
-are tasks drawn in the manner of TeLoGraF, searched up to the first satisfying plan. Compilation is not
-counted.
+Problems of stlpy and STLCCP have a single initial state. Their robustness is maximised until it reaches a
+target. The problems `circles` and `arm` consist of random tasks, drawn as in TeLoGraF. For these, the search
+ends at the first satisfying plan. The time of the compilation is not counted.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 SEED = 12345
-"""Of the planner; drawn tasks are those of this seed and the following ones."""
+"""Seed of the planner, and of the first random task. The other tasks have the seeds after it."""
 SLOW = {"umax": "0.2 m/s^2"}
-"""Limit of the controls in STLCCP's instances."""
+"""Limit of the controls in the problems of STLCCP."""
 METHODS = ("search", "halving", "schedule", "gradient", "cem", "milp")
 PROOF = 5.0
-"""Processor seconds for a plan of a drawn task, then for the proof that there is none."""
+"""Processor time (s) for a plan of a random task, and then for a proof that no plan exists."""
 MARGIN = 1e-3
-"""Robustness at which the search of a drawn task ends, above the tolerance of a verdict."""
+"""Robustness at which the search for a random task ends. It exceeds the tolerance of verdicts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A problem: a specification with changes, or a system with drawn tasks.
+    """A planning problem: a single specification, or a system with many random tasks.
 
     Attributes:
-        spec: name in `specs/planning`, or of a system for drawn tasks.
-        published: figures of other tools, with their source.
-        steps: horizon, if changed.
+        spec: name of the specification in `specs/planning`, or of the system of random tasks.
+        published: results of other tools, with their source.
+        steps: horizon in steps; None for the horizon in the system file.
         target: robustness at which the search ends.
-        seconds: processor time a start.
-        tasks: number of drawn tasks; 0 for a specification.
+        seconds: processor time per initial state.
+        tasks: number of random tasks; 0 for a single specification.
     """
 
     spec: str
@@ -68,7 +68,7 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Specification and horizon."""
+        """Name of the specification, with the horizon if that is changed."""
         return self.spec + (f", T = {self.steps}" if self.steps else "")
 
 
@@ -108,14 +108,14 @@ DRAWS = {"circles_linear": draw, "circles_dubins": draw, "arm": draw_arm}
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """A method's plans for a problem.
+    """Plans of one method for a problem.
 
     Attributes:
-        found: number of satisfying plans, judged by the published formula.
-        starts: of so many.
-        rho: robustness; the median of several starts.
-        seconds: processor time a start, mean.
-        evaluations: judged plans a start, mean.
+        found: number of satisfying plans; plans are judged by the published formula.
+        starts: number of initial states.
+        rho: robustness of the plan; the median if there are several initial states.
+        seconds: mean processor time per initial state.
+        evaluations: mean number of plans that were evaluated per initial state.
     """
 
     found: int
@@ -127,7 +127,10 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One cell of the table."""
+    """Results of one method for one problem.
+
+    `reason` says why the method cannot solve the problem; it is "" if `solution` is given.
+    """
 
     problem: str
     method: str
@@ -161,7 +164,7 @@ def planning(
     out: ResultsOption = RESULTS,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan for problems of stlpy, STLCCP and TeLoGraF; finished cells are kept, so that a run continues."""
+    """Plan for problems of stlpy, STLCCP and TeLoGraF; finished results are kept, so that a run continues."""
     wanted = None if only is None else {each.strip() for each in only.split(",")}
     store = ResultStore("planning", out)
     cells = [
@@ -177,7 +180,10 @@ def planning(
 
 
 def measured(problem: Problem, method: str, store: ResultStore) -> Row:
-    """The row of a cell: the stored solution, else a new one; a method that refuses the problem says why."""
+    """Return the row of a problem and a method, from the stored result or from a new measurement.
+
+    If the method cannot solve the problem, the row contains the reason.
+    """
     budget, target = problem.seconds, problem.target
     shown = (problem.name, method, budget, target, SEED)
     try:
@@ -201,7 +207,11 @@ def measured(problem: Problem, method: str, store: ResultStore) -> Row:
 
 
 def _impossible(problem: Problem, inputs: Mapping[str, Any], store: ResultStore) -> list[int]:
-    """Seeds of the drawn tasks that `milp` proves to have no plan; none for systems that it refuses."""
+    """Return the seeds of the random tasks for which `milp` proves that no satisfying plan exists.
+
+    The list is empty if `milp` cannot encode the system. `inputs` identifies the tasks and the system in the
+    stored results.
+    """
     key = Key(f"{problem.name}, no plan", {**inputs, "seconds": PROOF})
 
     def proved() -> Mapping[str, Any]:
@@ -245,7 +255,7 @@ def _seeds(problem: Problem) -> range:
 
 
 def _planned(problem: Problem, seed: int, method: str, seconds: float) -> PlanResult:
-    """Plan for the drawn task of a seed; compiling is not counted."""
+    """Plan for the random task of a seed for `seconds`; the time of the compilation is not counted."""
     task, x0 = _task_of(problem, seed)
     idle = torch.zeros(1, STEPS, len(task.system.control_names))
     task.judge(x0.float(), idle, states=False)
@@ -253,7 +263,7 @@ def _planned(problem: Problem, seed: int, method: str, seconds: float) -> PlanRe
 
 
 def _task_of(problem: Problem, seed: int) -> tuple[Task, Tensor]:
-    """The drawn task of a seed, and its initial state (1, n)."""
+    """Return the random task of a seed, and its initial state, (1, n)."""
     import stlc
     from stlc.controller.problem.task import Task
     from stlc.dynamics.model.system import System
@@ -264,7 +274,10 @@ def _task_of(problem: Problem, seed: int) -> tuple[Task, Tensor]:
 
 
 def _drawn(problem: Problem, method: str) -> Solution:
-    """Plans for drawn tasks, judged by the monitor with windows cut at the last sample."""
+    """Plan for all random tasks of a problem and return the results.
+
+    Plans are judged by the monitor. Time windows are cut at the last sample.
+    """
     import stlc
 
     rows = []

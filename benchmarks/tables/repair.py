@@ -1,8 +1,8 @@
-"""Repair of rejected plans: success rate and run time of each method.
+"""Repair of rejected plans: success rate and processor time of each repair method.
 
-Each method runs on the same states of a deployment under the paper's guard, one agent at a time: gradient
-refinement, local search of two lengths, gradient refinement then local search as in plan repair, and the
-whole guard.
+Each method runs in the same states of closed-loop simulations under the paper's guard, one agent at a time.
+The methods are gradient refinement, a short and a long local search, gradient refinement followed by local
+search, and the full guard.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ def repair(
 ) -> None:
     """Count the rejected plans that each repair method repairs, and time it.
 
-    Gradient refinement, local search, both, and the whole guard, on the same states of a deployment.
+    The methods are gradient refinement, local search, both, and the full guard. They run in the same states
+    of closed-loop simulations.
     """
     cells = product(opened(runs), ("", *(scenario or ())))
     rows = (

@@ -1,7 +1,8 @@
-"""Time of the robustness of whole traces, against one pass over memory and against plain torch.
+"""Time to compute the robustness of whole traces, compared with one pass over memory and with plain torch.
 
-A pass is `x.clone()`, and with gradients its backward too, over one signal of the same size. Traces are
-float32 on one thread; robustness is computed at every sample, with windows clipped at the end.
+One pass is `x.clone()` for a signal of the same size; if gradients are computed, the pass includes the
+backward pass of `x.clone()`. Traces are float32, on one thread. The robustness is computed at every sample.
+Time windows are cut at the end of the trace.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ def robustness(
 ) -> None:
     """Time the robustness of whole traces, forward and backward.
 
-    On one thread. `passes` is the time as a multiple of one pass over a signal (clone, and its backward);
-    `plain torch` is how many times longer plain torch takes.
+    All times are on one thread. `passes` is the time divided by that of one pass over a signal (`x.clone()`,
+    with its backward pass). `plain torch` is the time of plain torch divided by ours.
     """
     with one_thread():
         table = timings(samples or SAMPLES, traces or TRACES, seconds)
@@ -56,10 +57,10 @@ def robustness(
 def timings(
     samples: Iterable[int] = SAMPLES, traces: Iterable[int] = TRACES, seconds: float = 0.3
 ) -> Table[Any, Timing]:
-    """All formulas at all sizes, without and with gradients.
+    """Return the table of all formulas and all sizes of traces, without and with gradients.
 
     Args:
-        samples: lengths of traces.
+        samples: numbers of samples per trace.
         traces: numbers of traces.
         seconds: approximate measurement time per row.
     """

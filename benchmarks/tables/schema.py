@@ -1,4 +1,4 @@
-"""`python -m benchmarks schema`: JSON Schema of the tables' documents, derived from the records of rows."""
+"""`python -m benchmarks schema`: JSON Schema of the JSON documents of all tables, derived from their rows."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _dictionary: Any = TypedDict
 
 
 class FailedTraining(TypedDict):
-    """A training that failed, and the reason."""
+    """Name of a measurement that failed, and the reason."""
 
     name: str
     why: str
 
 
 class Facts(TypedDict):
-    """Entries of a result beside its rows; a table has some of them."""
+    """Entries of a table's JSON document other than its rows; each table has some of them."""
 
     page: NotRequired[str]
     results: NotRequired[int]
@@ -69,13 +69,13 @@ ROWS: dict[str, dict[str, type]] = {
 def schema() -> None:
     """Print the JSON Schema of the documents that tables print with --json.
 
-    Within a major version keys are only added.
+    Within a major version, keys are only added.
     """
     emit(json.dumps(document_schema(), indent=2))
 
 
 def document_schema() -> dict[str, Any]:
-    """The schema of a whole document: the common frame, and the result of one table."""
+    """Return the schema of a whole document: keys that all commands share, and the result of one table."""
     results = [_result(name, rows) for name, rows in ROWS.items()]
     frame = schema_of(DocumentRecord)
     frame["properties"] |= {"schema": {"const": NAME}, "result": schema_of(reduce(or_, [*results, None]))}
@@ -89,7 +89,10 @@ def _result(name: str, rows: Mapping[str, type]) -> Any:
 
 
 def document_type(kind: Any) -> Any:
-    """The type of the JSON form of a value; a record becomes a dictionary of its fields and properties."""
+    """Return the type of the JSON form of values of the type `kind`.
+
+    A dataclass becomes a dictionary of its fields and properties.
+    """
     origin, args = get_origin(kind), get_args(kind)
     if is_dataclass(kind):
         hints = get_type_hints(kind)

@@ -1,8 +1,8 @@
 """Time of the parts of a training step, and of rollouts with verdicts and gradients.
 
-Processor time on one thread. The parts of a step are repeated in turn on a warmed-up trainer: forward and
-backward through the network, the verdict on all of its plans, rollout and robustness of the chosen ones with
-their gradient, the optimiser.
+All times are processor times on one thread. After some training steps, the parts of a step are repeated in
+turn: the forward and backward pass of the network, the verdict on all of its plans, rollout and robustness of
+the chosen plans with gradients, and the optimiser.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from benchmarks.timing import one_thread
 from stlc.cli.framework.program import command
 
 WARM = 120
-"""Steps before the measurement, so that the search has found plans to learn from."""
+"""Number of training steps before the measurement, so that the search has found plans to learn from."""
 TEXT = """## A training step
 
 Written by `python -m benchmarks step`. Milliseconds of processor time on one thread, after {warm} steps;
@@ -59,7 +59,8 @@ def step(
 ) -> None:
     """Time the parts of a training step, and rollouts with verdicts and gradients.
 
-    Milliseconds of processor time on one thread; the concurrent search runs on another core.
+    The table shows milliseconds of processor time on one thread. The search that accompanies the training
+    runs on another core.
     """
     names = chosen(only, BENCHMARKS, "benchmark")
     steps = Table(

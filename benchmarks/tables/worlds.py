@@ -1,4 +1,4 @@
-"""Policies in the worlds of their systems, without a guard and with each."""
+"""Trained policies in the worlds (simulated environments) of their systems, without and with guards."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _named(line: Line) -> str:
 
 
 def _progress(line: Line) -> str:
-    """Metrics reported by the world, only means: `mean speed 4.28, junctions passed 76`."""
+    """Return the means of the world's metrics as text: `mean speed 4.28, junctions passed 76`."""
     told = line[0].guards[line[1]]["progress"].items()
     return ", ".join(f"{name.replace('_', ' ')} {float(metric['mean']):.3g}" for name, metric in told)
 
@@ -70,13 +70,19 @@ COLUMNS: Columns[Line] = {
 
 
 def table(rows: Sequence[Row]) -> Table[Line, Line]:
-    """A line for every guard; the first one names the deployment and its seeds x agents x steps."""
+    """Return the table: one line per simulation and guard.
+
+    The first line of a simulation names it, with its size (seeds x agents x steps).
+    """
     lines = [(row, guard) for row in rows for guard in row.guards]
     return listed("worlds", lines, COLUMNS)
 
 
 def section(results: Sequence[Result]) -> list[str]:
-    """The section of the page: all deployments, seeds without lost starts, policies and machines."""
+    """Return the lines of the section: the table, results for seeds without lost agents, and provenance.
+
+    An agent is lost if no safe plan is known from its start.
+    """
     rows = rows_of(results)
     told = [line for row in rows for line in wholly_viable(row)]
     made = provenance(results, "deployments (seeds x agents x steps)")
@@ -84,7 +90,10 @@ def section(results: Sequence[Result]) -> list[str]:
 
 
 def wholly_viable(row: Row) -> Iterator[str]:
-    """Metrics over the seeds in which every start is viable, if there are others."""
+    """Yield lines with metrics for the seeds in which a safe plan is known from the start of every agent.
+
+    No line is yielded if this holds for all seeds, or for none.
+    """
     first = next(iter(row.guards.values()))["metrics"].get("savable") or {"values": ()}
     whole = [index for index, share in enumerate(first["values"]) if share == 1.0]
     if not whole or len(whole) == len(first["values"]):
@@ -117,10 +126,10 @@ def worlds(
     options: DeploymentOptions = _OPTIONS,
     output: Output = _OUTPUT,
 ) -> None:
-    """Deploy policies in their worlds, without a guard and with each, and write the table.
+    """Simulate policies in their worlds, without a guard and with each guard, and write the table.
 
-    Stored deployments with the same policy, system and setting are reused. Scenarios with a world of their
-    own are simulated, too.
+    A world is the simulated environment of a system. Stored simulations with the same policy, system and
+    settings are reused. Scenarios with a world of their own are simulated, too.
     """
     modes = [mode for mode in GUARDS if mode in chosen(guards, GUARDS, "guard")]
     deployments = Deployments(ResultStore("worlds", options.out), options, ceiling)

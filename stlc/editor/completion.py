@@ -115,7 +115,9 @@ def _piece_start(text: str) -> int:
 
 
 def _units_at(piece: str, text: str) -> str | None:
-    """Return the part of a unit typed before the cursor inside `[…]`; None if the cursor is not in a unit.
+    """Return the part of a unit that is typed before the cursor inside `[…]`.
+
+    None is returned if the cursor is not in a unit.
 
     Args:
         piece: text of the declaration up to the word under the cursor.

@@ -257,7 +257,8 @@ def _time(op: str, interval: typed.Interval, window: Window | None, grid: Grid) 
 def _seconds(time: typed.Time, grid: Grid) -> str:
     """Return an end of an interval as text in seconds, such as `2.5 s`.
 
-    The result is "" if the time step is unknown, or if the end contains the horizon and that is unknown.
+    The result is "" if the time step is unknown. It is also "" if the end refers to the horizon, and the
+    horizon is unknown.
     """
     if grid.dt is None or (time.horizons and grid.horizon is None):
         return ""

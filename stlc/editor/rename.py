@@ -80,7 +80,7 @@ def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:
 
 
 def _refuse_capture(document: Document, edits: Sequence[Edit], name: str) -> None:
-    """Raise RenameError if, after the edits, some name refers to another declaration than before.
+    """Raise RenameError if the edits would change the declaration to which some name refers.
 
     `edits` give a symbol the new name `name`.
     """

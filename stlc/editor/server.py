@@ -30,7 +30,8 @@ class Layout:
     """Conversion between offsets in a text and positions (line, column) of the language server protocol.
 
     A position beyond the end of a line or of the text is converted to that end. Lines end at CR, LF or CRLF,
-    as the protocol says; the library pygls also ends them at Unicode separators.
+    as the protocol says. The library pygls cannot be used for this, because its lines also end at Unicode
+    separators.
     """
 
     def __init__(self, text: str, codec: PositionCodec) -> None:
@@ -173,7 +174,7 @@ def _completion(server: Server, params: lsp.CompletionParams) -> lsp.CompletionL
 
 
 def _item(offer: Offer, place: lsp.Range) -> lsp.CompletionItem:
-    """Convert a proposal to an LSP completion item that replaces the partial word at `place`."""
+    """Convert the proposal `offer` to an LSP completion item that replaces the partial word at `place`."""
     return lsp.CompletionItem(
         label=offer.text,
         kind=lsp.CompletionItemKind[offer.kind],
@@ -213,7 +214,7 @@ _SYMBOL_KINDS: dict[Kind, lsp.SymbolKind] = {
     "require": lsp.SymbolKind.Event,
     "assume": lsp.SymbolKind.Event,
 }
-"""Kinds of declarations in an outline; all others are variables."""
+"""Kinds of declarations in an outline; a kind that is not listed is shown as a variable."""
 
 
 def _symbols(server: Server, params: lsp.DocumentSymbolParams) -> list[lsp.DocumentSymbol]:

@@ -85,7 +85,7 @@ class SymbolNames:
         return max(touching, key=lambda one: one.span.start, default=None)
 
     def of(self, symbol: Symbol) -> tuple[Occurrence, ...]:
-        """Return all occurrences of a symbol."""
+        """Return all occurrences of the symbol `symbol` in the text."""
         return tuple(one for one in self.occurrences if one.symbol == symbol)
 
 

@@ -112,7 +112,7 @@ def _pragmas() -> list[dict[str, Any]]:
 
 
 def _numbers() -> dict[str, Any]:
-    """Pattern for a number with its unit; `%` before an operand is not a unit but the modulo operator."""
+    """Pattern for a number with its unit; a `%` before an operand is the modulo operator, not a unit."""
     number = r"(?:\d[\d_]*\.(?!\.)\d*|\.\d+|\d[\d_]*)(?:[eE][+-]?\d+)?"
     percent = rf"%(?!\s*(?!{PATTERNS['AFTER_PERCENT']}\b)[\w(.`])"
     return _captures(

@@ -142,7 +142,7 @@ def lint(
 
     Args:
         source: the text.
-        within: system and purpose; None skips the checks that need a system.
+        within: system and purpose; with None, checks that need a system are skipped.
         selection: choice of the warnings to report.
     """
     try:

@@ -94,9 +94,9 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
 
 
 def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """True if a word or number follows the sign `item` without a blank.
+    """True if a word or number follows the sign `item` without a space.
 
-    Replacing the sign by a word would then join the two: `!p` would become `notp`.
+    If a word then replaced the sign, the two would become one word: `!p` would become `notp`.
     """
     return following.start == item.end and following.kind in ("word", "number")
 

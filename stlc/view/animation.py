@@ -32,7 +32,7 @@ MAX_BYTES = 4_000_000
 LONGEST = 16.0
 """Maximum duration of an animation in seconds; longer recordings are sped up."""
 DPI, FINE = 100, 2
-"""Dots per inch of a GIF, and how many times as many a video and a still have."""
+"""Dots per inch of a GIF; factor by which videos and still pictures have more."""
 QUALITY = 86
 """WebP quality of a still."""
 
@@ -120,7 +120,7 @@ def dark_colors(all_: Sequence[VectorAnimation], dark: Mapping[str, str]) -> Map
 
 
 def clear_artists(axes: Axes) -> None:
-    """Remove all artists from `axes`; much faster than clearing the axes."""
+    """Remove all artists (drawn objects) from `axes`; this is much faster than clearing the axes."""
     for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.texts, *axes.images):
         artist.remove()
     axes.dataLim.set_points(np.array([[np.inf, np.inf], [-np.inf, -np.inf]]))
@@ -146,7 +146,8 @@ def save_animation(
         animation: the animation.
         gif: path of the GIF, whose width is reduced if the file would exceed `max_bytes`.
         mp4: path of the video; None for none.
-        max_frames: maximum number of frames. If there are more instants, some are left out evenly.
+        max_frames: maximum number of frames. If there are more instants, only every second, third, … instant
+            is shown.
         max_bytes: maximum size of the GIF.
 
     Raises:
@@ -208,7 +209,7 @@ def frames_in(animation: Animation, indices: range, dpi: int) -> Iterator[Image]
 
 COLOURS = 96
 SAMPLED = 8
-"""Number of frames from which the palette is computed, the first and last included."""
+"""Number of frames from which the palette is computed, including the first and the last one."""
 NARROWEST = 160  # pixels
 
 

@@ -29,11 +29,11 @@ Rgba: TypeAlias = tuple[float, float, float, float]
 
 ADVICE = "pip install 'stlc[panda]'"
 SIZE = 1216
-"""Pixels across a picture."""
+"""Width of a picture in pixels."""
 PITCH = 1.32
-"""Distance between bases, in reaches of the arm."""
+"""Distance between the bases of robots, as a multiple of the arm's reach."""
 CLEAR = 0.6
-"""Opacity of a ball in front of something."""
+"""Opacity of the balls in a picture."""
 _AWAY, _TILT, _FIELD = 9.0, -16.0, 0.86  # camera: distance (reaches), tilt (degrees), half height (reaches)
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 
@@ -275,7 +275,8 @@ _UNIT_MASS = {"ixx": "1", "iyy": "1", "izz": "1", "ixy": "0", "ixz": "0", "iyz":
 def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
     """Return the path of a robot description with visual geometry.
 
-    If `urdf` has visual geometry, this is `urdf` itself, else a copy to which it is added.
+    If the file `urdf` has visual geometry, its path is returned. Otherwise, a copy with added geometry is
+    written, and the path of the copy is returned.
 
     Args:
         urdf: path of the robot description (URDF); it may contain the kinematics only.

@@ -74,9 +74,10 @@ def _setting(simulation: Record) -> str:
 
 
 def _model_gap(guards: Mapping[str, Record]) -> Html | None:
-    """Paragraph that compares the world with the model; None if they agree, or if this is unknown.
+    """Paragraph on how often the world (simulated environment) behaved as the model predicts.
 
-    It gives the share of the instants from which the world behaved as the model predicts, over a whole plan.
+    It gives the share of instants from which this was so for the length of a whole plan. The result is None
+    if it was always so, or if this was not recorded.
     """
     consistent = _mean(list(guards.values())[-1].get("metrics") or {}, "foreseen")
     if consistent is None or consistent >= 1.0:

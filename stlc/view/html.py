@@ -53,7 +53,7 @@ def _written(child: Child) -> str:
 
 
 def classed(name: str, kind: str, *children: Child) -> Html:
-    """HTML element `name` of CSS class `kind`."""
+    """Return the HTML element `name` with the CSS class `kind` and the children `children`."""
     return el(name, *children, attrs={"class": kind})
 
 
@@ -69,7 +69,7 @@ def table(
     numeric: Sequence[int] = (),
     kind: str = "plain",
 ) -> Html:
-    """HTML table of CSS class `kind`; the columns with indices `numeric` are right-aligned."""
+    """HTML table with the CSS class `kind`; the columns with indices `numeric` are right-aligned."""
 
     def row(cell: str, cells: Sequence[Child]) -> Html:
         attrs = [{"class": "num"} if index in numeric else None for index in range(len(cells))]

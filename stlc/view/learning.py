@@ -25,7 +25,7 @@ from stlc.view.words import seconds as duration
 Level: TypeAlias = Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
 
 UNDERTRAINED, TRAINED = 0.5, 0.95
-"""Shares of the known feasible starts: below the first undertrained, from the second on trained."""
+"""Shares of feasible starts that the policy solves: undertrained below the first, trained from the second."""
 MUCH_INFEASIBLE = 0.5
 """Share of starts without a known plan from which on infeasibility is reported first."""
 LEAST_ROUNDS = 5
@@ -33,9 +33,9 @@ LEAST_ROUNDS = 5
 FLAT = 0.1
 """Growth of the log-odds per doubling of the steps below which a learning curve is flat."""
 MOST_TIMES = 32.0
-"""Multiple of the steps up to which the curve is extrapolated."""
+"""Largest factor by which the number of steps is extrapolated."""
 ROUND_TIMES = (10.0, 20.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 900.0, 1200.0, 1800.0, 3600.0)
-"""Budgets to propose, in seconds; multiples of an hour beyond."""
+"""Budgets to propose, in seconds; larger ones are multiples of an hour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,7 +346,10 @@ def _rough(seconds: float) -> float:
 
 
 def budget_text(seconds: float) -> str:
-    """Return the smallest of the usual budgets that is at least about `seconds`: `60s`, `5min`, `2h`."""
+    """Return a usual training budget for `seconds`, such as `60s`, `5min` or `2h`.
+
+    It is the smallest of the usual budgets that is not clearly less than `seconds`.
+    """
     fitting = [time for time in ROUND_TIMES if time >= 0.95 * seconds]
     time = fitting[0] if fitting else 3600.0 * math.ceil(0.95 * seconds / 3600.0)
     if time < 120.0:

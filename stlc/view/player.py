@@ -30,7 +30,7 @@ from stlc.view.words import count, labelled
 
 SCRIPT = "player.js"
 MOST_FRAMES = 160
-"""Maximum number of frames of the page's animation; others are subsampled evenly."""
+"""Maximum number of frames of the page's animation; of more frames, an even selection is shown."""
 MOST_ROWS = 60
 """Maximum number of listed events per requirement."""
 _WIDE, _HIGH = 1000, 40  # of a track

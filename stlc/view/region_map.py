@@ -91,7 +91,7 @@ class RegionMap:
         return region.depth(self.trace) >= 0.0
 
     def first(self, most: int) -> NDArray[np.int64]:
-        """Indices of the first `most` traces to draw; traces with violations come first."""
+        """Return the indices of the traces to draw, at most `most`; traces with violations come first."""
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
@@ -384,7 +384,7 @@ class MapRegion:
         return np.asarray(np.any([(low <= seconds) & (seconds <= high) for low, high in windows], axis=0))
 
     def depth(self, points: Trace) -> NDArray[np.float64]:
-        """Signed distance of points to the region's border, positive inside: (traces, samples)."""
+        """Signed distance of `points` to the region's border, positive inside: (traces, samples)."""
         (margin,) = self.monitor.requirement_robustness(points).values()
         return np.atleast_2d(margin)
 
@@ -505,10 +505,9 @@ def _membership(spec: ast.Spec, node: ast.Member, trace: Trace) -> Monitor | Non
 
 
 def _uses(rule: CompiledRequirement, trace: Trace) -> Iterator[tuple[typed.Predicate, Use]]:
-    """Yield every predicate of a requirement with its `Use`.
+    """Yield every predicate of a requirement with a `Use` that describes its place in the requirement.
 
-    The `Use` tells whether the predicate is under a negation, and to which times the requirement refers
-    there.
+    The `Use` tells whether the predicate is under a negation, and to which times it applies.
     """
     stack: list[tuple[typed.Formula, Use]] = [(rule.typed.formula, Use(rule.name, negative=False))]
     while stack:
@@ -535,10 +534,10 @@ def _turned(use: Use) -> Use:
 
 
 def _within(interval: typed.Interval, use: Use, rule: CompiledRequirement, trace: Trace) -> Use:
-    """Return a copy of `use` for the inside of a temporal operator with the interval `interval`.
+    """Return a copy of `use` for the part inside a temporal operator with the interval `interval`.
 
-    Its time window is restricted to that of the operator. If the operator is evaluated at many instants, its
-    window has no fixed place in time, and `use` is returned unchanged.
+    The time window of the copy is that of the operator, relative to the window of `use`. If the operator is
+    evaluated at many instants, its window has no fixed place in time. Then `use` is returned unchanged.
     """
     slides = rule.windowed or (rule.absolute and use.window is None)
     low, high = _seconds(interval.lo, trace), _seconds(interval.hi, trace)
@@ -572,7 +571,10 @@ def _point(node: ast.Member) -> ast.Expr:
 
 
 def _texts(node: ast.Member) -> tuple[str, str]:
-    """Return a key for the region in the predicate `point in region`: (text of point, text of region)."""
+    """Return (text of the point, text of the region) of the predicate `point in region`.
+
+    The two texts together identify a region of the map.
+    """
     point, region = (" ".join(part.span.text.split()) for part in (_point(node), node.region))
     return point, region
 

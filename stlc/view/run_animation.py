@@ -84,7 +84,8 @@ def animate(
 
     Args:
         run: a run with a closed-loop simulation.
-        max_frames: maximum number of frames. If there are more instants, some are left out evenly.
+        max_frames: maximum number of frames. If there are more instants, only every second, third, … instant
+            is shown.
         max_bytes: maximum size of the GIF; the picture is made smaller to meet it.
 
     Returns:
@@ -218,7 +219,7 @@ class RunPanel:
     """One closed-loop run as shown on a page.
 
     Attributes:
-        title: with or without the guard; empty if there is only one run.
+        title: words that say whether the run has a guard; "" if there is only one run.
         alt: description in words.
         frames: number of instants.
         dt: seconds between frames.

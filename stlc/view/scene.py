@@ -27,7 +27,7 @@ Scene = Mapping[str, NDArray[Any]]
 DrawScene = Callable[[Any, Scene, int], None]
 
 WIDTH, TALLEST = 7.6, 4.4
-"""Width of a picture, and maximum height of a scene with its strip below (else beside), in inches."""
+"""Width of a picture in inches; greatest height of a scene whose charts are below it instead of beside it."""
 _HEAD, _KEYS, _EDGE = 0.36, 0.24, 0.12
 _ROW, _GAP, _FOOT = 0.27, 0.07, 0.42
 _NAMES, _VALUES = 1.15, 0.62

@@ -54,7 +54,7 @@ MOST_LINES = 10
 MOST_LETTERS = 44
 """Maximum number of characters of a title in one line."""
 MOST_ROWS = 7
-"""Maximum number of requirements in a strip chart, least margins first."""
+"""Maximum number of requirements in the strip charts; those with the least margins are shown."""
 MOST_PANELS, MOST_AGENTS = 6, 40
 """Maximum numbers of signals and agents in the animation of a trace."""
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
@@ -423,7 +423,7 @@ def _titled(axes: Axes, name: str) -> Text:
 def _cover_future(axes: Axes, times: Floats) -> FrameUpdate:
     """Cover the times after the present frame, and draw a line at the present time.
 
-    Returns the update of both to another frame.
+    Returns an object that moves the cover and the line to another frame.
     """
     from matplotlib.patches import Rectangle
 

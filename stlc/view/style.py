@@ -131,7 +131,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def narrow_gaps(figure: Figure) -> None:
-    """Reduce the gaps between panels, for many small ones."""
+    """Reduce the gaps between the panels of a figure with many small panels."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     engine = figure.get_layout_engine()
@@ -140,7 +140,7 @@ def narrow_gaps(figure: Figure) -> None:
 
 
 def hide_frame(axes: Axes) -> None:
-    """Remove frame, ticks and grid; shared axes keep their ticks."""
+    """Remove the frame, the grid and the labels of the ticks."""
     axes.grid(visible=False)
     axes.tick_params(labelbottom=False, labelleft=False)
     for spine in axes.spines.values():

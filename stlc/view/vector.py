@@ -22,10 +22,10 @@ from stlc.view.animation import Animation, Command, VectorAnimation, clear_artis
 from stlc.view.style import new_figure, picture_style
 
 FINE = 4
-"""Coordinate steps per dot."""
+"""Steps of the integer coordinates per dot."""
 DPI = 100
 PICTURE = 720
-"""Maximum width of an embedded image in dots, and its WebP quality."""
+"""Maximum width of an embedded image in dots."""
 QUALITY = 60
 _LETTERS = {Outline.MOVETO: "m", Outline.LINETO: "l", Outline.CURVE3: "q", Outline.CURVE4: "c"}
 

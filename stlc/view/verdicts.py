@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ENOUGH = 0.4
-"""Minimum share of model-consistent instants for which only their margins are shown."""
+"""Margins are shown only where the world agrees with the model if at least this share of them remains."""
 CONSISTENT_ONLY = "least margin from each instant on, of the agents for which the world did as the model says"
 MOST = 240
 """Maximum number of events per requirement."""
@@ -105,8 +105,8 @@ class SceneVerdicts:
         verdict: verdict of that monitor.
         executed: verdict by the separate specification for closed-loop runs. It is `verdict` if the trace
             stores no such specification.
-        consistent: whether the world behaves as the model from a sample on, (agents, samples); None if not
-            recorded.
+        consistent: whether the world (simulated environment) behaves as the model predicts, for the length of
+            a plan after each sample: (agents, samples). None if not recorded.
     """
 
     trace: Trace
@@ -144,8 +144,8 @@ def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
     """Strip charts of the agents' margins, and of the sources of decisions.
 
-    The margins are shown only where the world behaves as the model. If too few of these are known, all
-    margins are shown.
+    Margins are shown only at samples from which the world (simulated environment) behaves as the model
+    predicts. If too few margins would be shown, all are shown.
 
     Args:
         judged: verdicts on the agents.
@@ -162,10 +162,11 @@ def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Stri
 
 
 def model_consistent(trace: Trace, agents: int) -> Mask | None:
-    """Return for each agent and sample whether the world behaves as the model predicts.
+    """Return for each agent and sample whether the world behaves as the model predicts: (agents, samples).
 
-    The array is (agents, samples). It is True at a sample if this is so for the length of a plan from there
-    on. None is returned if the trace does not record where the world deviates from the model.
+    The world is the simulated environment. A sample is True if the prediction is right for the length of a
+    plan after this sample. None is returned if the trace does not record where the world deviates from the
+    model.
     """
     steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
     if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):

@@ -58,11 +58,11 @@ def seconds(value: float | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class GuardWords:
-    """Names of a guard in texts.
+    """Words that name a guard in texts.
 
     Attributes:
-        title: heading of its column in a table.
-        option: option of `stlc simulate` that selects it; "" for no guard.
+        title: heading of the guard's column in a table.
+        option: option of `stlc simulate` that selects the guard; "" for no guard.
     """
 
     title: str

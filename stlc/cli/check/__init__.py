@@ -1,1 +1,1 @@
-"""`stlc check` and `stlc explain` of traces."""
+"""The work of `stlc check`, and of `stlc explain` for a trace: read, judge and explain traces."""

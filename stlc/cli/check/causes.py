@@ -73,8 +73,8 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
 def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
     """Yield (depth, node) for every node of a tree of causes, parents before their children.
 
-    Of several children, the one that decides the value of the parent comes first. There is no recursion, so
-    no formula exhausts the stack.
+    Of several children, the one that decides the value of the parent comes first. The function does not
+    recurse. So a deeply nested formula cannot overflow the stack.
     """
     stack = [(0, tree)]
     while stack:

@@ -36,7 +36,7 @@ def document(outcomes: Sequence[Outcome]) -> documents.CheckResult:
 
 
 def result_record(result: Checked, end: str) -> documents.CheckedTrace:
-    """JSON record of a judged trace.
+    """JSON record of the judged trace `result`, whose samples were all in memory.
 
     `end` is the value of the option `--end`: the treatment of traces that are too short.
     """
@@ -69,7 +69,7 @@ def trace_record(
     time: Callable[[int], float],
     **found: object,
 ) -> documents.CheckedTrace:
-    """JSON record of a judged trace.
+    """JSON record of a judged trace, made of the given parts.
 
     Args:
         name: name of the trace.
@@ -146,7 +146,8 @@ def _least(values: NDArray[np.float64]) -> float | None:
 def _mean(values: NDArray[np.float64]) -> float | None:
     """Return the mean of `values`; None if there are none.
 
-    The values are divided by their number before they are added, because their sum may overflow.
+    The sum of the values could overflow. So each value is divided by the number of values before they are
+    added.
     """
     with np.errstate(invalid="ignore"):  # +inf and -inf have no mean
         return float((values / values.size).sum()) if values.size else None

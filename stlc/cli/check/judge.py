@@ -33,17 +33,17 @@ class Question:
     """Options on how traces are read and judged, the same for all traces of a command.
 
     Attributes:
-        spec: path of a specification; None: the one stored in the trace.
+        spec: path of the specification; None for the specification stored in the trace.
         system: name of a system file.
         names: name of a signal in the specification -> its name in the trace.
-        require: names of the judged requirements; all if empty.
-        at: instant at which requirements are evaluated, as text: a sample, a time, or `all`. With None it is
-            the first sample. Requirements that hold for every planning window (the steps of one plan) are
-            then evaluated at each sample that has a full window after it.
+        require: names of the requirements to judge; all requirements if empty.
+        at: instant at which requirements are evaluated, as text. It is a sample, a time, or `all`. None means
+            the first sample. If a requirement must hold for every planning window (the steps of one plan),
+            None means each sample that has a full window after it.
         end: treatment of traces that are too short: "open" (report bounds), "strict" (an error) or "truncate"
             (end time windows at the last sample).
         tolerance: a requirement is satisfied if its robustness is at least `-tolerance`.
-        resample: new time step in seconds, to which traces are resampled; None: no resampling.
+        resample: new time step in seconds, to which traces are resampled; None for no resampling.
         overrides: name of a constant -> its new value, as text.
         semantics: name of the semantics of the reported robustness, such as "exact".
         dt: seconds between samples of a trace without times.
@@ -75,7 +75,7 @@ class Work:
         out: file to which the robustness signals are written.
         chunk: samples per chunk; 0: the file is read as a whole if it fits into memory.
         color: whether the text of the result has colour codes.
-        mode: value of `--color`, which the worker process adopts.
+        mode: value of `--color`; the worker process uses the same value.
     """
 
     name: str
@@ -133,12 +133,15 @@ def judge(name: str, question: Question, runs: Path) -> Checked:
 
 
 def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
-    """Remark that names the judged trace if it was found in the folder of the newest run, else ()."""
+    """Return a remark that names the file `path`, if it was found in the newest run; else an empty tuple.
+
+    `name` is the name that the user gave.
+    """
     return () if path == Path(name) else (f"taking {path}, of the newest run",)
 
 
 def _options(question: Question) -> tuple[str, ...]:
-    """The command-line options that read and judge a trace again as `question` says, as a list of words."""
+    """Return the command-line options that are equivalent to `question`, as a list of words."""
     words = [] if question.spec is None else [operand(str(question.spec))]
     words += [] if question.system is None else ["--system", question.system]
     for option, pairs in (("--map", question.names), ("--set", question.overrides)):
@@ -251,7 +254,7 @@ def time_step(option: str, text: str | None) -> float | None:
     """Parse the value of `option` as a time step and return it in seconds; None is returned unchanged.
 
     Raises:
-        UsageError: U101, the text is not a time with a unit, or not above 0.
+        UsageError: U101, the text is not a time with a unit, or the time is not positive.
     """
     if text is None:
         return None

@@ -47,7 +47,7 @@ def _end_all(_code: int = 0) -> None:
 
 
 def safe_outcome(work: Work) -> Outcome:
-    """Judge one file; errors are not raised, but stored in the outcome."""
+    """Judge one file and return its outcome; errors are not raised, but stored in the outcome."""
     try:
         return outcome_of(work)
     except StlcError as error:
@@ -56,7 +56,7 @@ def safe_outcome(work: Work) -> Outcome:
 
 
 def outcome_of(work: Work) -> Outcome:
-    """Judge one file. Raises StlcError if that fails."""
+    """Judge one file and return its outcome. Raises StlcError if that fails."""
     from stlc.cli.check.document import result_record
     from stlc.cli.check.text import result_text, rows_of
 

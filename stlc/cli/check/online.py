@@ -2,7 +2,7 @@
 
 The standard input is a `.csv` with a header, or has one JSON object per line. The time step is the value of
 `--dt`. Without that option it is the difference of the first two values of `t`; without times, it is the time
-step of the system. With `--resample`, samples at any times are resampled to a uniform grid.
+step of the system. With `--resample`, samples may be irregular in time; they are resampled to a uniform grid.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _outcome(
         dt: time step in seconds.
         color: whether the text of the outcome has colour codes.
         remarks: messages for the user, copied to the outcome.
-        begun: time at which the monitoring began, in seconds.
+        begun: value of `time.perf_counter()` when the monitoring began.
 
     Raises:
         TraceError: E306, the trace is too short and `--end strict` was given; E605, there is no sample.
@@ -244,7 +244,7 @@ def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online)
     """Return `sample` with its values converted to the units that the specification declares.
 
     `changes` maps the name of a signal to the function that converts its values. If the sample has no time,
-    the time is computed from the number of samples before it and the time step.
+    its time is added. This time follows from the time step and the number of samples before it.
     """
     converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
     return {CLOCK: online.time(online.samples), **sample, **converted}

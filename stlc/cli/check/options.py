@@ -21,7 +21,7 @@ from stlc.cli.framework.options import (
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """Command-line options for reading and judging traces."""
+    """Command-line options that say how traces are read and judged."""
 
     spec: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")

@@ -61,7 +61,7 @@ class Outcome:
 
     Attributes:
         name: name of the file.
-        entry: record of the JSON document.
+        entry: JSON record of the result.
         status: verdict over all traces and requirements.
         rows: results of the requirements.
         text: printed result.

@@ -90,7 +90,7 @@ def robustness_text(status: Status, low: float, high: float, least: float, unit:
 
 
 def in_unit(value: str, unit: str) -> str:
-    """Text of a robustness value with its unit, if it has one: `+1.500 m`."""
+    """Text of a robustness value with its unit, such as `+1.500 m`; without a unit, only the value."""
     return f"{value} {visible(unit)}".rstrip()
 
 
@@ -102,7 +102,7 @@ def signed(value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """A percentage; `100 %` stands only for a share of exactly 1, and `0 %` only for exactly 0."""
+    """Text of a share in percent; `100 %` is shown only for exactly 1, and `0 %` only for exactly 0."""
     percent = 100 * share
     if 0 < percent < 0.1 or 99.9 < percent < 100:
         return "< 0.1 %" if percent < 1 else "> 99.9 %"

@@ -80,11 +80,11 @@ def check(
 ) -> Answer[CheckResult]:
     """Judge recorded traces: verdicts, and the reasons of violations.
 
-    A trace is searched as given, then in the newest run. It is judged by the specification stored in it, with
-    its constants, unless a specification precedes it or --spec is given. With - the samples come from the
-    standard input, as CSV with a header or as one JSON object per line. A file larger than memory is judged
-    in chunks. Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short); with -q nothing is
-    printed.
+    A trace is looked for at the given path, then in the newest run. It is judged by SPEC or --spec, if given.
+    Otherwise it is judged by the specification and the constants that it stores. If the trace is -, samples
+    come from the standard input, as CSV with a header or as one JSON object per line. A file larger than
+    memory is judged in chunks. Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short); with
+    -q nothing is printed.
     """
     from stlc.cli.check.document import document
     from stlc.cli.check.document import junit as junit_xml
@@ -145,8 +145,11 @@ def _print(outcomes: Sequence[Outcome]) -> None:
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:
     """Split the arguments `files` into a specification and traces; return (specification or None, traces).
 
-    The specification is the file in `files` with the suffix of a specification. If there is none, it is
-    `spec`, the value of `--spec`.
+    The specification is the argument that ends with a suffix of specification files, such as `.stl`. If there
+    is no such argument, it is `spec`, the value of `--spec`.
+
+    Raises:
+        UsageError: U101, there are several specifications, or no trace.
     """
     specs = [name for name in files if Path(name).suffix in SPEC_SUFFIXES]
     traces = [name for name in files if name not in specs]

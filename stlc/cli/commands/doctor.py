@@ -118,7 +118,7 @@ def _tools() -> Iterator[InstallationFinding]:
 
 
 def _cache() -> InstallationFinding:
-    """Finding on the folder in which compiled kernels and parser tables are cached."""
+    """Return the line of the report on the cache folder, which keeps compiled kernels and parser tables."""
     from stlc.cache import Unusable, opened, why_not
 
     try:
@@ -134,7 +134,7 @@ def _cache() -> InstallationFinding:
 
 
 def _compiler() -> InstallationFinding:
-    """Entry of the report about the C compiler.
+    """Return the line of the report on the C compiler.
 
     It says whether plans are evaluated in C or in torch, and names a recent failure of the compiler.
     """

@@ -147,7 +147,7 @@ _FENCE = re.compile(r"^```(?P<language>\w*)(?P<notes>[^\n]*)\n(?P<body>.*?)^```$
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """Fenced block of a manual page.
+    """An example in a manual page: a code block with a language and notes.
 
     Attributes:
         language: `stl`, `yaml`, `csv` or `console`.
@@ -169,14 +169,14 @@ class Page:
 
     @property
     def examples(self) -> tuple[Example, ...]:
-        """Example blocks of the page, in order."""
+        """Examples in the page, in order."""
         return tuple(
             Example(match["language"], tuple(match["notes"].split()), match["body"])
             for match in _FENCE.finditer(self.text)
         )
 
     def having(self, note: str) -> tuple[Example, ...]:
-        """Example blocks whose notes include `note`."""
+        """Return the examples whose notes include `note`."""
         return tuple(example for example in self.examples if note in example.notes)
 
 
@@ -218,10 +218,11 @@ ASSUMED = (
 def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[documents.Guarantee]:
     """Compute lower bounds on the probability that the backup policy of a run finds a satisfying plan.
 
-    The backup policy takes the first steps (prefix) of a plan from a grid of control sequences. It is assumed
-    that every prefix within a radius of an unknown one leads to a satisfying plan. There is one bound for
-    each prefix length and each radius. The returned record also lists all assumptions. `runs` is the folder
-    of all runs, and `overrides` gives new values of constants.
+    The backup policy tries many candidates for the first steps of a plan (its prefix); the candidates form a
+    grid. The main assumption is that some unknown prefix leads to a satisfying plan, and so do all prefixes
+    within a given radius of it. There is one bound for each length of the prefix and each radius. The
+    returned record lists all assumptions. `runs` is the folder of all runs, and `overrides` gives new values
+    of constants.
     """
     from stlc.controller.guard.candidates import grid_of
     from stlc.controller.guard.coverage import axes_of, chances

@@ -29,9 +29,9 @@ def export(
     """Export a trained controller, monitor included.
 
     `torch` is a torch.export program that maps states to plans and their robustness. `c` is a C99 header with
-    an example program. It depends only on libm, and includes the backup policy. `onnx` are graphs for
-    onnxruntime, which `stlc.runtime` runs without torch. They include the backup policy, too. Every export is
-    compared with the run in random states.
+    an example program. It depends only on libm, and includes the backup policy. `onnx` is a set of graphs for
+    onnxruntime, which `stlc.runtime` runs without torch. It includes the backup policy, too. For random
+    states, the results of every export are compared with those of the run.
     """
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write

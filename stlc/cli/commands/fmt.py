@@ -38,10 +38,10 @@ def fmt(
 ) -> Answer[FormattedFiles]:
     """Format specifications in the standard layout.
 
-    Meaning, comments and blank lines between groups are kept. Operators of other tools (G, &&, =>, □)
-    become those of the language; parentheses are added where other tools parse a formula differently.
-    Formatting is idempotent.
-    Exit code: 0, or 1 if --check or --diff found a difference.
+    The meaning, the comments, and blank lines between groups are kept. Operators of other tools (G, &&, =>,
+    □) are replaced by those of the language. Parentheses are added where other tools parse a formula
+    differently. Formatting a second time changes nothing. Exit code: 0, or 1 if --check or --diff found a
+    difference.
     """
     from stlc.files import read_source, write_atomic
     from stlc.grammar.format.format import format_text
@@ -76,7 +76,7 @@ def fmt(
 
 
 def _tell(record: FormattedFiles, alike: int) -> None:
-    """Print the differences or the names of changed files, then the number of unchanged files, `alike`."""
+    """Print the differences or the names of changed files, then `alike`, the number of unchanged files."""
     if record.get("diff"):
         emit(record["diff"].rstrip("\n"))
     for name in record["changed"]:

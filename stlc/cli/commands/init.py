@@ -73,9 +73,9 @@ def init(
 ) -> Answer[CreatedFiles]:
     """Create a project, or one specification or system.
 
-    The example trains in a minute; settings for git and the editor are included. Existing files are
-    overwritten only with --force. --spec and --system write one file, into `specs/` and `systems/` if these
-    folders exist.
+    The project contains an example that trains in a minute, and settings for git and the editor. Existing
+    files are overwritten only with --force. --spec and --system write only one file, into `specs/` and
+    `systems/` if these folders exist.
     """
     if sum(given is not None for given in (example, spec, system)) > 1:
         raise usage("`--example`, `--spec` and `--system` contradict each other")
@@ -190,7 +190,7 @@ def _template(name: str) -> str:
 
 
 def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Path, str], str]:
-    """Path and text of a new specification in `folder`, which declares a signal for each state of a system.
+    """Path and text of the new specification `name`, which declares a signal for each state of a system.
 
     The system is the one called `from_`. If `from_` is None, the specification declares an example signal.
 
@@ -225,7 +225,8 @@ def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
 def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
     """Path of a new file in `folder`; `suffix` is added to `name` if it has none.
 
-    A bare name is placed in the subfolder `kind` (such as `specs`) if that exists.
+    If `name` contains no folder, and `folder` has a subfolder `kind` (such as `specs`), the file is placed
+    there.
 
     Raises:
         UsageError: U101, `name` is not a valid name of the language.

@@ -18,8 +18,8 @@ def lsp(
 ) -> None:
     """Serve an editor: findings, hover, completion, rename, format.
 
-    Speaks the language server protocol over the standard input and output; editors start it. Needs `pip
-    install 'stlc[lsp]'`. See docs/editors.md for the setup of editors.
+    Editors start this command and communicate with it by the language server protocol, over the standard
+    input and output. It needs `pip install 'stlc[lsp]'`. See docs/editors.md for the setup of editors.
     """
     from stlc.editor.server import make_server
 

@@ -74,7 +74,7 @@ def diff(
     second: Annotated[str, typer.Argument(metavar="OTHER", help="The run to compare with.")] = "latest",
     runs: RunsOption = RUNS,
 ) -> Answer[documents.RunComparison]:
-    """Show the differences of two runs: options, inputs, results.
+    """Show the differences between two runs: options, inputs, results.
 
     Exit code: 0, or 1 if they differ.
     """

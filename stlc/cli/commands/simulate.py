@@ -1,4 +1,4 @@
-"""`stlc simulate`: closed-loop runs of a trained policy in the world of its system."""
+"""`stlc simulate`: closed-loop runs of a trained policy in its world (simulated environment)."""
 
 from __future__ import annotations
 
@@ -138,13 +138,13 @@ def simulate(
 ) -> Answer[Simulation]:
     """Deploy a trained policy in the world of its system.
 
-    The newest run by default. With --method, RUN is a specification, and a planner controls the system
-    without training. With --backup the backup policy of Meng and Fan (2023) guards the policy. For
-    comparison, the same seeds are simulated without the backup policy, too. Trace, scene and figures are
-    written to the run's folder. A drive is the closed-loop run of one agent with one seed. Drives are judged
-    by the specification that the system file names (key `judge` of its section `test`). Means over seeds have
-    95 % intervals (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets
-    their strength in percent, as in mismatch-20. --scenario disturbed runs all of them.
+    RUN is by default the newest run. With --method, RUN is a specification, and a planner controls the system
+    without training. With --backup, the backup policy of Meng and Fan (2023) guards the policy. For
+    comparison, the same seeds are simulated without it, too. Trace, scene and figures are written to the
+    run's folder. A drive is the closed-loop run of one agent with one seed. Drives are judged by the
+    specification that the system file names (key `judge` of its section `test`). Means over seeds have 95 %
+    intervals (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets their
+    strength in percent, as in mismatch-20. --scenario disturbed runs all of them.
     """
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
@@ -231,8 +231,8 @@ def _run_of(
 def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
     """Return the warning W604 if `steps` steps exceed the time for which the policy was validated, else ().
 
-    The warning concerns requirements without an end, about which the validation of the policy says nothing at
-    later times.
+    The requirements may have no end in time. Nothing is then known about the policy beyond the validated
+    time.
     """
     result = run.dir.record().get("result")
     judged = result.get("judged_seconds") if isinstance(result, dict) else None
@@ -261,7 +261,7 @@ class _Order:
 
 
 def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simulation:
-    """Simulate the policy without and with its guard, and return the record of both deployments.
+    """Simulate the policy without and with its guard, and return one record of both simulations.
 
     Args:
         order: options of the simulation.
@@ -308,9 +308,9 @@ def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
 
 
 def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
-    """Return the scenarios to simulate besides the simulation without a scenario: name -> scenario.
+    """Return the scenarios that are simulated in addition to the system without a scenario: name -> scenario.
 
-    The mapping is empty if `scenario` is None or the name of a single scenario.
+    The mapping is empty if `scenario`, the value of `--scenario`, is None or the name of a single scenario.
     """
     from stlc.dynamics.scenarios.scenario import DISTURBED, find_scenario
 
@@ -368,9 +368,10 @@ def _guard(backup: bool | None, guard: str | None) -> Mode:
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
-    """Simulate with the guard `mode`, and show the progress with the options in `watching`.
+    """Simulate the policy of `run` with the guard `mode`, and return the results.
 
-    The closed-loop runs are judged by `rules`. If the simulation fails or Ctrl-C ends it, the steps simulated
+    `order` contains the options of the simulation, and `watching` those of the progress display. The
+    closed-loop runs are judged by `rules`. If the simulation fails or Ctrl-C ends it, the steps simulated
     until then are saved as a trace.
     """
     from stlc.controller.evaluation.archive import save_trace_of

@@ -328,10 +328,10 @@ LOST = "R403"
 
 @contextmanager
 def one_voice() -> Iterator[None]:
-    """Context for one of several training processes that `torchrun` started: only the first one prints.
+    """Context for one of several training processes that `torchrun` started; only the first process prints.
 
-    The output of all other processes is dropped, except for two kinds of message. These are errors of the
-    first process on each machine, and missing packages in any process.
+    The output of all other processes is dropped, except for two kinds of message: errors in the first process
+    of each machine, and missing packages in any process.
     """
     rank, local = (int(os.environ.get(name, "0")) for name in ("RANK", "LOCAL_RANK"))
     if rank == 0:

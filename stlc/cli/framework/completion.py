@@ -45,7 +45,10 @@ def requirement_names(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def _fitting(names: Iterable[str], incomplete: str) -> list[str]:
-    """Return the names that begin with `incomplete` and need no quoting, since completions are not quoted."""
+    """Return those of `names` that begin with `incomplete` and need no quotes.
+
+    Other names are left out, because completions are inserted without quotes.
+    """
     plain = (name for name in dict.fromkeys(names) if shell((name,)) == name and not name.startswith("-"))
     return [name for name in plain if name.startswith(incomplete)]
 

@@ -28,7 +28,7 @@ R = TypeVar("R")
 Num: TypeAlias = float | str
 Count = Annotated[int, 0]
 Positive = Annotated[float, 0]
-"""Numbers of at least 0."""
+"""Numbers that are not negative."""
 
 
 def record(kind: type[R], source: object, **given: object) -> R:
@@ -708,13 +708,13 @@ RESULTS: dict[str, Any] = {
 }
 """The result of each command's document, by the name of its schema."""
 LINES: dict[str, Any] = {"robustness-line": RobustnessLine}
-"""Documents without a frame, one a line: those of `simulate --robustness`."""
+"""Documents that are single lines without a frame: those of `simulate --robustness`."""
 
 
 # ------------------------------------------------------------------------------ JSON Schema
 
 _OPEN = (SyntaxTree,)
-"""Records with further keys."""
+"""Records that may have further keys."""
 _NAMES: dict[Any, str] = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
 
 

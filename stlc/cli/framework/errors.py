@@ -1,4 +1,4 @@
-"""The place where the exceptions of all commands become messages and exit codes."""
+"""Conversion of the exceptions of all commands into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class BugError(StlcError):
 def report(error: BaseException, argv: Sequence[str]) -> int:
     """Print an error as a message or as a JSON document, and return the exit code of the program.
 
-    An error that stlc does not know is reported as a bug, with a crash report. A closed pipe gives 0.
+    An error that stlc does not know is reported as a bug, with a crash report. For a closed pipe, nothing is
+    printed and the exit code is 0.
     """
     match error:
         case SystemExit() if isinstance(error.__context__, BrokenPipeError):
@@ -85,7 +86,7 @@ def _schema(argv: Sequence[str]) -> str:
 
 
 def _known(error: BaseException) -> StlcError | None:
-    """Return the StlcError that describes an error of another library or of the system.
+    """Return an StlcError that describes `error`, an error of another library or of the operating system.
 
     An StlcError is returned unchanged. None means that the error is a bug of stlc.
     """

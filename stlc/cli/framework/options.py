@@ -148,7 +148,7 @@ def _below(name: str) -> Iterator[str]:
 
 
 def _shown(path: Path, folder: Path) -> bool:
-    """True if no file or folder name on the way from `folder` to `path` begins with a dot."""
+    """True if `path` is not hidden: no file or folder name below `folder` begins with a dot."""
     return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 

@@ -28,7 +28,7 @@ R = TypeVar("R", covariant=True)
 ColorMode = Literal["auto", "always", "never"]
 
 WIDEST = 80
-"""Maximum width up to which a cell widens its column."""
+"""Largest width in characters that a cell can give its column; a wider cell sticks out."""
 
 COLOR: ContextVar[ColorMode] = ContextVar("stlc_color", default="auto")
 QUIET: ContextVar[bool] = ContextVar("stlc_quiet", default=False)
@@ -146,8 +146,8 @@ def noticing() -> Iterator[None]:
 def wants_color(stream: TextIO) -> bool:
     """True if colour codes may be written to `stream`.
 
-    `--color always` or `never` decides; else there is no colour if `NO_COLOR` is set, or if `stream` is not a
-    terminal.
+    The option `--color always` or `--color never` decides. Without it, there is no colour if `NO_COLOR` is
+    set, or if `stream` is not a terminal.
     """
     mode = COLOR.get()
     if mode != "auto":
@@ -181,7 +181,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: str = "  ") -> str:
-    """Lay out rows of cells as a text table with two blanks between columns.
+    """Lay out rows of cells as a text table with two spaces between columns.
 
     Each line begins with `indent`. Numbers, and values with a sign and a unit, are right-aligned.
     """
@@ -245,7 +245,7 @@ class Pulse:
 
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:
-        """Context that sets the activity named in the progress message; while it is "", none is shown."""
+        """Context in which the progress message names the activity `what`; for "", no message is shown."""
         self._doing.append((what, time.monotonic()))
         self.note()
         try:
@@ -254,7 +254,7 @@ class Pulse:
             self._doing.pop()
 
     def now(self, what: str) -> None:
-        """Change the name of the current activity; its elapsed time continues."""
+        """Change the name of the current activity to `what`; the elapsed time is not reset."""
         if self._doing:
             self._doing[-1] = what, self._doing[-1][1]
 
@@ -284,7 +284,7 @@ class Pulse:
 
 
 PULSE = Pulse()
-"""The heartbeat of the running command."""
+"""Progress message of the running command."""
 
 
 class _Noted:

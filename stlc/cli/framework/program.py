@@ -166,9 +166,9 @@ class Program:
         return [*(name for name in self.order if name in found), *sorted(set(found) - set(self.order))]
 
     def made(self, only: str = "") -> typer.Typer:
-        """Return the typer application with the command `only`, or else with all commands.
+        """Return the typer application with the command `only`.
 
-        All commands are included if no command is called `only`.
+        If no command has this name, the application has all commands.
         """
         names = self.names()
         app = typer.Typer(
@@ -205,7 +205,7 @@ class Program:
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run a command line and return its exit code.
 
-        All exceptions of commands are caught here. They become a message and an exit code; see
+        All exceptions of commands are caught here. Each becomes a message and an exit code; see
         `stlc.cli.framework.errors`.
 
         Args:

@@ -116,8 +116,8 @@ def _marks(diagnostic: Diagnostic) -> list[_Mark]:
 def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
     """Yield the lines of the source excerpts, one excerpt per file.
 
-    The excerpt of the finding's own place comes first. `width` is the number of digits of the greatest line
-    number.
+    The first excerpt is that of the file in which the finding itself lies. `width` is the number of digits of
+    the greatest line number.
     """
     margin = " " * width
     for index, source in enumerate(dict.fromkeys(mark.span.source for mark in marks)):

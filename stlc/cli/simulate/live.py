@@ -32,9 +32,9 @@ REDRAWN = 0.5
 LINES = 10
 """Number of lines without a terminal."""
 HALF = 10
-"""Half the width of a bar; its right half is a positive margin."""
+"""Half the width of a bar in characters; the right half shows positive margins."""
 NARROW = 4
-"""Half the width of a bar in a narrow terminal."""
+"""Half the width of a bar in characters in a narrow terminal."""
 FIRST = ("agent", "decided by", "plan", "least margin")
 """Headers of the columns before the states of an agent."""
 

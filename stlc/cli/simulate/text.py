@@ -22,7 +22,7 @@ ERRORS = {
     "actuator_noise": "noise: what actuators give",
     "sensor_noise": "noise: what agents see",
 }
-"""Errors of a scenario, in words."""
+"""Model errors of a scenario, in words."""
 COMPARED = ("obeyed every rule", "plan accuracy")
 """Columns of the comparison of scenarios; lost drives are not counted."""
 
@@ -107,8 +107,8 @@ def _rules(document: Record) -> Iterator[tuple[str, ...]]:
 def _broken(drives: Record) -> Iterator[str]:
     """Lines such as `broken by seed 3, agent 7: full_stop (4.3 s)` on drives that broke a requirement.
 
-    Only the first few drives (closed-loop runs) are listed. Viable drives, for which a satisfying plan was
-    known, come first.
+    A drive is the closed-loop run of one agent with one seed. Only the first few drives are listed. Viable
+    drives, for which a satisfying plan was known, come first.
     """
     from stlc.view.words import cause_words
 
@@ -203,7 +203,7 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
 def _shares(guards: Record, *, safe: bool) -> Iterator[tuple[str, ...]]:
     """Table rows with shares, such as the share of satisfying plans; one column per guard.
 
-    With `safe`, rows on the requirements tagged `@safety` are included.
+    If `safe` is True, rows on the requirements tagged `@safety` are included.
     """
     from stlc.controller.evaluation.metrics import METRICS
 
@@ -279,8 +279,8 @@ def _acted(decisions: Mapping[str, float]) -> str:
     """Text on how often the guard intervened, and by which means.
 
     An example is `3.1 % of decisions (T0=1 71 %, T0=2 22 %, longest safe prefix 7 %)`. T0=2 means that a
-    search chose the first 2 steps of the plan, and the policy the rest. "Longest safe prefix" means that no
-    satisfying plan was found, and the plan that stays safe for longest was followed.
+    search chose the first 2 steps of the plan, and the policy chose the rest. "Longest safe prefix" means
+    that no satisfying plan was found. The plan that stays safe for longest was then followed.
     """
     total = 1.0 - decisions["policy"]
     if total <= 0.0:
@@ -292,5 +292,5 @@ def _acted(decisions: Mapping[str, float]) -> str:
 
 
 def _part(share: float) -> str:
-    """Text of a share in percent; `0 %` stands only for exactly 0, and `100 %` only for exactly 1."""
+    """Text of a share in percent; `0 %` is shown only for exactly 0, and `100 %` only for exactly 1."""
     return "< 1 %" if share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 else f"{100 * share:.0f} %"

@@ -76,7 +76,10 @@ class Many:
         return " ".join(words + ([] if part.seed is None else [f"seed {part.seed}"]))
 
     def job(self, part: Part) -> Job:
-        """Return the job of one run: the arguments of `stlc train`, and its files if it runs on a cluster."""
+        """Return the job of one run: the arguments of `stlc train`.
+
+        If the run is trained on a cluster, the job also lists its input files.
+        """
         from stlc.controller.parallel.jobs import Job
 
         config, launch = self.config, self.launch

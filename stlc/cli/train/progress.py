@@ -79,7 +79,7 @@ class Progress:
         self._live: Live | None = None
 
     def start(self, record: Mapping[str, Any], run: str) -> None:
-        """Open the panel, or print the first line.
+        """Open the panel; without a terminal, print the first line instead.
 
         Args:
             record: content of `run.json`.
@@ -260,7 +260,7 @@ def engine_text(engine: Mapping[str, Any]) -> str:
 
 
 def native_text(by_torch: Mapping[str, str]) -> str:
-    """Text on which parts of the training run as generated C, and why the others are computed by torch.
+    """Text that says which parts of the training run as generated C, and why torch computes the others.
 
     `by_torch` maps the name of a part to the reason for torch; "" means C.
     """

@@ -40,7 +40,8 @@ class Session:
     """Progress display of a training run, as a context manager that also handles Ctrl-C and SIGTERM.
 
     During the training steps, the first signal ends the run after the present step, and saves a checkpoint. A
-    second signal ends the run immediately. Before and after the training steps, the first signal does so.
+    second signal ends the run immediately. Before and after the training steps, the first signal already ends
+    the run immediately.
 
     Attributes:
         folder: folder of the run.
