@@ -1,8 +1,8 @@
 """Recorder of ONNX graphs: symbolic arrays and the operations between them.
 
-A `Value` behaves like an array in the evaluators: shape, slicing along time, arithmetic. Each operation
-becomes a node of the graph that the value belongs to; equal nodes are shared. `stlc.export.onnx_write` writes
-graphs to files; this module does not import ONNX.
+To the evaluators a `Value` looks like an array: it has a shape, slices along time, and arithmetic. Each
+operation becomes a node of the graph that the value belongs to; equal nodes are shared.
+`stlc.export.onnx_write` writes graphs to files; this module does not import ONNX.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class GraphNode:
     def reads(self) -> frozenset[str]:
         """Names of the values that the node reads.
 
-        If the node is a loop or a condition, they include values of the enclosing graph that its bodies read.
+        For a loop or a condition, these include values of the enclosing graph that the bodies read.
         """
         bodies = (value for _, value in self.attributes if isinstance(value, GraphBody))
         return frozenset(self.inputs).union(*(body.around for body in bodies))
@@ -93,7 +93,7 @@ class OnnxGraph:
     _known: dict[tuple[object, ...], tuple[Value, ...]] = field(default_factory=dict)
 
     def input(self, name: str, shape: tuple[int, ...], kind: Kind = "float64") -> Value:
-        """Add an input of the graph."""
+        """Add an input of the graph; return it as a symbolic array."""
         self.inputs.append(Value(self, name, shape, kind))
         return self.inputs[-1]
 
@@ -144,7 +144,8 @@ class OnnxGraph:
             rows: values (count, …); an iteration gets one row (1, …) of each.
             turn: loop body, a function (graph, loop state, rows) -> (next loop state, outputs). It adds
                 operations to the graph that it gets. If it reads a value of the enclosing graph, it must
-                convert the value by `Value.on`. The loop state keeps its shapes; each output is (1, …).
+                convert the value by `Value.on`. The arrays of the loop state keep their shapes. Each output
+                is (1, …).
 
         Returns:
             Outputs of all iterations, (count, …) each.
@@ -176,8 +177,8 @@ class OnnxGraph:
             yes: branch that is executed if the condition holds, a function graph -> outputs. It adds
                 operations to the graph that it gets. If it reads a value of the enclosing graph, it must
                 convert the value by `Value.on`.
-            no: branch that is executed otherwise, the same; its outputs have the shapes of those of `yes`.
-                All outputs of both have one element type.
+            no: branch that is executed otherwise, a function like `yes`. Its outputs have the same shapes as
+                those of `yes`. All outputs of both branches have the same element type.
 
         Returns:
             Outputs of the branch that is executed.
@@ -327,7 +328,7 @@ class Value:
 
     @property
     def T(self) -> Value:  # noqa: N802 - as arrays call it
-        """Transpose of two axes."""
+        """Transpose of an array with two axes."""
         return self.transposed(1, 0)
 
     def expand(self, *shape: int, like: Value | None = None) -> Value:
@@ -345,7 +346,7 @@ class Value:
         return out
 
     def count(self) -> Value:
-        """Length of the last axis as a value, (1,) int64."""
+        """Length of the last axis, as a symbolic array (1,) of the type int64."""
         (out,) = self.sheet.emit("Shape", (self,), [(1,)], "int64", {"start": self.ndim - 1})
         return out
 
