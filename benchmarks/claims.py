@@ -1,4 +1,4 @@
-"""The paper's claims about its comparison of methods, each with a verdict by the measured results.
+"""The paper's claims about its comparison of methods, each with a verdict based on the measured results.
 
 The paper is Meng & Fan (2023). A claim of the form "better than every baseline" is refuted by one measured
 baseline. If it is not refuted, it is confirmed only for those baselines that are measured.
@@ -65,7 +65,7 @@ class Claim:
 
 
 def claims(standings: Iterable[Standing]) -> list[Claim]:
-    """Return all claims of the paper, with verdicts by the measured results `standings`."""
+    """Return all claims of the paper, each with a verdict based on the measured results `standings`."""
     known = {(each.benchmark, each.method): each for each in standings}
     return [
         *(_lead(known, name, lead) for name, lead in LEADS.items()),

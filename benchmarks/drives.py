@@ -1,4 +1,4 @@
-"""Closed-loop measurements (drives) for the paper's comparison: a policy or planner in a benchmark's world.
+"""Closed-loop measurements for the paper's comparison: a policy or planner in the world of a benchmark.
 
 The world is the simulated environment of a benchmark. As in the paper, each method is measured without a
 guard and with the paper's backup policy. The number of agents, of steps, and of steps between two plans are

@@ -90,7 +90,7 @@ class Stored:
         return _ordered(DriveRow.of(each) for each in self.drives.all().values())
 
     def claims(self) -> list[Claim]:
-        """Return the paper's claims, with verdicts by the stored results."""
+        """Return the paper's claims, each with a verdict based on the stored results."""
         return claims(standings(learned(self.place.all()), self.plan_rows(), self.drive_rows()))
 
 

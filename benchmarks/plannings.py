@@ -230,7 +230,7 @@ def is_outdated(result: Result) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Ceiling:
-    """Shares of the initial states (starts) of one benchmark with known and with impossible plans.
+    """Shares of a benchmark's initial states (starts) that are known to be feasible, or proved infeasible.
 
     They are computed from the stored results of all planners and policies together.
 
@@ -274,8 +274,8 @@ def ceilings(results: Iterable[Result]) -> dict[str, Ceiling]:
 def improves(cell: PlanCell, store: ResultStore) -> bool:
     """True if a measurement is worth its time.
 
-    A measurement with a short time budget always is. One with a long time budget is worth its time if,
-    between two shorter budgets, ten times the time found more plans.
+    A measurement with a short time budget always is. A measurement with a long time budget is worth its time
+    if, between two shorter budgets, ten times the time found more plans.
     """
     if cell.seconds < LONG or math.isinf(cell.seconds):
         return True

@@ -61,7 +61,7 @@ class ResultStore:
         return self.folder / f"{self.table}.json"
 
     def get(self, key: Key, compute: Callable[[], Result]) -> Result:
-        """Return the stored result of `key`; if there is none, call `compute` and store its result."""
+        """Return the stored result of `key`, or else the result of `compute`, which is then stored."""
         found = self.find(key)
         return found if found is not None else self.put(key, compute())
 

@@ -1,4 +1,7 @@
-"""Diagnostics as data: codes, labels, help. Rendering is done in `stlc.cli.framework.render`."""
+"""Errors and warnings (diagnostics) as data: codes, labels, help.
+
+They are printed by `stlc.cli.framework.render`.
+"""
 
 from __future__ import annotations
 

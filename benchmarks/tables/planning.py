@@ -1,8 +1,8 @@
 """Planning problems from the literature: success, robustness and processor time, beside published figures.
 
 Problems of stlpy and STLCCP have a single initial state. Their robustness is maximised until it reaches a
-target. The problems `circles` and `arm` consist of random tasks, drawn as in TeLoGraF. For these, the search
-ends at the first satisfying plan. The time of the compilation is not counted.
+target. The problems `circles_linear`, `circles_dubins` and `arm` consist of random tasks, drawn as in
+TeLoGraF. For these, the search ends at the first satisfying plan. The time of the compilation is not counted.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Solution:
 
     Attributes:
         found: number of satisfying plans; plans are judged by the published formula.
-        starts: number of initial states.
+        starts: number of initial states. The table leaves out those from which provably no plan exists.
         rho: robustness of the plan; the median if there are several initial states.
         seconds: mean processor time per initial state.
         evaluations: mean number of plans that were evaluated per initial state.

@@ -1,8 +1,8 @@
-"""Region of failing held-out starts: how it is found, described and drawn.
+"""Region of the initial states from which a trained policy fails: how it is found, described and drawn.
 
-Held-out starts are initial states that were not used in training. The region is a conjunction of simple
-conditions. It contains many failing starts and few others: a beam search maximises its F-score (subgroup
-discovery).
+The region is determined on held-out starts: initial states that were not used in training. It is a
+conjunction of simple conditions. It contains many failing starts and few others: a beam search maximises its
+F-score (subgroup discovery).
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Animation of a recorded scene, with a legend above it and strip charts below it.
 
-The world, which is the simulated environment of a closed-loop run, draws the scene.
+A scene is a mapping from names to arrays that a closed-loop run recorded for its animation. The world, which
+is the simulated environment of the run, draws the scene.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Diagnostics as text, with the source and carets under it, and as JSON.
+"""Errors and warnings (diagnostics) as text with the underlined source, and as JSON.
 
 The main source location is underlined with `^`, further ones with `-`. Each label has a line of its own. Then
 follow advice (`help`, `fix`) and reasons (`note`).

@@ -1,4 +1,4 @@
-"""Output while a deployment runs: a progress bar, the live view, and robustness as JSON lines."""
+"""Output while a deployment (closed-loop simulation) runs: progress bar, live view, and JSON lines."""
 
 from __future__ import annotations
 
