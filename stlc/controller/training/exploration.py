@@ -54,8 +54,6 @@ EFFORTS = (8, 24, 72)
 """Sweeps for a plan of `USUAL` steps: first attempt, and increased effort after failures."""
 USUAL = 30
 """Plan length in steps to which `EFFORTS` refers; the cost of a sweep grows with its square."""
-BATCH = 8
-"""Number of sweeps from one initial state before it is the next state's turn."""
 TAILS = 8
 """Number of instants of a plan; the remainder after each of them is tried as a further plan."""
 RAISED = 250
