@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
-    """Return the states under plans; conditions of the dynamics switch exactly, without smoothing.
+    """Return the states under plans. Conditions in the dynamics are evaluated exactly, without smoothing.
 
     Args:
         step: one step of the system.
@@ -72,11 +72,14 @@ def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, V
 
 
 class _Rollout:
-    """Rollout that is computed in stages, where possible for all time steps at once.
+    """Computation of the states under plans, in stages.
 
-    A stage is a group of states and intermediate variables that depend only on earlier groups or on each
-    other. `states` holds the states computed by previous stages, (steps + 1, batch). `now` holds the values
-    of states, controls and variables at each step: (steps, batch), or (1, batch) if constant in time.
+    Where possible, a stage is computed for all time steps at once.
+
+    A stage is a group of states and intermediate variables. They depend only on each other and on earlier
+    stages. If states depend on each other, the stage is computed step by step. `states` holds the states
+    computed by previous stages, (steps + 1, batch). `now` holds the values of states, controls and variables
+    at each step: (steps, batch), or (1, batch) if constant in time.
     """
 
     def __init__(
@@ -89,9 +92,9 @@ class _Rollout:
         self.now |= controls
 
     def run(self, stage: RolloutStage) -> None:
-        """Compute the states and variables of a stage for all time steps.
+        """Compute the states and variables of `stage` for all time steps, and store them.
 
-        They depend only on earlier stages or on each other.
+        All earlier stages must already be computed.
         """
         if stage.early:
             self.now.update(ArrayProgram(stage.early)(self.now, ONNX))
@@ -147,7 +150,10 @@ class _Rollout:
 
 
 def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:
-    """Evaluate expressions on signals: name -> value, of a shape that broadcasts with the signals.
+    """Evaluate the expressions `numbers` on the signals `columns`.
+
+    Returns name of the expression -> value. The shape of a value may have length 1 in some dimensions in
+    which the signals are longer (broadcasting).
 
     Raises:
         Untranslatable: an expression calls a Python function.
@@ -228,7 +234,10 @@ def _weights(like: Value, tensor: Tensor) -> Value:
 
 
 def _squashed(control: ControlDecl, columns: Iterator[Value]) -> Value:
-    """Values of one control in physical units, from one or two columns of the network's output."""
+    """Values of one control in physical units, from the next columns of the network's output.
+
+    An angle takes two columns, as the direction of a vector; any other control takes one.
+    """
     first = next(columns)
     match control.squash:
         case "tanh":
@@ -318,7 +327,11 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
 
 
 def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) -> Value:
-    """Mask of the plans that contain a number that is not finite, or that lead to NaN: (1, batch)."""
+    """Mask of the plans whose verdict is invalid because a value is not finite: (1, batch).
+
+    It is True if a plan contains a number that is not finite, or if a state in `states` or a robustness in
+    `margins` is NaN.
+    """
     nothing = _reduced("ReduceSum", plans * 0.0, (1, 2)).reshaped(1, BATCH)
     moving = [states[name] for name in task.system.exact_step.next]
     like = next(iter(states.values()))
@@ -329,7 +342,10 @@ def _broken(task: Task, plans: Value, states: States, margins: Sequence[Value]) 
 
 
 def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
-    """Reduce `x` over `axes`, which are kept with length 1."""
+    """Apply the ONNX reduction `op`, such as `ReduceSum`, to `x` over `axes`.
+
+    The reduced axes are retained with length 1.
+    """
     shape = tuple(1 if place in axes else length for place, length in enumerate(x.shape))
     (out,) = x.sheet.emit(op, (x, x.sheet.constant(axes, "int64")), [shape], x.kind, {"keepdims": 1})
     return out
@@ -432,8 +448,8 @@ def falls(task: Task, start: States, plans: Value) -> Value:
 def deciding(task: Task, network: PlanNetwork, *, varied: bool = True) -> dict[str, Value]:
     """Graph from `state` (batch, n) to the best of the policy's plans and its verdict, all float64.
 
-    If `varied` is False, the network's changes of plans are not tried: the plan is that of
-    `Policy.continuation`.
+    If the best plan of the network violates the specification, copies of it with small changes are tried,
+    too. If `varied` is False, no copies are tried: the plan is that of `Policy.continuation`.
 
     Outputs are `plan` (batch, T, m), `rho`, `safe` and `cost` (batch,), and `requirements` (batch, R). If the
     specification adds states, the output `added` (batch, k) holds these states one step later.
@@ -481,10 +497,13 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
 
 
 def _varied(task: Task, network: PlanNetwork, state: Value, policy: Mapping[str, Value]) -> dict[str, Value]:
-    """Replace a plan that violates phi by the best of the plan and its changed copies.
+    """Replace each plan that violates the specification by a changed copy, if one ranks higher.
 
-    The plan is the best of the network's plans; `policy` holds its results, (batch, …) each, as `_picked`
-    returns them. Changed copies are judged only if the plan of some agent violates the specification phi.
+    A changed copy is the plan plus one of the changes that the network declares. The copies are judged only
+    if the plan of at least one agent violates the specification.
+
+    `policy` holds the results for the best plan of the network, by name, (batch, …) each. The results `plan`,
+    `rank`, `rho`, `safe`, `cost` and `requirements` of the chosen plans are returned.
     """
     names = ("plan", "rank", "rho", "safe", "cost", "requirements")
     if not len(network.changes):
@@ -517,8 +536,9 @@ def _varied(task: Task, network: PlanNetwork, state: Value, policy: Mapping[str,
 def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
     """Evaluate several plans per agent: `plans` is (batch, count, T, m), `state` (batch, n).
 
-    Returns name of a result -> its values, (batch, count, …). The results are `rank`, `rho`, `safe`, `cost`,
-    `requirements`, and the plans themselves as `plan`; with goals in the task also `deepened`.
+    Returns name of a result -> values, (batch, count, …). The results are `rank`, `rho`, `safe`, `cost`,
+    `requirements`, and `plan` (the plans themselves). If the task has goals, there is also the result
+    `deepened`.
     """
     names = task.system.names
     count, steps, controls = plans.shape[1:]

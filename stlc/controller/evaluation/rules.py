@@ -66,7 +66,7 @@ class Rules:
 
     @property
     def docs(self) -> dict[str, str]:
-        """Rule -> text of its `##` comment."""
+        """Comments on the rules: name of a rule -> text of its `##` comment."""
         return {item.name: " ".join((item.doc or "").split()) for item in _requirements(self.spec)}
 
 

@@ -1,4 +1,4 @@
-"""Feasibility of states: search for a plan that satisfies the specification, or one that is only safe."""
+"""Feasibility: search for a plan that satisfies the specification, or at least its safety requirements."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class JobResult:
 
     @property
     def why(self) -> str:
-        """Cause of a failure: the findings that the job printed, else the end of its standard error."""
+        """Cause of a failure: the error messages that the job printed, else the end of its standard error."""
         findings = (self.document or {}).get("diagnostics") or []
         lines = [f"{each['severity']}[{each['code']}]: {each['message']}" for each in findings]
         return "\n".join(lines) or self.said

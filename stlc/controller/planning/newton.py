@@ -1,6 +1,6 @@
 """Gauss-Newton steps that change a plan so that its states meet conditions at given samples.
 
-Example: the condition `x > 1` at sample 5. Each step linearises the predicted states of a plan and the
+An example of a condition is `x > 1` at sample 5. Each step linearises the predicted states of a plan and the
 conditions on them. Then it makes the smallest change of the controls for which the linearised conditions hold
 (a damped least-squares problem with bounds). The derivatives of the conditions are approximated by
 differences.
@@ -69,8 +69,9 @@ class GaussNewton:
             conditions: formulas over the states of one sample.
             spread: typical range of each state, (n,).
             pull: function that `state_gradient` returned for the system.
-            rows: maximum number of conditions, the worst ones, that a step considers.
-            margin: distance from their boundaries at which the conditions shall hold.
+            rows: a step considers at most this many pairs of condition and sample per plan, the most violated
+                ones.
+            margin: distance that states should keep from the boundaries of the conditions.
             damping: damping of the least-squares problem, relative to the mean of its diagonal.
         """
         self.task, self.spread = task, spread.clamp(min=TINY)

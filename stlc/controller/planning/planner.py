@@ -182,7 +182,7 @@ class PlanSearch:
     def charged(self, rows: Tensor) -> Iterator[None]:
         """Context whose processor time is added to `seconds`, in equal parts for the states `rows`, (k,).
 
-        At the end of the context, the function `progress`, if given to the search, is called.
+        At the end of the context, the function `progress` is called, if the search was given one.
         """
         before = process_time()
         try:

@@ -104,11 +104,13 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
 
 @torch.no_grad()
 def trace_of(task: Task, result: PlanResult, seed: int | None = None) -> Trace:
-    """Convert plans to the content of a trace file: one trace, the predicted states, per initial state.
+    """Convert plans to the content of a trace file, with one trace per initial state.
 
-    Besides the states there are the arrays `action.NAME`, (traces, steps), the actuator commands of the
-    control NAME; `plan_rho`, (traces,), the robustness of each plan; and `infeasible`, (traces,), 1 if the
-    planner proved that no plan satisfies the specification.
+    A trace contains the predicted states, and these arrays:
+
+    - `action.NAME`, (traces, steps): the actuator commands of the control NAME.
+    - `plan_rho`, (traces,): the robustness of each plan.
+    - `infeasible`, (traces,): 1 if the planner proved that no plan satisfies the specification, else 0.
     """
     states = task.rollout(result.states, result.plans).numpy()
     commanded = task.system.commanded(

@@ -283,7 +283,7 @@ class GradientRefine(GuardStage):
         return torch.ones_like(best.is_safe)
 
     def propose(self, rejected: Rejected, rows: Tensor, deadline: Deadline) -> Candidates:
-        """Return the best refined plan of each agent; store its two best plans for the next stage."""
+        """Return the best refined plan of each agent; store the two best ones for the next stage."""
         plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
         x, starts = rejected.x[rows], torch.stack(plans, 1)[rows]
         raised = self.ascent.rise(x, starts, 0.5 * (perf_counter() + deadline.until))

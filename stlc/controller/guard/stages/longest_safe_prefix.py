@@ -1,4 +1,7 @@
-"""Longest safe prefix: the last resort of Meng and Fan (2023) if no plan is safe over the whole horizon."""
+"""Longest safe prefix: the last resort of Meng and Fan (2023) if no plan is safe over the whole horizon.
+
+Of all plans, the one is chosen that stays safe for the longest time.
+"""
 
 from __future__ import annotations
 
