@@ -298,7 +298,7 @@ def _of_spec(path: Path, root: Path) -> RunDir:
 
 
 def _spec_path(run: RunDir) -> Path | None:
-    """Path of the specification file from which a run was trained; None if its record cannot be read."""
+    """Path of the specification file from which a run was trained; None if the run has no readable record."""
     try:
         return Path(str(run.record().get("spec_path"))).resolve()
     except RunError:

@@ -66,9 +66,9 @@ def paper_objective(task: Task) -> Objective:
 def guided_objective(margin: float, *, slope: float, performance_weight: float) -> Objective:
     """Objective of the method `guided`, with exact minima and maxima.
 
-    The penalty begins where the robustness falls below `margin`, and is steeper below 0. It grows slowly far
-    below. `slope` is k in the smooth step (1 + tanh(k x)) / 2, whose derivative replaces those of jumps and
-    conditions in the dynamics.
+    The penalty begins where the robustness falls below `margin`, and is steeper below 0. For robustness far
+    below 0, it grows only like a logarithm. `slope` is k in the smooth step (1 + tanh(k x)) / 2, whose
+    derivative replaces those of jumps and conditions in the dynamics.
     """
     return Objective(
         margin=margin,

@@ -131,13 +131,14 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
 
 
 def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
-    """Return the increment of a state if its next value is `state + increment`, else None.
+    """Return the increment of the only state in `states` if its next value is `state + increment`.
 
-    The increment must not depend on the state.
+    Returns None if `states` or `body` has several entries, if the next value has another form, or if the
+    increment depends on the state.
 
     Args:
-        states: the states of a group -> name of the expression of their next value.
-        body: the expressions of the group.
+        states: states that are computed together -> name of the expression of the next value.
+        body: these expressions by name.
     """
     if len(states) != 1 or len(body) != 1:
         return None

@@ -43,7 +43,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class ParseFailure:
-    """Syntax error: part of the text (`piece`), and the offset at which no rule of the grammar applies."""
+    """Syntax error: a part of the text (`piece`), and the offset in the text where no grammar rule fits."""
 
     piece: Piece
     at: int

@@ -205,7 +205,7 @@ _COMMENT_SPREAD = 40
 
 @dataclass(frozen=True, slots=True)
 class AlignedColumn:
-    """Line of formatted text before alignment with the lines around it.
+    """Line of formatted text, the parts of which are yet to be aligned with those of the lines around it.
 
     Attributes:
         text: the line without its comment.

@@ -300,7 +300,7 @@ def _deciding(tree: CauseNode) -> CauseNode:
 
 
 def _closest(tree: CauseNode) -> bool:
-    """True if the deciding predicate fails at every instant of a window.
+    """True if the predicate that decides the verdict fails at every instant of its window.
 
     The explanation then shows the instant at which it comes closest to being true.
     """

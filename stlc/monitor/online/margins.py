@@ -145,10 +145,10 @@ class _Watched:
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Return how many window starts the margin leaves out, because their windows have ended.
+        """Return how many samples, counted from sample `next` on, the margin no longer considers.
 
-        The window starts are counted from `next` on. Their windows end before the latest sample. `samples` is
-        the number of samples received.
+        A sample is no longer considered if the window that starts there ends before the latest sample.
+        `samples` is the number of samples received.
         """
         if not self.everywhere or self.ahead is None:
             return 0

@@ -54,8 +54,8 @@ class UnboundedOperators:
     """Decomposition of a formula into its unbounded future operators and its other subformulas.
 
     A column is a time series of values. Columns `$0`, `$1`, … replace the subformulas without unbounded
-    operators. Columns `!0`, `!1`, … stand for the values that the unbounded operators have on samples not yet
-    received. Operators are rewritten so that their windows begin at 0.
+    operators. Columns `!0`, `!1`, … hold what the samples not yet received contribute to the values of the
+    unbounded operators. Operators are rewritten so that their windows begin at 0.
 
     Attributes:
         root: the formula over columns.

@@ -159,7 +159,7 @@ def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list
 
 
 def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps of an evaluation plan, `(count, batch)` each.
+    """Return the values of all steps of an evaluation plan, `(instants, batch)` each.
 
     A step is one sub-formula at a range of instants.
 
