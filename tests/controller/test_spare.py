@@ -113,6 +113,7 @@ def test_a_network_chooses_among_its_plans_by_what_they_spare() -> None:
     class Two(PlanNetwork):
         def __init__(self) -> None:
             torch.nn.Module.__init__(self)
+            self.changes = torch.zeros(0, task.horizon, 1)
 
         def forward(self, x0: Tensor) -> Tensor:
             fast, slow = (torch.full((len(x0), 1, task.horizon, 1), u) for u in (0.15, 0.08))
