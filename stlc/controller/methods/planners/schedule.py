@@ -111,7 +111,7 @@ class SchedulePlanner:
             if not bool((search.open() == row).any()):
                 continue
             with search.charged(row):
-                attempts = _Attempts(self, search, row, library, (scheduler, pull), random)
+                attempts = _Attempts(self, search, row, library, scheduler, pull, random)
             while bool((search.open() == row).any()):
                 attempts.round(searcher)
 
@@ -126,8 +126,8 @@ class _Attempts:
         search: the search for plans.
         row: index of the initial state, (1,).
         library: plans with which attempts begin, (k, T, m).
-        prepared: scheduler with the conditions of the specification; and the function that `state_gradient`
-            returns, for derivatives of the states.
+        scheduler: scheduler with the conditions of the specification.
+        pull: the function that `state_gradient` returns, for derivatives of the states.
         random: source of the random schedules.
     """
 
@@ -137,11 +137,12 @@ class _Attempts:
         search: PlanSearch,
         row: Tensor,
         library: Tensor,
-        prepared: tuple[GoalScheduler, Pull],
+        scheduler: GoalScheduler,
+        pull: Pull,
         random: Generator,
     ) -> None:
         self._options, self._search, self._row, self._library = options, search, row, library
-        (self._scheduler, pull), self._random = prepared, random
+        self._scheduler, self._random = scheduler, random
         conditions, self._x0 = self._scheduler.conditions, search.states[row]
         states = search.task.rollout(self._x0.expand(len(library), -1), library).nan_to_num(0.0, 0.0, 0.0)
         spread = states.flatten(0, 1).std(0)
