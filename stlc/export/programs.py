@@ -47,9 +47,7 @@ class Deciding(nn.Module):
         plan, rho, safe, each = self.proposed(x)
         if not len(self.network.changes):
             return plan, rho, safe, each
-        low, high = self._task.system.control_low.to(x), self._task.system.control_high.to(x)
-        changed = (plan[:, None] + self.network.changes).clamp(low, high)
-        found = self._best(x, torch.cat((plan[:, None], changed), 1))
+        found = self._best(x, self.network.with_changes(plan))
         pairs = zip((plan, rho, safe, each), found, strict=True)
         good = rho >= -TOLERANCE
         plan, rho, safe, each = (

@@ -209,6 +209,13 @@ class PlanNetwork(nn.Module):
             return plans
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
+    def with_changes(self, plans: Tensor) -> Tensor:
+        """Each plan and its changed copies, within the control bounds: (k, T, m) -> (k, 1 + V, T, m)."""
+        system = self._task.system
+        low, high = system.control_low.to(plans), system.control_high.to(plans)
+        changed = plans[:, None] + self.changes.to(plans)
+        return torch.cat((plans[:, None], changed.clamp(low, high)), 1)
+
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
         """Replace states on one side of the mirror symmetry by their mirror images on the other side.
 
@@ -255,13 +262,5 @@ class BestOfKPolicy(Policy):
         failing = (~satisfied(judged.rho)).nonzero()[:, 0]
         if not len(self.network.changes) or not len(failing):
             return plans, judged
-        better, found = self._best(x0[failing], self._varied(plans[failing]))
+        better, found = self._best(x0[failing], self.network.with_changes(plans[failing]))
         return plans.index_copy(0, failing, better), judged.put(failing, found)
-
-    def _varied(self, plans: Tensor) -> Tensor:
-        """Each plan and its changed copies, within the control bounds: (k, T, m) -> (k, 1 + V, T, m)."""
-        low, high = (
-            bound.to(plans) for bound in (self.task.system.control_low, self.task.system.control_high)
-        )
-        changed = plans[:, None] + self.network.changes.to(plans)
-        return torch.cat((plans[:, None], changed.clamp(low, high)), 1)
