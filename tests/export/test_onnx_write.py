@@ -125,3 +125,10 @@ def test_a_plan_that_is_no_number_counts_as_violated() -> None:
     found, _ = graphs.judged(x.numpy(), plans.numpy())
     assert found.rho[:2].tolist() == found.safe[:2].tolist() == [-torch.inf, -torch.inf]
     torch.testing.assert_close(torch.from_numpy(found.each), wanted.requirements, rtol=0.0, atol=1e-12)
+
+
+def test_without_changed_copies_there_is_one_graph_less(tmp_path: Path) -> None:
+    done = export(run_of("traffic", "car", tmp_path, varied=False), "onnx", tmp_path / "out")
+    assert "continue.onnx" not in done.files
+    assert done.agreement is not None
+    assert done.agreement.rho <= 1e-9

@@ -52,9 +52,12 @@ def build_in_cpp(folder: Path) -> Path:
 
 
 @compiled
-@pytest.mark.parametrize(("spec", "system"), [("traffic", "car"), ("ship_safe", "ship_safe")])
-def test_the_c_controller_decides_as_the_guard(spec: str, system: str, tmp_path: Path) -> None:
-    run = run_of(spec, system, tmp_path)
+@pytest.mark.parametrize(
+    ("spec", "system", "varied"),
+    [("traffic", "car", True), ("traffic", "car", False), ("ship_safe", "ship_safe", True)],
+)
+def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: bool, tmp_path: Path) -> None:
+    run = run_of(spec, system, tmp_path, varied=varied)
     done = export(run, "c", tmp_path / "out")
     assert done.files == ("Makefile", "main.c", "stlc_controller.h", "stlc_weights.h")
     assert done.agreement is not None

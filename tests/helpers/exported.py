@@ -51,17 +51,18 @@ require slow: always[0, T] abs(v) <= 1.5 m/s
 """
 
 
-def run_of(spec: str, system: str, folder: Path) -> Run:
-    """A run with a small network that has learnt nothing, and that tries changed copies of its plans."""
-    return untrained(ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml", folder)
+def run_of(spec: str, system: str, folder: Path, *, varied: bool = True) -> Run:
+    """A run with a small network that has learnt nothing; if `varied`, it tries changed copies of plans."""
+    files = ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml"
+    return untrained(*files, folder, varied=varied)
 
 
-def untrained(spec: Path, system: Path, folder: Path) -> Run:
+def untrained(spec: Path, system: Path, folder: Path, *, varied: bool = True) -> Run:
     """The same of any two files."""
     task = Task.of(parse(read_source(spec)), System.load(system))
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        network = PlanNetwork(task, hidden=(16, 16), plans=3, varied=True).eval()
+        network = PlanNetwork(task, hidden=(16, 16), plans=3, varied=varied).eval()
     network.normalise(task.sample(200, seed=1))
     opened = open_folder(task, TrainConfig(steps=1), Launch(root=folder, name="test"))
     return Run(opened, task, BestOfKPolicy(task, network))
