@@ -34,6 +34,7 @@ STEPS = 14
 OPERATIONS = {
     "add": 2, "sub": 2, "mul": 2, "div": 2, "mod": 2, "atan2": 2, "neg": 1, "square": 1, "abs": 1, "relu": 1,
     "floor": 1, "ceil": 1, "round": 1, "sign": 1, "sin": 1, "cos": 1, "tan": 1, "atan": 1, "exp": 1,
+    "sinh": 1, "cosh": 1, "tanh": 1,
     "min": 3, "max": 3, "clip": 3, "norm": 3, "norm1": 3, "norminf": 3,
 }  # fmt: skip
 """Functions of the table with how many arguments they are tried."""

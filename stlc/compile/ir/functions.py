@@ -143,6 +143,11 @@ def _squared(args: Sequence[Bounds]) -> Bounds:
     return (low * low, high * high)
 
 
+def _catenary(args: Sequence[Bounds]) -> Bounds:
+    low, high = _even(args)
+    return (math.cosh(low), math.cosh(high))
+
+
 def _modulo(args: Sequence[Bounds]) -> Bounds:
     low, high = args[1]
     return (min(low, 0.0), max(high, 0.0))
@@ -234,7 +239,7 @@ def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, ru
     return _function(name, doc, rule, fold, c, ("0.0",), **flags)
 
 
-def _smooth(name: str, doc: str, slope: str, bounds: Bounds | None, kernel: str = "") -> Function:
+def _smooth(name: str, doc: str, slope: str, bounds: RangeRule | Bounds | None, kernel: str = "") -> Function:
     """Return the table entry of a smooth function of one argument.
 
     `slope` is the C expression of its derivative, in the argument `{0}` and the result `{r}`. `kernel` is the
@@ -386,9 +391,18 @@ _FUNCTIONS = (
     ),
     _smooth("exp", "`exp(x)` of a plain number.", "{r}", None),
     _smooth("log", "`log(x)`: the natural logarithm of a plain number.", "(1.0 / {0})", None),
+    _smooth(
+        "log10",
+        "`log10(x)`: the logarithm of a plain number to the base 10.",
+        f"({1.0 / math.log(10.0)!r} / {{0}})",
+        None,
+    ),
     _smooth("sin", "`sin(x)` of an angle.", "cos({0})", (-1.0, 1.0)),
     _smooth("cos", "`cos(x)` of an angle.", "(-sin({0}))", (-1.0, 1.0)),
     _smooth("tan", "`tan(x)` of an angle.", "(1.0 + {r} * {r})", (-math.inf, math.inf)),
+    _smooth("sinh", "`sinh(x)`: the hyperbolic sine of a plain number.", "cosh({0})", None),
+    _smooth("cosh", "`cosh(x)`: the hyperbolic cosine of a plain number.", "sinh({0})", _catenary),
+    _smooth("tanh", "`tanh(x)`: the hyperbolic tangent of a plain number.", "(1.0 - {r} * {r})", (-1.0, 1.0)),
     _smooth("asin", "`asin(x)`: an angle.", "(1.0 / sqrt(1.0 - {0} * {0}))", None, "arcsin"),
     _smooth("acos", "`acos(x)`: an angle.", "(-1.0 / sqrt(1.0 - {0} * {0}))", None, "arccos"),
     _smooth("atan", "`atan(x)`: an angle.", "(1.0 / (1.0 + {0} * {0}))", None, "arctan"),

@@ -61,8 +61,8 @@ class TestEveryEntryHasEverything:
 
 
 def test_an_entry_is_all_that_a_function_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    tanh = functions._smooth("tanh", "`tanh(x)`: the hyperbolic tangent.", "(1.0 - {r} * {r})", (-1.0, 1.0))
-    table = MappingProxyType({**FUNCTIONS, "tanh": tanh})
+    asinh = functions._smooth("asinh", "`asinh(x)`.", "(1.0 / sqrt(1.0 + {0} * {0}))", None, "arcsinh")
+    table = MappingProxyType({**FUNCTIONS, "asinh": asinh})
     for module in (
         functions,
         numpy_ops,
@@ -70,17 +70,36 @@ def test_an_entry_is_all_that_a_function_needs(monkeypatch: pytest.MonkeyPatch) 
         *map(__import__("sys").modules.__getitem__, (SlopeWriter.__module__, bounds.__module__)),
     ):
         monkeypatch.setattr(module, "FUNCTIONS", table)
-    monkeypatch.setattr(NumpyOps, "tanh", staticmethod(np.tanh), raising=False)
-    monkeypatch.setattr(TorchOps, "tanh", staticmethod(torch.tanh), raising=False)
-    number = ir.Op("tanh", (X,))
+    monkeypatch.setattr(NumpyOps, "asinh", staticmethod(np.arcsinh), raising=False)
+    monkeypatch.setattr(TorchOps, "asinh", staticmethod(torch.asinh), raising=False)
+    number = ir.Op("asinh", (X,))
     program = ArrayProgram({"y": number})
-    assert "tanh" in functions.callable_names()
-    assert program({"x": np.array([0.5])}, NUMPY)["y"] == pytest.approx(math.tanh(0.5))
-    assert program({"x": torch.tensor([0.5])}, TORCH)["y"].item() == pytest.approx(math.tanh(0.5))
-    assert bounds(number, {}) == (-1.0, 1.0)
+    assert "asinh" in functions.callable_names()
+    assert program({"x": np.array([0.5])}, NUMPY)["y"] == pytest.approx(math.asinh(0.5))
+    assert program({"x": torch.tensor([0.5])}, TORCH)["y"].item() == pytest.approx(math.asinh(0.5))
+    assert bounds(number, {"x": (0.0, 1.0)}) == (0.0, math.asinh(1.0))
     writer = SlopeWriter(lambda leaf: f"x[{leaf.name}]", soft=False)
     register = writer.number(number)
-    assert any("tanh(" in line for line in writer.lines)
+    assert any("asinh(" in line for line in writer.lines)
     lines, gathered = writer.backward({register: "1.0"})
-    assert any(f"(1.0 - {register} * {register})" in line for line in lines)
+    assert any("(1.0 / sqrt(1.0 +" in line for line in lines)
     assert list(gathered) == ["gx[x]"]
+
+
+@pytest.mark.parametrize("name", ["tanh", "sinh", "cosh", "log10"])
+def test_slopes_of_smooth_functions_are_those_of_torch(name: str) -> None:
+    function = FUNCTIONS[name]
+    at = torch.tensor([0.25, 0.5, 2.0], dtype=torch.float64, requires_grad=True)
+    result = ArrayProgram({"y": ir.Op(name, (X,))})({"x": at}, TORCH)["y"]
+    result.sum().backward()
+    assert callable(function.slopes)
+    assert at.grad is not None
+    for x, r, wanted in zip(at.tolist(), result.tolist(), at.grad.tolist(), strict=True):
+        (text,) = function.slopes(repr(r), repr(x))
+        assert eval(text, vars(math)) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_the_range_of_a_catenary_turns_at_0() -> None:
+    number = ir.Op("cosh", (X,))
+    assert bounds(number, {"x": (-2.0, 1.0)}) == (1.0, math.cosh(2.0))
+    assert bounds(number, {"x": (-2.0, -1.0)}) == (math.cosh(1.0), math.cosh(2.0))

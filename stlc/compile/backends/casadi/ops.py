@@ -143,6 +143,7 @@ class CasadiOps:
     add, sub, mul, div = _each(operator.add, operator.sub, operator.mul, operator.truediv)
     exp, expm1, log, log1p = _each(casadi.exp, casadi.expm1, casadi.log, casadi.log1p)
     sin, cos, tan = _each(casadi.sin, casadi.cos, casadi.tan)
+    sinh, cosh, tanh, log10 = _each(casadi.sinh, casadi.cosh, casadi.tanh, casadi.log10)
     asin, acos, atan, atan2 = _each(casadi.asin, casadi.acos, casadi.atan, casadi.atan2)
     sign, floor, ceil = _each(casadi.sign, casadi.floor, casadi.ceil)
     gt, ge, pow, where = _each(operator.gt, operator.ge, operator.pow, casadi.if_else)

@@ -57,7 +57,7 @@ class OnnxOps:
     # operators of ONNX, elementwise
     add, sub, mul, div, pow = map(_binary, ("Add", "Sub", "Mul", "Div", "Pow"))
     abs, sign, floor, ceil, round = map(_unary, ("Abs", "Sign", "Floor", "Ceil", "Round"))
-    sqrt, exp, log, sin, cos = map(_unary, ("Sqrt", "Exp", "Log", "Sin", "Cos"))
+    sqrt, exp, log, sin, cos, tanh = map(_unary, ("Sqrt", "Exp", "Log", "Sin", "Cos", "Tanh"))
     minimum, maximum = map(_binary, ("Min", "Max"))
     gt, ge = map(_comparison, ("Greater", "GreaterOrEqual"))
     both, either = map(_binary, ("And", "Or"))
@@ -95,6 +95,18 @@ class OnnxOps:
             total = self.add(total, part * part) if isinstance(total, Value) else part * part + total
         assert isinstance(total, Value)
         return total.apply("Sqrt")
+
+    def log10(self, x: Value) -> Value:
+        """Logarithm to the base 10."""
+        return x.apply("Log") / math.log(10.0)
+
+    def sinh(self, x: Value) -> Value:
+        """Hyperbolic sine, as `tanh(x) cosh(x)`, which is exact to rounding also near 0."""
+        return x.apply("Tanh") * self.cosh(x)
+
+    def cosh(self, x: Value) -> Value:
+        """Hyperbolic cosine."""
+        return (x.apply("Exp") + (-x).apply("Exp")) / 2.0
 
     # ------------------------------------------------------------------ angles
 
