@@ -17,7 +17,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.environments import MOST, Environments, require_reward, reward_at_end
-from stlc.controller.problem.load import load_task
+from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import usage
@@ -249,9 +249,11 @@ def make(
     By default the system is the one that the specification names. For the other arguments see `SpecEnv`.
 
     Raises:
-        UsageError: there is no such file, no system is named, or an argument is wrong.
+        UsageError: there is no such file, no system is named, the system has no control, or an argument is
+            wrong.
         SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
             together.
     """
     task = load_task(spec, system, hint="give `system`")
+    require_controls(task)
     return SpecEnv(task, steps=steps, reward=reward, normalised=normalised, time=time, world=world)

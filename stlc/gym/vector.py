@@ -14,7 +14,7 @@ from torch import Tensor
 
 from stlc.controller.problem.environments import MOST, Environments, Transition
 from stlc.controller.problem.environments import Reward as EpisodeReward
-from stlc.controller.problem.load import load_task
+from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
 from stlc.diagnostics import usage
 from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation
@@ -207,9 +207,11 @@ def make_vec(
     `SpecVectorEnv`.
 
     Raises:
-        UsageError: there is no such file, no system is named, or an argument is wrong.
+        UsageError: there is no such file, no system is named, the system has no control, or an argument is
+            wrong.
         SpecError, SystemFileError: a file is invalid, or the specification and the system do not fit
             together.
     """
     task = load_task(spec, system, hint="give `system`")
+    require_controls(task)
     return SpecVectorEnv(task, num_envs, reward=reward, normalised=normalised, time=time, autoreset=autoreset)

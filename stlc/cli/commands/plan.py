@@ -68,7 +68,7 @@ def plan(
     Only the planner milp can prove that there is none. Ctrl-C ends the search and keeps the best plans found.
     Without --fail-under, the exit code is 1 if a plan violates the specification.
     """
-    from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named
+    from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.controller.planning.traces import starts_of, trace_of
     from stlc.controller.problem.load import load_task
     from stlc.trace import check_writable, save_trace
@@ -82,7 +82,7 @@ def plan(
     states = starts_of(task, from_, starts, seed)
     search = PlanSearch(task, states, PlanBudget(choice.seconds, judged, _target(target)), seed=seed)
     with PULSE.doing(f"planning, {method}"):
-        solver = planner.prepare(task)
+        solver = prepared(planner, task)
         try:
             solver(search)
         except KeyboardInterrupt:

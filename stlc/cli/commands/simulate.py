@@ -150,6 +150,7 @@ def simulate(
     from stlc.cli.simulate.watch import require_writable
     from stlc.controller.deployment.simulator import Setting
     from stlc.controller.guard.margins import parse_margins
+    from stlc.controller.problem.load import require_controls
     from stlc.controller.training.run import Run
     from stlc.trace import check_writable
 
@@ -161,6 +162,8 @@ def simulate(
     overrides = parse_overrides(set_)
     run = _run_of(run, _planner(method, option, budget, system), system, overrides, runs)
     opened = Run.open(run, root=runs, overrides=overrides)
+    if chosen != "none":
+        require_controls(opened.task, "a guard")
     decl = opened.task.system.decl
     test = decl.test
     show_diagnostics(_longer(opened, steps or test.steps))

@@ -254,7 +254,7 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
 
     `overrides` gives new values of constants and of fields of the system file.
     """
-    from stlc.controller.problem.load import load_task
+    from stlc.controller.problem.load import load_task, require_controls
     from stlc.dynamics.model.feedback import unstable
 
     if not specs:
@@ -267,6 +267,7 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
         hint="stlc train SPEC --system FILE",
         found=lambda path: say(f"system {path}"),
     )
+    require_controls(task)
     show_diagnostics([*task.compiled.warnings, *unstable(task.plain.decl)])
     return task
 

@@ -52,7 +52,8 @@ class Disturbance:
         self._errors = scenario.errors if scenario else ErrorsDecl()
         own = [[seeded(each.initial_seed(), key) for key in range(4)] for each in generators]
         self._streams = tuple(zip(*own, strict=True))
-        self._angle = torch.tensor([control.squash == "angle" for control in system.decl.controls])
+        angles = [control.squash == "angle" for control in system.decl.controls]
+        self._angle = torch.tensor(angles, dtype=torch.bool)
         self._factor, self._offset = self._wrong_gains()
         half = 0.5 * torch.tensor([high - low for low, high in system.actuators]).double()
         self._reach = torch.where(self._angle, 1.0, half)

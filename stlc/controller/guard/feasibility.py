@@ -62,6 +62,9 @@ def solve(
         The best plan found from each state, and its robustness, in float64. The robustness is -inf for a
         state whose search was stopped before it began.
     """
+    if not task.system.decl.controls:  # nothing to search for
+        plans = x0.new_zeros((len(x0), task.horizon, 0), dtype=torch.float64)
+        return SearchResult(x0, plans, task.judge(x0.double(), plans, states=False).rho)
     generator = generator or torch.Generator().manual_seed(0)
     if library is None:
         library = extremes(task, torch.Generator().manual_seed(0))

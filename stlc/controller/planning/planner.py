@@ -233,6 +233,22 @@ def planner_named(name: str, **options: Any) -> Planner:
     return planner
 
 
+def prepared(planner: Planner, task: Task) -> Solver:
+    """Return the function that improves the plans of a search with a planner.
+
+    A system without controls has a single, empty plan, which is judged instead.
+    """
+    return planner.prepare(task) if task.system.decl.controls else _without_choice
+
+
+def _without_choice(search: PlanSearch) -> None:
+    """Judge the only plan of a system without controls."""
+    rows = search.open()
+    with search.charged(rows):
+        search.offer(rows, search.start[rows])
+    search.ended[rows] = True
+
+
 def _value(name: str, key: str, value: object, kind: type) -> Any:
     """Convert the value of a planner's option from text to the option's type `kind`.
 
@@ -287,7 +303,7 @@ def plan(
     names = task.system.names
     if states.dim() != 2 or states.shape[1] != len(names):
         raise usage(f"initial states of {tuple(given.shape)} are not (B, {len(names)})", ", ".join(names))
-    solver = planner_named(method, **options).prepare(task)
+    solver = prepared(planner_named(method, **options), task)
     search = PlanSearch(task, states, budget or PlanBudget(), seed=seed, start=start, progress=progress)
     solver(search)
     return search.result
@@ -299,13 +315,13 @@ class PlannerPolicy(Policy):
     def __init__(self, task: Task, planner: Planner, budget: PlanBudget, *, seed: int = 0) -> None:
         super().__init__(task)
         self._planner, self._budget, self._seed = planner, budget, seed
-        self._prepared = task, planner.prepare(task)
+        self._prepared = task, prepared(planner, task)
         self._short: tuple[Task, Solver] | None = None
 
     def candidates(self, x0: Tensor) -> Tensor:
         """The best plan found from each state: (B, n) -> (B, 1, T, m)."""
         if self._prepared[0] is not self.task:
-            self._prepared = self.task, self._planner.prepare(self.task)
+            self._prepared = self.task, prepared(self._planner, self.task)
         return self._searched(x0, self._prepared[1], self._budget)
 
     def continuation(self, x0: Tensor) -> Tensor:
@@ -314,7 +330,7 @@ class PlannerPolicy(Policy):
         The planner of this policy is not used here, because it would take too long.
         """
         if self._short is None or self._short[0] is not self.task:
-            self._short = self.task, planner_named("search", tries=SHORT).prepare(self.task)
+            self._short = self.task, prepared(planner_named("search", tries=SHORT), self.task)
         return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]
 
     def _searched(self, x0: Tensor, solver: Solver, budget: PlanBudget) -> Tensor:

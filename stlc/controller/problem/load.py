@@ -18,6 +18,19 @@ HINT = "--system FILE"
 """Advice that most commands print if no system is named."""
 
 
+def require_controls(task: Task, who: str = "a policy") -> None:
+    """Raise UsageError (U101) if the system of a task has no control.
+
+    `who` would have chosen its values: `a policy`, `a guard`.
+    """
+    if task.system.decl.controls:
+        return
+    message = f"the system `{task.system.decl.name}` has no control: {who} has nothing to choose"
+    raise usage(
+        message, "`stlc plan SPEC` judges it from random initial states", "control: {u: {range: [-1, 1]}}"
+    )
+
+
 def load_task(
     spec: Path | str,
     system: Path | str | None = None,

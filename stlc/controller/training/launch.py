@@ -9,6 +9,7 @@ from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.methods.plan import planner_of
+from stlc.controller.planning.planner import prepared
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import train
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
@@ -125,7 +126,7 @@ def open_planner(task: Task, choice: PlannerChoice, *, seed: int, launch: Launch
         UsageError: U101, there is no such planner or option, or the planner cannot plan for the task.
     """
     config = TrainConfig(method="plan", planner=choice, seed=seed)
-    planner_of(choice.name, choice.options).prepare(task)  # a refusal leaves no run behind
+    prepared(planner_of(choice.name, choice.options), task)  # a refusal leaves no run behind
     folder = open_folder(task, config, launch)
     save_config(folder, resolve_config(task, config))
     folder.finish("finished", None)

@@ -15,6 +15,7 @@ import torch
 
 from stlc.controller.evaluation.held_out import silent
 from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.problem.load import require_controls
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
 from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
@@ -108,6 +109,7 @@ def train(
             writes files.
 
     Raises:
+        UsageError: U101, the system has no control.
         SystemFileError: S301, hardly any initial state is admissible; S302, predicted states are not finite;
             S304, the declared mirror is not a symmetry of the system or the specification.
         MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, the process
@@ -115,6 +117,7 @@ def train(
         RunError: R401, the loss or its gradient is not finite.
 
     """
+    require_controls(task)
     now = clock_of(config.clock)
     started = now()
     keep_freed_memory()

@@ -44,7 +44,7 @@ from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
 
 Ranges = tuple[tuple[float, float], ...]
 
-_RANGE = raw({"type": "array", "prefixItems": [VECTOR, VECTOR], "minItems": 2, "maxItems": 2})
+RANGE = raw({"type": "array", "prefixItems": [VECTOR, VECTOR], "minItems": 2, "maxItems": 2})
 _SIZE = integer(high=MAX_COMPONENTS)
 _ENUM = raw({"type": ["array", "object"]})
 _FORMULA = raw(EXPRESSION)
@@ -83,7 +83,7 @@ class StateKeys:
     """The keys that the declaration of one state may have."""
 
     unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
-    ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
+    ends: Node | None = key(RANGE, "lower and upper end, numbers or vectors", name="range")
     clamp: bool = key(FLAG, "kept within `range` after every step", False)
     role: str = key(word(("state", "env")), "`env`: changed by events alone", "state")
     enum: Node | None = key(_ENUM, "members, by name or by name and value")
@@ -100,7 +100,7 @@ class ParamKeys:
     """The keys that the declaration of one parameter may have."""
 
     unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
-    ends: Node | None = key(_RANGE, "drawn uniformly from it unless `draw` is given", name="range")
+    ends: Node | None = key(RANGE, "drawn uniformly from it unless `draw` is given", name="range")
     draw: Node | None = key(raw(VECTOR), "distribution of the value")
     size: int | None = key(_SIZE, "components of a vector")
     enum: Node | None = key(_ENUM, "members, by name or by name and value")
@@ -112,7 +112,7 @@ class ControlKeys:
     """The keys that the declaration of one control may have."""
 
     unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
-    ends: Node | None = key(_RANGE, "lower and upper end, numbers or vectors", name="range")
+    ends: Node | None = key(RANGE, "lower and upper end, numbers or vectors", name="range")
     squash: Squash = key(
         word(get_args(Squash)), "map from a network output to the range; `angle`: a direction", "tanh"
     )
@@ -229,7 +229,7 @@ def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) ->
     elif keys.boolean:
         shared = Column("", keys.unit, "bool", "state", 0.0, 1.0, (), fact=True)
     else:
-        bounds = _ranges(keys, where, cx) or ((None, None),) * len(called)
+        bounds = read_ranges(keys.ends, keys.unit, len(called), where, cx) or ((None, None),) * len(called)
         return tuple(
             Column(each, keys.unit, low=low, high=high)
             for each, (low, high) in zip(called, bounds, strict=True)
@@ -257,13 +257,13 @@ def _members(node: Node, where: str, reader: Reader) -> tuple[tuple[str, float],
     return tuple(members)
 
 
-def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) -> Ranges | None:
-    """Return (low, high) from `range: [low, high]`, in the unit of the state, parameter or control.
+def read_ranges(node: Node | None, unit: Unit, size: int, where: str, cx: Context) -> Ranges | None:
+    """Return (low, high) from `range: [low, high]`, in `unit`, for each of `size` components.
 
     Each of `low` and `high` is one number for all components, or a vector with one entry per component.
     `where` names the declaration in messages.
     """
-    node, reader, here = keys.ends, cx.reader, cx.here
+    reader, here = cx.reader, cx.here
     if node is None:
         return None
     items = reader.items(node, f"`range` of {where}")
@@ -271,8 +271,8 @@ def _ranges(keys: StateKeys | ParamKeys | ControlKeys, where: str, cx: Context) 
         if items or (isinstance(node, Sequence) and not node.items):
             reader.wrong(node, f"`range` of {where}", "two numbers `[low, high]`")
         return None
-    lows = here.constants(items[0], f"the lower bound of {where}", keys.unit, keys.size or 1)
-    highs = here.constants(items[1], f"the upper bound of {where}", keys.unit, keys.size or 1)
+    lows = here.constants(items[0], f"the lower bound of {where}", unit, size)
+    highs = here.constants(items[1], f"the upper bound of {where}", unit, size)
     if lows is None or highs is None:
         return None
     for low, high in zip(lows, highs, strict=True):
@@ -418,9 +418,6 @@ def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
 def read_controls(node: Node | None, cx: Context) -> None:
     """Read the section `control`, and declare its controls as names."""
     reader, names = cx.reader, cx.names
-    if node is None:
-        advice = "control: {u: {range: [-1, 1]}}"
-        reader.report("S102", "the file lacks `control`", reader.source.span(0, 1), advice)
     for entry in reader.entries(node, "`control`"):
         names.declare(entry.key, "control", reader)
         name = entry.key.text
@@ -430,7 +427,7 @@ def read_controls(node: Node | None, cx: Context) -> None:
             advice = f"{name}: {{range: [-1, 1]}}"
             reader.report("S204", f"{where} has no range", entry.key.span, advice, label="needs bounds")
         called = component_names(name, keys.size)
-        bounds = _ranges(keys, where, here) or ((-1.0, 1.0),) * len(called)
+        bounds = read_ranges(keys.ends, keys.unit, len(called), where, here) or ((-1.0, 1.0),) * len(called)
         common = max(low for low, _ in bounds), min(high for _, high in bounds)
         levels = read_levels(keys.levels, where, keys.unit, common, here)
         for each, ends in zip(called, bounds, strict=True):

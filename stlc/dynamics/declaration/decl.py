@@ -18,6 +18,7 @@ from stlc.diagnostics import Diagnostic
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.init import InitDecl, Situation
+from stlc.dynamics.declaration.inputs import InputDecl
 from stlc.dynamics.declaration.learning import Feedback, ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.declaration.motion import Assign, JumpDecl
 from stlc.dynamics.schema.names import ControlDecl
@@ -70,6 +71,11 @@ class SystemDecl:
         overrides: values of `--set`.
         places: name of a state, control, constant or definition -> source location of its declaration.
         warnings: findings that are not errors.
+        inputs: input signals, which are functions of time that no policy chooses.
+        updates: columns that are computed at every sample after flow and jumps, in order. A name in their
+            values stands for the value at that sample; with the suffix `BEFORE`, at the sample before.
+        hidden: columns that policies do not observe by default: the numbers that determine input signals,
+            clocks, and earlier values.
     """
 
     name: str
@@ -102,6 +108,9 @@ class SystemDecl:
     overrides: Mapping[str, str] = field(default_factory=dict)
     places: Mapping[str, Span] = field(default_factory=dict, repr=False)
     warnings: tuple[Diagnostic, ...] = field(default=(), repr=False)
+    inputs: tuple[InputDecl, ...] = ()
+    updates: tuple[Assign, ...] = ()
+    hidden: tuple[str, ...] = ()
 
     @property
     def hash(self) -> str:
@@ -114,6 +123,8 @@ class SystemDecl:
     def learnt(self) -> str:
         """SHA-256 of the fields that determine what a policy learns, in hexadecimal."""
         text = repr([getattr(self, name) for name in LEARNT])
+        if self.updates:
+            text += repr((self.updates, self.init.computed))
         text = re.sub(r"\b[A-Z]\w+(?=\()", lambda found: _HASHED_AS.get(found[0], found[0]), text)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -176,8 +187,12 @@ def describe(decl: SystemDecl) -> str:
         (jump.name, f"when {jump.text}", ", ".join(f"{each.name} := {each.text}" for each in jump.resets))
         for jump in decl.jumps
     ]
+    updates = {assign.name: f"= {assign.text}" for assign in decl.updates}
+    apart = {*decl.hidden, *(each.name for each in decl.inputs)}
+    states = [column for column in decl.signature.columns if column.name not in apart]
     blocks = (
-        ("states", [_state(column, flow.get(column.name), rate) for column in decl.signature.columns]),
+        ("states", [_state(each, updates.get(each.name) or flow.get(each.name), rate) for each in states]),
+        ("input signals", [_input(each) for each in decl.inputs]),
         ("controls", [_control(decl, index) for index in range(len(decl.controls))]),
         ("feedback beneath the plans", _feedback(decl)),
         ("jumps", jumps),
@@ -197,6 +212,13 @@ def _state(column: Column, flow: str | None, rate: str) -> Row:
         else "constant"
     )
     return column.name, f"[{column.unit}]" if column.unit.text else "", _values(column), moves
+
+
+def _input(decl: InputDecl) -> Row:
+    unit = f"[{decl.unit}]" if decl.unit.text else ""
+    pieces = "constant" if not decl.moves else f"{decl.pieces} pieces, {decl.interpolate}"
+    span = f"{float(decl.duration):g} s" + (", free times" if decl.free_times else "")
+    return decl.name, unit, f"[{decl.low:g}, {decl.high:g}]", f"{pieces}, {span}" if decl.moves else pieces
 
 
 def _values(column: Column) -> str:

@@ -96,6 +96,7 @@ class InitDecl:
         where_text: source text of these conditions.
         params: distributions of the parameters. They are drawn first; a situation may draw a parameter again.
         override: assignments drawn last, which replace the values that situations draw.
+        computed: assignments made after all draws, of columns that follow from the others.
         span: source location of the section, for messages.
     """
 
@@ -105,6 +106,7 @@ class InitDecl:
     params: tuple[Assign, ...] = ()
     override: tuple[Assign, ...] = ()
     span: Span | None = field(default=None, compare=False, repr=False)
+    computed: tuple[Assign, ...] = field(default=(), repr=False)
 
 
 @dataclass(repr=False, eq=False)
@@ -143,8 +145,14 @@ class AxisKeys:
 # ------------------------------------------------------------------------------ situations
 
 
-def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -> InitDecl:
-    """Read the section `init`; the assignments `params` (distributions of parameters) are drawn first."""
+def read_init(
+    node: Node | None, cx: Context, params: tuple[Assign, ...] = (), computed: tuple[Assign, ...] = ()
+) -> InitDecl:
+    """Read the section `init`.
+
+    The assignments `params` (distributions of parameters) are drawn first. Those in `computed` are made last;
+    they give the columns that follow from the drawn ones.
+    """
     reader = cx.reader
     if node is None:
         advice = "init: {mixture: [{draw: {x: 0}}]}"
@@ -156,7 +164,9 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
     if len(given) > 1:
         message = f"`init` takes one of `mixture`, `grid` and `from`, not {len(given)}"
         reader.report("S102", message, first_line(node.span))
-    draws = _Draws(cx, frozenset(assign.name for assign in params))
+    draws = _Draws(
+        cx, frozenset(assign.name for assign in params), computed=frozenset(each.name for each in computed)
+    )
     if "mixture" in given or not given:
         for name, value in (("draw", keys.draw), ("let", keys.let)):
             if value is not None:
@@ -171,7 +181,8 @@ def read_init(node: Node | None, cx: Context, params: tuple[Assign, ...] = ()) -
     formulas = [cx.here.formula(item, "a line of `where`") for item in items]
     span = node.span if keys.where is None else keys.where.span
     where = tuple(each for each in formulas if each is not None)
-    return InitDecl(mixture, where, tuple(map(written, items)), params, span=first_line(span))
+    texts = tuple(map(written, items))
+    return InitDecl(mixture, where, texts, params, span=first_line(span), computed=computed)
 
 
 def _mixture(items: tuple[Node, ...], outer: _Draws) -> tuple[Situation, ...]:
@@ -192,7 +203,7 @@ def _situation(node: Node, outer: _Draws) -> Situation:
     `outer` holds the assignments made before the situation is drawn; the situation may read their names.
     """
     keys = read(SituationKeys, outer.cx, node, "a situation")
-    draws = _Draws(outer.cx, outer.ready, outer.locals)
+    draws = _Draws(outer.cx, outer.ready, outer.locals, outer.computed)
     draws.read(keys)
     choices = outer.cx.reader.items(keys.choose, "`choose`")
     branches = _mixture(choices, draws)
@@ -210,16 +221,22 @@ class _Draws:
         found: the assignments read, in the order in which they are drawn.
         ready: columns, and components of local names, that already have a value.
         locals: local names that already have a value.
+        computed: columns that are not drawn, since they follow from the others.
     """
 
     def __init__(
-        self, cx: Context, ready: frozenset[str], known: MappingType[str, Name] = MappingProxyType({})
+        self,
+        cx: Context,
+        ready: frozenset[str],
+        known: MappingType[str, Name] = MappingProxyType({}),
+        computed: frozenset[str] = frozenset(),
     ) -> None:
         self.cx = cx
         self.found: list[Assign] = []
         self.failed = False
         self.ready = ready
         self.locals = dict(known)
+        self.computed = computed
         self.unresolved: dict[str, Node] = {}
 
     @property
@@ -232,7 +249,8 @@ class _Draws:
 
         The message is located at `node` and begins with `called`, such as "this situation".
         """
-        undrawn = [column.name for column in self.cx.names.columns if column.name not in self.ready]
+        known = self.ready | self.computed
+        undrawn = [column.name for column in self.cx.names.columns if column.name not in known]
         missing = list(dict.fromkeys(map(base_name, undrawn)))
         if missing and not self.failed:
             listed = ", ".join(f"`{column}`" for column in missing)
@@ -269,6 +287,13 @@ class _Draws:
         """
         columns = states_of(entry, where, self.cx)
         if not columns:
+            return
+        if any(column.name in self.computed for column in columns):
+            name = entry.key.text
+            message = f"`{name}` follows from the other states, and cannot be drawn"
+            near = f"{name}_values"
+            advice = f"draw `{near}`" if near in self.cx.names.places else ""
+            self.cx.reader.report("S202", message, entry.key.span, advice)
             return
         self._needed(entry.value)
         self.found.extend(shared_draws(state_assigns(entry, where, self.drawing)))
@@ -320,7 +345,8 @@ def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
     missing = [
         column.name
         for column in cx.names.columns
-        if column.name not in draws.ready and not {column.name, base_name(column.name)} & rest
+        if column.name not in draws.ready | draws.computed
+        and not {column.name, base_name(column.name)} & rest
     ]
     points: GridDecl | FileDecl | None
     if keys.grid is not None:

@@ -6,10 +6,25 @@ and, if the switching times are free, these times. The numbers are drawn once pe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from itertools import pairwise
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
+from stlc.compile.frontend.scope import Known, column_value
+from stlc.compile.ir import nodes as ir
+from stlc.dynamics.declaration.columns import RANGE, name_columns, read_ranges, unit_text
+from stlc.dynamics.declaration.motion import Assign
+from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
+from stlc.dynamics.model.algebra import add, multiply, substitute
+from stlc.dynamics.schema.expressions import SECOND
+from stlc.dynamics.schema.names import Context, base_name
+from stlc.dynamics.schema.reader import first_line
+from stlc.dynamics.schema.record import OF, SECONDS, integer, key, read, word
+from stlc.dynamics.schema.yaml_nodes import Entry, Node
+from stlc.signature import Column
 from stlc.units import Unit
 
 if TYPE_CHECKING:
@@ -19,6 +34,7 @@ if TYPE_CHECKING:
     Floats: TypeAlias = NDArray[np.float64]
 
 Interpolate: TypeAlias = Literal["hold", "linear", "pchip"]
+MAX_PIECES = 200
 SLACK = 1e-9
 """Share of the duration by which a sample may precede a switching time that it is meant to coincide with."""
 
@@ -56,6 +72,11 @@ class InputDecl:
     def points(self) -> int:
         """Number of values."""
         return self.pieces if self.interpolate == "hold" else self.pieces + 1
+
+    @property
+    def moves(self) -> bool:
+        """Whether the signal may change over time."""
+        return self.points > 1
 
     @property
     def values(self) -> tuple[str, ...]:
@@ -186,3 +207,214 @@ def _end_slope(mean: Floats, following: Floats, width: Floats, next_width: Float
         mean * following > 0.0, parabola, np.clip(parabola, *np.sort((0.0 * mean, 3.0 * mean), axis=0))
     )
     return np.asarray(np.where(parabola * mean > 0.0, limited, 0.0))
+
+
+# ------------------------------------------------------------------------------ the section
+
+
+@dataclass(repr=False, eq=False)
+class InputKeys:
+    """The keys that the declaration of one input signal may have."""
+
+    unit: Unit = key(unit_text, "unit of the values", Unit())
+    ends: Node | None = key(
+        RANGE, "lower and upper end, between which values are drawn", name="range", required=True
+    )
+    pieces: int = key(integer(high=MAX_PIECES), "number of pieces", 1)
+    interpolate: Interpolate = key(
+        word(get_args(Interpolate)),
+        "`hold`: constant pieces; `linear`, `pchip`: between values at their ends",
+        "hold",
+    )
+    duration: Fraction | None = key(SECONDS, "length of all pieces together; the horizon unless given")
+    times: str = key(word(("fixed", "free")), "`free`: the times between pieces are drawn, too", "fixed")
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The section `inputs`: the input signals, and the columns that they add to the system."""
+
+    signals: tuple[InputDecl, ...] = ()
+    sampled: Sampled = field(default_factory=Sampled)
+
+
+def read_inputs(node: Node | None, cx: Context) -> Inputs:
+    """Read the section `inputs`, and declare its signals and the numbers that determine them as names."""
+    signals: list[InputDecl] = []
+    sampled = Sampled()
+    for entry in cx.reader.entries(node, "`inputs`"):
+        if cx.names.declare(entry.key, "input signal", cx.reader):
+            signal = _signal(entry, cx)
+            if signal is not None:
+                signals.append(signal)
+                sampled += _sampled(signal, entry, cx)
+    if node is not None and any(signal.moves for signal in signals):
+        flows = any(signal.interpolate != "hold" for signal in signals)
+        sampled = clock(cx, first_line(node.span), flows=flows) + sampled
+    return Inputs(tuple(signals), sampled)
+
+
+def _signal(entry: Entry, cx: Context) -> InputDecl | None:
+    """Read the declaration of one input signal; None if its range is missing or invalid."""
+    where = f"the input signal `{entry.key.text}`"
+    keys = read(InputKeys, cx.plain, entry.value, where, OF)
+    ranges = read_ranges(keys.ends, keys.unit, 1, where, cx.plain)
+    if ranges is None:
+        return None
+    duration = keys.duration or cx.horizon * cx.dt or Fraction(1)
+    return InputDecl(
+        entry.key.text, keys.unit, *ranges[0], keys.pieces, keys.interpolate, duration, keys.times == "free"
+    )
+
+
+def _sampled(decl: InputDecl, entry: Entry, cx: Context) -> Sampled:
+    """Declare the columns of an input signal: its present value, and the numbers that determine it.
+
+    `entry` is its declaration in the file.
+    """
+    names, span = cx.names, entry.key.span
+    present = Column(decl.name, decl.unit, "real", "env", decl.low, decl.high)
+    names.columns.append(present)
+    values, times = Column("", decl.unit, low=decl.low, high=decl.high), Column("", SECOND, low=0.0)
+    times = replace(times, high=float(decl.duration))
+    for column, group in ((values, decl.values), (times, decl.times)):
+        for name in group:
+            declared(cx, replace(column, name=name, role="env"), span)
+        if group:
+            names.places.setdefault(base_name(group[0]), span)
+    name_columns(names, "input signal")
+    value = _present(decl, cx.dt)
+    if decl.interpolate != "hold" and not cx.discrete:
+        known = column_value(present)
+        names.entries[decl.name] = Known(
+            replace(known, num=substitute(known.num, {decl.name: value})), "input signal", span
+        )
+    shown = Assign(decl.name, value, decl.interpolate)
+    return Sampled(_draws(decl), (shown,), (shown,) if decl.moves else (), (), decl.columns)
+
+
+def _draws(decl: InputDecl) -> tuple[Assign, ...]:
+    """Return the distributions of the numbers of an input signal, as `drawn_numbers` has them."""
+    low, high = ir.Const(decl.low), ir.Const(decl.high)
+    found = [
+        Assign(name, ir.Op("uniform", (low, high)), f"uniform({decl.low:g}, {decl.high:g})")
+        for name in decl.values
+    ]
+    length = ir.Const(float(decl.duration))
+    rest: ir.Num = length
+    for index, name in enumerate(decl.times):
+        share = ir.Op("uniform", (ir.Const(0.0), ir.Const(1.0)))
+        root = ir.Op("pow", (share, ir.Const(1.0 / (len(decl.times) - index))))
+        found.append(Assign(name, ir.Op("sub", (length, multiply(rest, root))), "sorted uniform times"))
+        rest = ir.Op("sub", (length, ir.Signal(name)))
+    return tuple(found)
+
+
+def _present(decl: InputDecl, dt: Fraction) -> ir.Num:
+    """Return the value of an input signal now, as an expression of the clock and the signal's numbers."""
+    points: list[ir.Num] = [ir.Signal(name) for name in decl.values]
+    if decl.interpolate == "hold":
+        value = points[0]
+        for point, passed in zip(points[1:], _passed(decl, dt), strict=True):
+            value = ir.Where(ir.Predicate(passed), point, value)
+        return value
+    ends = _ends(decl)
+    least = ir.Const(SLACK * float(decl.duration))
+    widths = [_largest(_minus(after, before), least) for before, after in pairwise(ends)]
+    now = multiply(ir.Signal(CLOCK), ir.Const(float(dt)))
+    unit = (ir.Const(0.0), ir.Const(1.0))
+    shares = [
+        ir.Op("clip", (_over(_minus(now, before), width), *unit))
+        for before, width in zip(ends, widths, strict=False)
+    ]
+    rises = [_minus(after, before) for before, after in pairwise(points)]
+    if decl.interpolate == "linear":
+        parts: Sequence[ir.Num] = [multiply(*each) for each in zip(rises, shares, strict=True)]
+    else:
+        slopes = _slopes(rises, widths)
+        parts = [
+            _cubic(rise, share, multiply(width, left), multiply(width, right))
+            for rise, share, width, (left, right) in zip(rises, shares, widths, pairwise(slopes), strict=True)
+        ]
+    value = points[0]
+    for part in parts:
+        value = add(value, part)
+    return value
+
+
+def _passed(decl: InputDecl, dt: Fraction) -> tuple[ir.Num, ...]:
+    """Return numbers that are not negative at samples at or after the times at which pieces begin.
+
+    There is one for each piece but the first.
+    """
+    count = ir.Signal(CLOCK)
+    if not decl.free_times:
+        return tuple(_minus(count, ir.Const(float(math.ceil(end / dt)))) for end in decl.ends[1:-1])
+    slack = ir.Const(SLACK * float(decl.duration))
+    now = add(multiply(count, ir.Const(float(dt))), slack)
+    return tuple(_minus(now, ir.Signal(name)) for name in decl.times)
+
+
+def _ends(decl: InputDecl) -> tuple[ir.Num, ...]:
+    """Return the ends of the pieces in seconds."""
+    if not decl.free_times:
+        return tuple(ir.Const(float(end)) for end in decl.ends)
+    inner = (ir.Signal(name) for name in decl.times)
+    return (ir.Const(0.0), *inner, ir.Const(float(decl.duration)))
+
+
+def _cubic(rise: ir.Num, share: ir.Num, left: ir.Num, right: ir.Num) -> ir.Num:
+    """Return the increase of a cubic polynomial over the first `share` of its piece.
+
+    `rise` is the increase over the whole piece; `left` and `right` are the derivatives at its ends, times its
+    length.
+    """
+    rest = _minus(ir.Const(1.0), share)
+    eased = multiply(ir.Op("square", (share,)), _minus(ir.Const(3.0), multiply(ir.Const(2.0), share)))
+    bent = multiply(multiply(share, rest), _minus(multiply(left, rest), multiply(right, share)))
+    return add(multiply(rise, eased), bent)
+
+
+def _slopes(rises: Sequence[ir.Num], widths: Sequence[ir.Num]) -> list[ir.Num]:
+    """Return the derivatives at the ends of the pieces, as `pchip_slopes` has them."""
+    means = [_over(rise, width) for rise, width in zip(rises, widths, strict=True)]
+    if len(means) == 1:
+        return [means[0], means[0]]
+    found = [_end(means[0], means[1], widths[0], widths[1])]
+    for (left, right), (before, after) in zip(pairwise(means), pairwise(widths), strict=True):
+        near = add(multiply(ir.Const(2.0), after), before)
+        far = add(after, multiply(ir.Const(2.0), before))
+        below = add(multiply(near, ir.Op("abs", (right,))), multiply(far, ir.Op("abs", (left,))))
+        above = multiply(ir.Op("relu", (multiply(left, right),)), multiply(ir.Const(3.0), add(before, after)))
+        turned = multiply(ir.Op("sign", (left,)), above)
+        found.append(_over(turned, _largest(below, ir.Const(1e-30))))
+    return [*found, _end(means[-1], means[-2], widths[-1], widths[-2])]
+
+
+def _end(mean: ir.Num, following: ir.Num, width: ir.Num, next_width: ir.Num) -> ir.Num:
+    """Return the derivative at an end, from mean slopes and lengths of the outer piece and the next."""
+    both = add(multiply(ir.Const(2.0), width), next_width)
+    above = _minus(multiply(both, mean), multiply(width, following))
+    parabola = _over(above, add(width, next_width))
+    most = multiply(ir.Const(3.0), mean)
+    zero = ir.Const(0.0)
+    bounded = ir.Op("clip", (parabola, ir.Op("min", (zero, most)), ir.Op("max", (zero, most))))
+    same = ir.Predicate(multiply(mean, following), strict=True)
+    ahead = ir.Predicate(multiply(parabola, mean), strict=True)
+    return ir.Where(ahead, ir.Where(same, parabola, bounded), zero)
+
+
+def _minus(left: ir.Num, right: ir.Num) -> ir.Num:
+    if isinstance(left, ir.Const) and isinstance(right, ir.Const):
+        return ir.Const(left.value - right.value)
+    return ir.Op("sub", (left, right))
+
+
+def _over(above: ir.Num, below: ir.Num) -> ir.Num:
+    return ir.Op("div", (above, below))
+
+
+def _largest(left: ir.Num, right: ir.Const) -> ir.Num:
+    if isinstance(left, ir.Const):
+        return ir.Const(max(left.value, right.value))
+    return ir.Op("max", (left, right))

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
+from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.columns import (
     Clockwork,
@@ -34,6 +35,7 @@ from stlc.dynamics.declaration.deployment import (
 )
 from stlc.dynamics.declaration.functions import FunctionDecl, FunctionKeys, read_functions
 from stlc.dynamics.declaration.init import InitDecl, InitKeys, read_init
+from stlc.dynamics.declaration.inputs import InputDecl, InputKeys, read_inputs
 from stlc.dynamics.declaration.learning import ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.declaration.motion import (
     Assign,
@@ -44,6 +46,7 @@ from stlc.dynamics.declaration.motion import (
     shared_draws,
     state_assigns,
 )
+from stlc.dynamics.declaration.sampled import Sampled, in_order
 from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader, first_line
@@ -88,6 +91,7 @@ class SystemKeys:
         "constants of a trajectory, drawn at its start",
     )
     state: Node | None = key(section(StateKeys, free=True), "states, in the order of the columns")
+    inputs: Node | None = key(section(InputKeys, free=True), "input signals that no policy chooses")
     control: Node | None = key(section(ControlKeys, free=True), "controls")
     def_: Node | None = key(raw(mapping_of(EXPRESSION)), "named sub-expressions", name="def")
     flow: Node | None = key(raw(mapping_of(VECTOR)), "derivatives, or next values of a discrete system")
@@ -184,7 +188,7 @@ def _declaration(
     named = _named(found, reader)
     names, cx = named.cx.names, named.cx
     timer_flow, timer_jumps = read_timers(named.states, cx)
-    flow = (*timer_flow, *read_flow(found.flow, cx))
+    flow = (*timer_flow, *read_flow(found.flow, cx), *named.sampled.flow)
     jumps = (*read_jumps(found.jump, cx), *timer_jumps)
     _report_idle(found.control, cx, flow, jumps)
     spec = reader.text(found.spec, "`spec`")
@@ -207,9 +211,11 @@ def _declaration(
         clamps=MappingProxyType(
             {c.name: (c.low, c.high) for c in clamped if c.low is not None and c.high is not None}
         ),
-        init=_given_states(read_init(found.init, cx, named.drawn), overrides, cx),
+        init=_given_states(
+            read_init(found.init, cx, named.drawn, in_order(named.sampled.initial, cx)), overrides, named
+        ),
         objective=read(ObjectiveDecl, cx, found.objective, "`objective`"),
-        policy=read(PolicyDecl, cx, found.policy, "`policy`"),
+        policy=_observing(read(PolicyDecl, cx, found.policy, "`policy`"), named),
         train=read(TrainDecl, cx, found.train, "`train`"),
         backup=read_backup(cx, found.backup, "`backup`"),
         test=read(TestDecl, cx.timed, found.test, "`test`"),
@@ -218,7 +224,19 @@ def _declaration(
         overrides=MappingProxyType(dict(overrides)),
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
+        inputs=named.inputs,
+        updates=in_order(named.sampled.updates, cx),
+        hidden=named.sampled.hidden,
     )
+
+
+def _observing(policy: PolicyDecl, named: _Named) -> PolicyDecl:
+    """Return `policy`; by default it observes no hidden columns, such as future values of input signals."""
+    hidden = named.sampled.hidden
+    if policy.observe or not hidden:
+        return policy
+    seen = (column.name for column in named.cx.names.columns if column.name not in hidden)
+    return replace(policy, observe=tuple(map(ir.Signal, seen)))
 
 
 def _report_idle(
@@ -248,6 +266,8 @@ class _Named:
         drawn: assignments that are made before the other states are drawn. They draw the parameters, and set
             to false the bool states that record which jumps with `once` have happened.
         functions: external functions.
+        inputs: input signals.
+        sampled: columns that are computed at every sample.
     """
 
     cx: Context
@@ -255,6 +275,8 @@ class _Named:
     states: dict[str, StateKeys]
     drawn: tuple[Assign, ...]
     functions: tuple[FunctionDecl, ...]
+    inputs: tuple[InputDecl, ...]
+    sampled: Sampled
 
 
 def _named(found: SystemKeys, reader: Reader) -> _Named:
@@ -266,10 +288,12 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
     states = read_states(found.state, cx)
     drawn = read_params(found.param, cx) + read_latches(found.jump, cx)
     name_columns(cx.names, "state")
+    inputs = read_inputs(found.inputs, cx)
     read_controls(found.control, cx)
     functions = read_functions(found.functions, cx.plain)
     read_definitions(found.def_, cx)
-    return _Named(cx.plain, clock, states, drawn, functions)
+    drawn += inputs.sampled.drawn
+    return _Named(cx.plain, clock, states, drawn, functions, inputs.signals, inputs.sampled)
 
 
 @dataclass(frozen=True, slots=True)
@@ -422,17 +446,22 @@ def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> No
     return node
 
 
-def _given_states(init: InitDecl, overrides: MappingType[str, str], cx: Context) -> InitDecl:
+def _given_states(init: InitDecl, overrides: MappingType[str, str], named: _Named) -> InitDecl:
     """Return `init`, with values from `overrides` in place of the initial values of some states.
 
     An entry such as `x=3m`, or `x` with a distribution, replaces the value that is drawn for `x`.
     """
-    params = {base_name(assign.name) for assign in init.params}
+    cx, signals = named.cx, {name for each in named.inputs for name in each.columns}
+    params = {base_name(assign.name) for assign in init.params if assign.name not in signals}
+    computed = {assign.name for assign in init.computed}
     found: list[Assign] = []
     for name, text in overrides.items():
         if cx.names.group(name) and name not in params:
             node = _value(name, text, cx.reader)
-            if node is not None:
+            if node is not None and name in computed:
+                advice = f"give `{name}_values`" if any(each.name == name for each in named.inputs) else ""
+                cx.reader.report("S202", f"`{name}` follows from the other states", node.span, advice)
+            elif node is not None:
                 entry = Entry(Scalar(node.span, name), node)
                 found.extend(shared_draws(state_assigns(entry, "`--set`", cx.drawing({}))))
     return replace(init, override=(*init.override, *found))

@@ -227,6 +227,7 @@ class InitialStates:
         self._params = tuple(Drawing(assign) for assign in decl.params)
         self._mixture = _Mixture(decl.mixture)
         self._override = tuple(Drawing(assign) for assign in decl.override)
+        self._computed = tuple(Drawing(assign) for assign in decl.computed)
         self._where = ArrayProgram({f"{i}": ir.Indicator(cond) for i, cond in enumerate(decl.where)})
 
     @property
@@ -266,7 +267,7 @@ class InitialStates:
         for drawing in self._params:
             table[drawing.name] = drawing(table, rows)
         table = self._mixture(table, rows)
-        for drawing in self._override:
+        for drawing in (*self._override, *self._computed):
             table[drawing.name] = drawing(table, rows)
         return torch.stack([table[name] for name in self.names], 1)
 

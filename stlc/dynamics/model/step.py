@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
-from stlc.dynamics.model.algebra import Assignments, add, multiply, substitute
+from stlc.dynamics.declaration.sampled import BEFORE
+from stlc.dynamics.model.algebra import Assignments, add, multiply, names_in, substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.integrators._tableau import State
 
@@ -44,6 +45,8 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
         moved |= {assign.name for assign in jump.resets}
     reset = {assign.name for jump in decl.jumps for assign in jump.resets}
     state = {name: _clamped(decl, name, num) if name in reset else num for name, num in state.items()}
+    state = _updated(decl, writer, state)
+    moved |= {assign.name for assign in decl.updates}
     ordered = [name for name in decl.signature.names if name in moved | set(decl.clamps)]
     return ModelStep(tuple(writer.lets), {name: state[name] for name in ordered})
 
@@ -114,6 +117,22 @@ def _jump(jump: JumpDecl, state: State, *, soft: bool) -> State:
         else:
             changed[assign.name] = ir.Where(jump.guard, assign.value, flowed)
     return changed
+
+
+def _updated(decl: SystemDecl, writer: Assignments, state: State) -> State:
+    """Return the states with the columns that are computed at every sample.
+
+    `state` is the result of flow and jumps. Intermediate results are appended to `writer`.
+    """
+    if not decl.updates:
+        return state
+    before = {f"{name}{BEFORE}": ir.Signal(name) for name in decl.signature.names}
+    read = frozenset[str]().union(*(names_in(assign.value) for assign in decl.updates))
+    known = {name: writer.name(num, name + "#{}") if name in read else num for name, num in state.items()}
+    for assign in decl.updates:
+        num = substitute(assign.value, {**known, **before})
+        known[assign.name] = writer.name(num, assign.name + "#{}") if assign.name in read else num
+    return known
 
 
 def _blend(cond: ir.Formula, yes: ir.Num, no: ir.Num, sharpness: float | None) -> ir.Num:

@@ -212,7 +212,7 @@ int judge(int64_t batch, int64_t first, int64_t last, const double *x0, const do
           double *columns) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
   lanes *x = malloc(sizeof(lanes) * N);
-  inputs *v = malloc(sizeof(double) * M * T * LANES);
+  inputs *v = malloc(sizeof(double) * (M * T + 1) * LANES);
   double *room = malloc(sizeof(double) * {room} * LANES);
   lane *out = malloc(sizeof(double) * (R + 1) * LANES);
   if (!x || !v || !room || !out) {{ free(x); free(v); free(room); free(out); return 1; }}
