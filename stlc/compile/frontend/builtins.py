@@ -8,7 +8,17 @@ from dataclasses import replace
 from fractions import Fraction
 from types import MappingProxyType
 
-from stlc.compile.frontend.arithmetic import absolute, agree, apply, broadcast, cross, dot, minus, norm
+from stlc.compile.frontend.arithmetic import (
+    absolute,
+    agree,
+    apply,
+    broadcast,
+    cross,
+    dot,
+    in_unit,
+    minus,
+    norm,
+)
 from stlc.compile.frontend.coerce import (
     Expectation,
     as_formula,
@@ -42,11 +52,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, delay_fault, no_delay
 from stlc.compile.ir.functions import FUNCTIONS, REGIONS, REWRITTEN, STEPPING
-from stlc.compile.ir.traverse import shifted
+from stlc.compile.ir.traverse import map_leaves, shifted
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
-from stlc.units import SYMBOLS, same_dims
+from stlc.units import SYMBOLS, Unit, same_dims
 
 FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -285,6 +295,28 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
     return time
 
 
+def _before(value: Value, call: ast.Call, scope: Scope) -> Value:
+    """Return a number, a vector or a formula at the previous sample, as an expression of one instant.
+
+    Raises:
+        Failed: the value is none of these (E202, E205).
+    """
+
+    def renamed(leaf: ir.Num) -> ir.Num:
+        return ir.Signal(leaf.name + ir.BEFORE) if isinstance(leaf, ir.Signal) else leaf
+
+    match value:
+        case Number():
+            formula = None if value.formula is None else map_leaves(value.formula, renamed)
+            return replace(value, num=map_leaves(value.num, renamed), formula=formula, origin=None)
+        case VectorValue(items):
+            return replace(
+                value, items=tuple(replace(each, num=map_leaves(each.num, renamed)) for each in items)
+            )
+        case _:
+            return map_leaves(as_formula(value, call.args[0].value, Expectation("`prev`"), scope), renamed)
+
+
 def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:
     """Return the value of a call of a function that the system provides.
 
@@ -294,12 +326,15 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
     _positional(entry.name, call, scope, "give its arguments in order")
     count_arguments(entry.name, call, len(entry.arguments), len(entry.arguments), scope)
     flat: list[ir.Num] = []
-    for arg, value, size in zip(call.args, values, entry.arguments, strict=True):
+    for index, (arg, value, size) in enumerate(zip(call.args, values, entry.arguments, strict=True)):
         need = Expectation(
             f"`{entry.name}` takes {'a number' if size is None else f'a vector of {size}'}", "this"
         )
         if size is None:
-            flat.append(absolute(loose_number(value, arg.value, need, scope)).num)
+            number = loose_number(value, arg.value, need, scope)
+            if entry.units:
+                number = _argument(number, entry.units[index], need, arg.span, scope)
+            flat.append(absolute(number).num)
             continue
         vector = as_vector(value, arg.value, need, scope)
         if len(vector.items) != size:
@@ -309,6 +344,19 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
     if entry.result is None:
         return replace(numbers[0], span=call.span)
     return VectorValue(tuple(numbers), call.span)
+
+
+def _argument(number: Number, unit: Unit, need: Expectation, span: Span, scope: Scope) -> Number:
+    """Return the argument of a function that takes a number in `unit`.
+
+    Raises:
+        Failed: the number has other dimensions (E203).
+    """
+    if number.bare:
+        return in_unit(number, unit, scope)
+    if not number.flexible and not same_dims(number.unit, unit):
+        scope.fail(Diagnostic("E203", f"{need.who} in [{unit}], this is in [{number.unit}]", span))
+    return number
 
 
 def _output(entry: External, index: int, args: tuple[ir.Num, ...]) -> Number:
@@ -331,6 +379,8 @@ def builtin(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) ->
     _positional(name, call, scope)
     if name in STEPPING:
         count_arguments(name, call, *STEPPING[name], scope)
+        if name == "prev" and scope.earlier:
+            return _before(values[0], call, scope)
         if not scope.temporal:
             scope.fail(unsupported(f"`{name}`", call.span, scope))
         return stepping(name, call, values, scope)

@@ -168,6 +168,8 @@ class External:
             None if it is not loaded.
         about: description, for messages.
         span: source location of its declaration.
+        units: unit of each argument, which is checked, and which numbers without a unit take; () if the
+            arguments may have any units.
     """
 
     name: str
@@ -178,6 +180,7 @@ class External:
     function: Callable[..., Sequence[Any]] | ir.Body | None
     about: str = ""
     span: Span | None = None
+    units: tuple[Unit, ...] = ()
 
 
 Entry: TypeAlias = Known | Definition | External
@@ -193,6 +196,8 @@ class Scope:
         error: class of the errors raised: `SpecError`, or `SystemFileError` in a system file.
         samplers: whether random draws such as `uniform(…)` are allowed.
         temporal: whether temporal operators are allowed.
+        earlier: whether `prev(…)` is allowed in numbers of one instant; it reads signals whose names end in
+            `ir.BEFORE`.
         time_unit: unit of numbers without a unit in intervals; "" if the file does not declare one.
         facts: ranges that signals never leave, each in the unit in which the signal is stored.
         system_hints: advice for names that only the system declares, by name.
@@ -209,6 +214,7 @@ class Scope:
     error: type[StlcError] = SpecError
     samplers: bool = False
     temporal: bool = False
+    earlier: bool = False
     time_unit: str = ""
     facts: Mapping[str, Bounds] = field(default_factory=dict)
     system_hints: Mapping[str, str] = field(default_factory=dict)

@@ -115,6 +115,9 @@ Num: TypeAlias = Const | Signal | ShiftedSignal | FrozenVar | Op | Indicator | W
 ELAPSED = "#elapsed"
 """Name of the signal that every evaluator provides: the index of the current sample."""
 
+BEFORE = "#before"
+"""Suffix of the name of a state: with it, the name stands for the value at the previous sample."""
+
 _LONG = 1 << 30
 
 

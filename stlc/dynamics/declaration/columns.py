@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import get_args
+from typing import Protocol, get_args
 
 from stlc.compile.analysis.ranges import usual_range
 from stlc.compile.frontend.arithmetic import absolute
@@ -76,6 +76,16 @@ class Clockwork:
     integrator: str = key(word(INTEGRATORS.names), "integration method", "euler")
     substeps: int = key(integer(high=1000), "integration steps within one step", 1)
     discrete: bool = key(FLAG, "`flow` gives next values instead of derivatives", False)
+
+
+class Shaped(Protocol):
+    """Keys that say which values the columns of a name can take."""
+
+    unit: Unit
+    ends: Node | None
+    enum: Node | None
+    boolean: bool
+    size: int | None
 
 
 @dataclass(repr=False, eq=False)
@@ -199,7 +209,7 @@ def read_states(node: Node | None, cx: Context) -> dict[str, StateKeys]:
             message = f"the timer `{entry.key.text}` is a single number"
             reader.report("S103", message, entry.place("size"), "declare one a timer")
         role: Role = "env" if keys.role == "env" else "state"
-        columns = _columns(entry.key.text, keys, where, cx.plain)
+        columns = declared_columns(entry.key.text, keys, where, cx.plain)
         names.columns += (replace(each, role=role, fact=each.fact or keys.clamp) for each in columns)
         names.place_components(entry.key.text, [column.name for column in columns])
     name_columns(names, "state")
@@ -216,10 +226,10 @@ def name_columns(names: Names, about: str) -> None:
     names.entries |= member_entries(column.labels for column in names.columns if column.kind == "enum")
 
 
-def _columns(name: str, keys: StateKeys | ParamKeys, where: str, cx: Context) -> tuple[Column, ...]:
-    """Return the columns of the state or parameter `name`, made from its keys.
+def declared_columns(name: str, keys: Shaped, where: str, cx: Context) -> tuple[Column, ...]:
+    """Return the columns of the name `name`, made from its keys.
 
-    `where` names the state or parameter in messages.
+    `where` names its declaration in messages.
     """
     called = component_names(name, keys.size)
     if keys.enum is not None:
@@ -349,7 +359,8 @@ def read_params(node: Node | None, cx: Context) -> tuple[Assign, ...]:
         here = cx.drawing({}, drawn)
         keys = _param_keys(entry, here)
         columns = [
-            replace(each, role="env") for each in _columns(name, keys, f"the parameter `{name}`", here)
+            replace(each, role="env")
+            for each in declared_columns(name, keys, f"the parameter `{name}`", here)
         ]
         names.columns += columns
         names.place_components(name, [column.name for column in columns])

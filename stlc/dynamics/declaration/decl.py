@@ -21,6 +21,7 @@ from stlc.dynamics.declaration.init import InitDecl, Situation
 from stlc.dynamics.declaration.inputs import InputDecl
 from stlc.dynamics.declaration.learning import Feedback, ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.declaration.motion import Assign, JumpDecl
+from stlc.dynamics.declaration.tables import TableDecl
 from stlc.dynamics.schema.names import ControlDecl
 from stlc.escape import visible
 from stlc.signature import Column, Signature
@@ -72,8 +73,9 @@ class SystemDecl:
         places: name of a state, control, constant or definition -> source location of its declaration.
         warnings: findings that are not errors.
         inputs: input signals, which are functions of time that no policy chooses.
+        tables: interpolation tables that expressions of the file call.
         updates: columns that are computed at every sample after flow and jumps, in order. A name in their
-            values stands for the value at that sample; with the suffix `BEFORE`, at the sample before.
+            values stands for the value at that sample; with the suffix `ir.BEFORE`, at the sample before.
         hidden: columns that policies do not observe by default: the numbers that determine input signals,
             clocks, and earlier values.
     """
@@ -109,6 +111,7 @@ class SystemDecl:
     places: Mapping[str, Span] = field(default_factory=dict, repr=False)
     warnings: tuple[Diagnostic, ...] = field(default=(), repr=False)
     inputs: tuple[InputDecl, ...] = ()
+    tables: tuple[TableDecl, ...] = ()
     updates: tuple[Assign, ...] = ()
     hidden: tuple[str, ...] = ()
 
@@ -123,8 +126,8 @@ class SystemDecl:
     def learnt(self) -> str:
         """SHA-256 of the fields that determine what a policy learns, in hexadecimal."""
         text = repr([getattr(self, name) for name in LEARNT])
-        if self.updates:
-            text += repr((self.updates, self.init.computed))
+        if self.updates or self.tables:
+            text += repr((self.updates, self.init.computed, self.tables))
         text = re.sub(r"\b[A-Z]\w+(?=\()", lambda found: _HASHED_AS.get(found[0], found[0]), text)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -187,11 +190,12 @@ def describe(decl: SystemDecl) -> str:
         (jump.name, f"when {jump.text}", ", ".join(f"{each.name} := {each.text}" for each in jump.resets))
         for jump in decl.jumps
     ]
-    updates = {assign.name: f"= {assign.text}" for assign in decl.updates}
+    moves = {name: f"{rate.format(name)} {text}" for name, text in flow.items()}
+    moves |= {assign.name: f"= {assign.text}" for assign in decl.updates}
     apart = {*decl.hidden, *(each.name for each in decl.inputs)}
     states = [column for column in decl.signature.columns if column.name not in apart]
     blocks = (
-        ("states", [_state(each, updates.get(each.name) or flow.get(each.name), rate) for each in states]),
+        ("states", [_state(each, moves.get(each.name)) for each in states]),
         ("input signals", [_input(each) for each in decl.inputs]),
         ("controls", [_control(decl, index) for index in range(len(decl.controls))]),
         ("feedback beneath the plans", _feedback(decl)),
@@ -203,14 +207,8 @@ def describe(decl: SystemDecl) -> str:
     return "\n".join([head, grid, *(line for title, rows in blocks for line in _table(title, rows))])
 
 
-def _state(column: Column, flow: str | None, rate: str) -> Row:
-    moves = (
-        f"{rate.format(column.name)} {flow}"
-        if flow
-        else "set from outside"
-        if column.role == "env"
-        else "constant"
-    )
+def _state(column: Column, moves: str | None) -> Row:
+    moves = moves or ("set from outside" if column.role == "env" else "constant")
     return column.name, f"[{column.unit}]" if column.unit.text else "", _values(column), moves
 
 

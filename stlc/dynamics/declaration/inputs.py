@@ -18,7 +18,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.columns import RANGE, name_columns, read_ranges, unit_text
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
-from stlc.dynamics.model.algebra import add, multiply, substitute
+from stlc.dynamics.model.algebra import add, multiply, substitute, total
 from stlc.dynamics.schema.expressions import SECOND
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     Floats: TypeAlias = NDArray[np.float64]
 
 Interpolate: TypeAlias = Literal["hold", "linear", "pchip"]
-MAX_PIECES = 200
+MAX_PIECES = 500
 SLACK = 1e-9
 """Share of the duration by which a sample may precede a switching time that it is meant to coincide with."""
 
@@ -314,10 +314,7 @@ def _present(decl: InputDecl, dt: Fraction) -> ir.Num:
     """Return the value of an input signal now, as an expression of the clock and the signal's numbers."""
     points: list[ir.Num] = [ir.Signal(name) for name in decl.values]
     if decl.interpolate == "hold":
-        value = points[0]
-        for point, passed in zip(points[1:], _passed(decl, dt), strict=True):
-            value = ir.Where(ir.Predicate(passed), point, value)
-        return value
+        return _piece(points, _passed(decl, dt))
     ends = _ends(decl)
     least = ir.Const(SLACK * float(decl.duration))
     widths = [_largest(_minus(after, before), least) for before, after in pairwise(ends)]
@@ -336,10 +333,19 @@ def _present(decl: InputDecl, dt: Fraction) -> ir.Num:
             _cubic(rise, share, multiply(width, left), multiply(width, right))
             for rise, share, width, (left, right) in zip(rises, shares, widths, pairwise(slopes), strict=True)
         ]
-    value = points[0]
-    for part in parts:
-        value = add(value, part)
-    return value
+    return total([points[0], *parts])
+
+
+def _piece(points: Sequence[ir.Num], passed: Sequence[ir.Num]) -> ir.Num:
+    """Return the value of the present piece, by bisection.
+
+    `passed` has a number for each piece but the first, which is not negative from its beginning on.
+    """
+    if not passed:
+        return points[0]
+    half = len(passed) // 2
+    later, earlier = _piece(points[half + 1 :], passed[half + 1 :]), _piece(points[: half + 1], passed[:half])
+    return ir.Where(ir.Predicate(passed[half]), later, earlier)
 
 
 def _passed(decl: InputDecl, dt: Fraction) -> tuple[ir.Num, ...]:

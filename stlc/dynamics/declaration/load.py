@@ -34,6 +34,7 @@ from stlc.dynamics.declaration.deployment import (
     read_scenarios,
 )
 from stlc.dynamics.declaration.functions import FunctionDecl, FunctionKeys, read_functions
+from stlc.dynamics.declaration.held import HeldKeys, HeldSection, declare_held, read_held
 from stlc.dynamics.declaration.init import InitDecl, InitKeys, read_init
 from stlc.dynamics.declaration.inputs import InputDecl, InputKeys, read_inputs
 from stlc.dynamics.declaration.learning import ObjectiveDecl, PolicyDecl, TrainDecl
@@ -47,6 +48,7 @@ from stlc.dynamics.declaration.motion import (
     state_assigns,
 )
 from stlc.dynamics.declaration.sampled import Sampled, in_order
+from stlc.dynamics.declaration.tables import TableDecl, TableKeys, read_tables
 from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader, first_line
@@ -93,6 +95,8 @@ class SystemKeys:
     state: Node | None = key(section(StateKeys, free=True), "states, in the order of the columns")
     inputs: Node | None = key(section(InputKeys, free=True), "input signals that no policy chooses")
     control: Node | None = key(section(ControlKeys, free=True), "controls")
+    table: Node | None = key(section(TableKeys, free=True), "interpolation tables, called as functions")
+    held: Node | None = key(section(HeldKeys, free=True), "values computed at samples and held in between")
     def_: Node | None = key(raw(mapping_of(EXPRESSION)), "named sub-expressions", name="def")
     flow: Node | None = key(raw(mapping_of(VECTOR)), "derivatives, or next values of a discrete system")
     jump: Node | None = key(raw(items_of(json_schema(JumpDecl)), JumpDecl), "guarded resets")
@@ -187,9 +191,11 @@ def _declaration(
     """
     named = _named(found, reader)
     names, cx = named.cx.names, named.cx
+    sampled = named.sampled + read_held(named.held, cx)
     timer_flow, timer_jumps = read_timers(named.states, cx)
-    flow = (*timer_flow, *read_flow(found.flow, cx), *named.sampled.flow)
+    flow = (*timer_flow, *read_flow(found.flow, cx), *sampled.flow)
     jumps = (*read_jumps(found.jump, cx), *timer_jumps)
+    _report_set((*flow, *(each for jump in jumps for each in jump.resets)), sampled, cx)
     _report_idle(found.control, cx, flow, jumps)
     spec = reader.text(found.spec, "`spec`")
     folder = path.parent
@@ -212,10 +218,12 @@ def _declaration(
             {c.name: (c.low, c.high) for c in clamped if c.low is not None and c.high is not None}
         ),
         init=_given_states(
-            read_init(found.init, cx, named.drawn, in_order(named.sampled.initial, cx)), overrides, named
+            read_init(found.init, cx, named.drawn + sampled.drawn, in_order(sampled.initial, cx)),
+            overrides,
+            named,
         ),
         objective=read(ObjectiveDecl, cx, found.objective, "`objective`"),
-        policy=_observing(read(PolicyDecl, cx, found.policy, "`policy`"), named),
+        policy=_observing(read(PolicyDecl, cx, found.policy, "`policy`"), sampled.hidden, cx),
         train=read(TrainDecl, cx, found.train, "`train`"),
         backup=read_backup(cx, found.backup, "`backup`"),
         test=read(TestDecl, cx.timed, found.test, "`test`"),
@@ -225,18 +233,26 @@ def _declaration(
         places=MappingProxyType(names.places),
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
         inputs=named.inputs,
-        updates=in_order(named.sampled.updates, cx),
-        hidden=named.sampled.hidden,
+        tables=named.tables,
+        updates=in_order(sampled.updates, cx),
+        hidden=sampled.hidden,
     )
 
 
-def _observing(policy: PolicyDecl, named: _Named) -> PolicyDecl:
+def _observing(policy: PolicyDecl, hidden: tuple[str, ...], cx: Context) -> PolicyDecl:
     """Return `policy`; by default it observes no hidden columns, such as future values of input signals."""
-    hidden = named.sampled.hidden
     if policy.observe or not hidden:
         return policy
-    seen = (column.name for column in named.cx.names.columns if column.name not in hidden)
+    seen = (column.name for column in cx.names.columns if column.name not in hidden)
     return replace(policy, observe=tuple(map(ir.Signal, seen)))
+
+
+def _report_set(assigns: SequenceType[Assign], sampled: Sampled, cx: Context) -> None:
+    """Report S202 where `flow` or a jump sets a column that is computed at every sample."""
+    computed = {each.name for each in sampled.updates} - {each.name for each in sampled.flow}
+    for name in dict.fromkeys(base_name(each.name) for each in assigns if each.name in computed):
+        message = f"`{name}` is computed at every sample, so that `flow` and jumps cannot set it"
+        cx.reader.report("S202", message, cx.names.places[name])
 
 
 def _report_idle(
@@ -267,7 +283,9 @@ class _Named:
             to false the bool states that record which jumps with `once` have happened.
         functions: external functions.
         inputs: input signals.
-        sampled: columns that are computed at every sample.
+        sampled: columns of input signals.
+        held: names and keys of the section `held`.
+        tables: interpolation tables.
     """
 
     cx: Context
@@ -277,6 +295,8 @@ class _Named:
     functions: tuple[FunctionDecl, ...]
     inputs: tuple[InputDecl, ...]
     sampled: Sampled
+    held: HeldSection
+    tables: tuple[TableDecl, ...]
 
 
 def _named(found: SystemKeys, reader: Reader) -> _Named:
@@ -291,9 +311,10 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
     inputs = read_inputs(found.inputs, cx)
     read_controls(found.control, cx)
     functions = read_functions(found.functions, cx.plain)
+    tables = read_tables(found.table, cx.plain)
+    held = declare_held(found.held, cx)
     read_definitions(found.def_, cx)
-    drawn += inputs.sampled.drawn
-    return _Named(cx.plain, clock, states, drawn, functions, inputs.signals, inputs.sampled)
+    return _Named(cx.plain, clock, states, drawn, functions, inputs.signals, inputs.sampled, held, tables)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,6 @@ from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import Unit
 
-BEFORE = "#before"
-"""Suffix of a name of a column: with it, the name stands for the value at the previous sample."""
 CLOCK = "step_count"
 """Name of the column that counts the samples since the start."""
 
@@ -32,7 +30,7 @@ class Sampled:
         drawn: distributions of numbers that are drawn once per trajectory, before the states.
         initial: values at the start, computed after the states are drawn.
         updates: values at every later sample, computed after flow and jumps. A name stands for the value at
-            the sample itself; with the suffix `BEFORE`, for the value at the sample before.
+            the sample itself; with the suffix `ir.BEFORE`, for the value at the sample before.
         flow: derivatives of these columns within a step.
         hidden: columns that policies do not observe unless `policy: {observe: …}` lists them.
     """
@@ -76,7 +74,7 @@ def clock(cx: Context, span: Span, *, flows: bool) -> Sampled:
     if column in cx.names.columns:
         return Sampled()
     declared(cx, column, span)
-    start, later = Assign(CLOCK, ir.Const(0.0), "0"), add(ir.Signal(CLOCK + BEFORE), ir.Const(1.0))
+    start, later = Assign(CLOCK, ir.Const(0.0), "0"), add(ir.Signal(CLOCK + ir.BEFORE), ir.Const(1.0))
     rate = (Assign(CLOCK, ir.Const(float(1 / cx.dt)), "1 / dt"),) if flows and not cx.discrete else ()
     return Sampled((start,), (), (Assign(CLOCK, later, "samples"),), rate, (CLOCK,))
 

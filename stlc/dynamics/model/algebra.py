@@ -5,7 +5,7 @@ The expressions are in the compiler's intermediate representation (IR).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from stlc.compile.ir import nodes as ir
@@ -38,6 +38,14 @@ def substitute(node: N, table: Mapping[str, ir.Num]) -> N:
 def add(left: ir.Num, right: ir.Num) -> ir.Num:
     """Sum of two numeric expressions."""
     return ir.Op("add", (left, right))
+
+
+def total(parts: Sequence[ir.Num]) -> ir.Num:
+    """Sum of one or more numeric expressions, as a tree of little depth."""
+    if len(parts) == 1:
+        return parts[0]
+    half = len(parts) // 2
+    return add(total(parts[:half]), total(parts[half:]))
 
 
 def multiply(left: ir.Num, right: ir.Num) -> ir.Num:

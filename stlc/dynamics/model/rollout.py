@@ -182,7 +182,10 @@ class Stepper:
         """
         batch = next(iter(start.values())).shape[0]
         steady = {name: column for name, column in start.items() if name not in self.next}
-        columns = _Columns(dict(start), {**steady, **controls}, steps, batch, switch)
+        known = {**steady, **controls} or {
+            "": next(iter(start.values()))
+        }  # programs need an array to be like
+        columns = _Columns(dict(start), known, steps, batch, switch)
         for stage in self.stages:
             stage(columns)
         columns.states.update((name, column.expand(steps + 1, batch)) for name, column in steady.items())

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
-from stlc.dynamics.declaration.sampled import BEFORE
 from stlc.dynamics.model.algebra import Assignments, add, multiply, names_in, substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.integrators._tableau import State
@@ -126,7 +125,7 @@ def _updated(decl: SystemDecl, writer: Assignments, state: State) -> State:
     """
     if not decl.updates:
         return state
-    before = {f"{name}{BEFORE}": ir.Signal(name) for name in decl.signature.names}
+    before = {f"{name}{ir.BEFORE}": ir.Signal(name) for name in decl.signature.names}
     read = frozenset[str]().union(*(names_in(assign.value) for assign in decl.updates))
     known = {name: writer.name(num, name + "#{}") if name in read else num for name, num in state.items()}
     for assign in decl.updates:

@@ -1,0 +1,226 @@
+"""Section `held`: values that are computed at samples and constant in between, as in a digital controller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from stlc.compile.frontend.scope import Known, column_value
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import map_leaves
+from stlc.dynamics.declaration.columns import RANGE, declared_columns, name_columns, unit_text
+from stlc.dynamics.declaration.motion import Assign, state_assigns
+from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
+from stlc.dynamics.schema.names import Context, base_name
+from stlc.dynamics.schema.reader import first_line
+from stlc.dynamics.schema.record import FLAG, OF, STEPS, VECTOR, integer, key, raw, values_of
+from stlc.dynamics.schema.yaml_nodes import Entry, Node
+from stlc.signature import Column
+from stlc.source import Span
+from stlc.units import Unit
+
+
+@dataclass(repr=False, eq=False)
+class HeldKeys:
+    """The keys that the declaration of one held value may have."""
+
+    value: Node | None = key(
+        raw(VECTOR), "the value; `prev(…)` is a value at the sample before", required=True
+    )
+    every: int = key(STEPS, "time between samples; one step unless given", 1)
+    before: Node | None = key(raw(VECTOR), "value before the start, for `prev(…)`")
+    unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
+    ends: Node | None = key(RANGE, "lower and upper end, numbers or vectors", name="range")
+    enum: Node | None = key(raw({"type": ["array", "object"]}), "members, by name or by name and value")
+    boolean: bool = key(FLAG, "takes 0 and 1", False, name="bool")
+    whole: bool = key(FLAG, "takes whole numbers", False, name="int")
+    size: int | None = key(integer(high=1000), "components of a vector")
+
+
+@dataclass(frozen=True, slots=True)
+class HeldSection:
+    """The section `held`, of which only names and keys are read.
+
+    Attributes:
+        entries: the entries of the file, each with its keys.
+        ticks: the clock, if a value is not computed at every step.
+    """
+
+    entries: tuple[tuple[Entry, HeldKeys], ...] = ()
+    ticks: Sampled = field(default_factory=Sampled)
+
+
+def declare_held(node: Node | None, cx: Context) -> HeldSection:
+    """Read the section `held` except for the values, and declare its names."""
+    found: list[tuple[Entry, HeldKeys]] = []
+    for entry in cx.reader.entries(node, "`held`"):
+        name = entry.key.text
+        if not cx.names.declare(entry.key, "held value", cx.reader):
+            continue
+        where = f"the held value `{name}`"
+        keys = HeldKeys(**values_of(HeldKeys, cx.plain, entry.value, where, OF))
+        columns = declared_columns(name, keys, where, cx.plain)
+        if keys.whole:
+            columns = tuple(replace(each, kind="int") if each.kind == "real" else each for each in columns)
+        cx.names.columns += columns
+        cx.names.place_components(name, [column.name for column in columns])
+        found.append((entry, keys))
+    name_columns(cx.names, "held value")
+    if node is None or all(keys.every == 1 for _, keys in found):
+        return HeldSection(tuple(found))
+    return HeldSection(tuple(found), clock(cx, first_line(node.span), flows=False))
+
+
+def read_held(section: HeldSection, cx: Context) -> Sampled:
+    """Read the values of the section `held`.
+
+    The columns that keep earlier values for `prev(…)` are declared.
+    """
+    sampled = {
+        each.name: Known(column_value(each), "input signal")
+        for each in cx.names.columns
+        if each.role == "env"
+    }
+    here = cx.here.extended(sampled)
+    inside = replace(cx, here=replace(here, scope=replace(here.scope, earlier=True)))
+    cells: dict[str, _Held] = {}
+    for entry, keys in section.entries:
+        cells |= {each.column.name: each for each in _cells(entry, keys, inside, cx)}
+    past = _Past(cells, cx)
+    initial = tuple(Assign(name, past.at_start(cell), cell.text) for name, cell in cells.items())
+    updates = tuple(Assign(name, past.later(cell), cell.text) for name, cell in cells.items())
+    return section.ticks + Sampled((), initial, updates) + past.kept()
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """One column of the section `held`.
+
+    Attributes:
+        column: the column.
+        every: steps between samples.
+        value: its value at a sample. A name with `ir.BEFORE` is a value at the sample before.
+        text: source text of the value.
+        before: its value before the start, as an expression of the initial states; None if it is not given.
+        span: location of its declaration.
+    """
+
+    column: Column
+    every: int
+    value: ir.Num
+    text: str
+    before: ir.Num | None
+    span: Span
+
+
+def _cells(entry: Entry, keys: HeldKeys, inside: Context, cx: Context) -> list[_Held]:
+    """Read the value of one declaration, one column per component.
+
+    `inside` is the context of values, in which `prev(…)` is known; `cx` is that of other expressions.
+    """
+    if keys.value is None:
+        return []
+    values = state_assigns(Entry(entry.key, keys.value), "`held`", inside)
+    started = () if keys.before is None else state_assigns(Entry(entry.key, keys.before), "`before`", cx)
+    before = {assign.name: assign.value for assign in started}
+    columns = {column.name: column for column in cx.names.group(entry.key.text)}
+    return [
+        _Held(columns[each.name], keys.every, each.value, each.text, before.get(each.name), entry.key.span)
+        for each in values
+    ]
+
+
+class _Past:
+    """Earlier values that held values read by `prev(…)`, and the columns that keep them.
+
+    Attributes:
+        cells: the columns of the section `held`, by name.
+        kept_samples: (steps between samples, name of a column) -> number of samples that are kept.
+    """
+
+    def __init__(self, cells: Mapping[str, _Held], cx: Context) -> None:
+        self.cells = cells
+        self.kept_samples: dict[tuple[int, str], int] = {}
+        self._cx = cx
+
+    def at_start(self, cell: _Held) -> ir.Num:
+        """Value of a column at the first sample, as an expression of the initial states."""
+
+        def read(leaf: ir.Num) -> ir.Num:
+            name, back = _earlier_name(leaf)
+            return self._before(name, cell) if back else leaf
+
+        return map_leaves(cell.value, read)
+
+    def later(self, cell: _Held) -> ir.Num:
+        """Value of a column at a later sample."""
+
+        def read(leaf: ir.Num) -> ir.Num:
+            name, back = _earlier_name(leaf)
+            return self._earlier(name, back, cell) if back else leaf
+
+        return _ticking(cell.every, map_leaves(cell.value, read), cell.column.name)
+
+    def _own(self, every: int, name: str) -> bool:
+        """True if the column `name` is held with the same period, so that it is its own latest value."""
+        return name in self.cells and self.cells[name].every == every
+
+    def _earlier(self, name: str, back: int, cell: _Held) -> ir.Num:
+        """The value that the column `name` had `back` samples of `cell` ago, as an expression."""
+        back -= self._own(cell.every, name)
+        if back == 0:
+            return ir.Signal(name + ir.BEFORE)
+        chain = cell.every, name
+        self.kept_samples[chain] = max(back, self.kept_samples.get(chain, 0))
+        return ir.Signal(_kept_name(*chain, back) + ir.BEFORE)
+
+    def _before(self, name: str, reader: _Held | None = None) -> ir.Num:
+        """Value of a column before the start: `before` of a held value, the initial value of a state.
+
+        S102 is reported if `reader`, a held value, needs it and it is not given.
+        """
+        cell = self.cells.get(name)
+        if cell is None:
+            return ir.Signal(name)
+        if cell.before is None and reader is not None:
+            message = f"`prev({name})` has no value before the start"
+            self._cx.reader.report("S102", message, cell.span, f"{base_name(name)}: {{before: 0}}")
+        return ir.Const(0.0) if cell.before is None else cell.before
+
+    def kept(self) -> Sampled:
+        """Declare the columns that keep earlier values; return how they are computed."""
+        found = Sampled()
+        for (every, name), count in self.kept_samples.items():
+            own = self._own(every, name)
+            column = next(each for each in self._cx.names.columns if each.name == name)
+            place = self._cx.names.places.get(base_name(name)) or self._cx.names.places[name]
+            start, value = (self._before(name), name + ir.BEFORE) if own else (ir.Signal(name), name)
+            for back in range(1, count + 1):
+                kept = _kept_name(every, name, back)
+                declared(self._cx, replace(column, name=kept, role="state"), place)
+                text = f"{name}, {back} samples ago"
+                first, later = Assign(kept, start, text), _ticking(every, ir.Signal(value), kept)
+                found += Sampled((), (first,), (Assign(kept, later, text),), (), (kept,))
+                start, value = self._before(name), kept + ir.BEFORE
+        return found
+
+
+def _earlier_name(leaf: ir.Num) -> tuple[str, int]:
+    """Return the name of a column, and how many times `prev(…)` is applied to it, for a leaf of a value."""
+    name, *befores = leaf.name.split(ir.BEFORE) if isinstance(leaf, ir.Signal) else ("",)
+    return name, len(befores)
+
+
+def _kept_name(every: int, name: str, back: int) -> str:
+    """Name of the column that keeps the value of a column some samples ago."""
+    stem = name.replace("[", "_").replace("]", "")
+    return f"{stem}_{back}_ago" if every == 1 else f"{stem}_{back}_ago_of_{every}"
+
+
+def _ticking(every: int, value: ir.Num, name: str) -> ir.Num:
+    """Return `value` at every so many steps, and otherwise the present value of the column `name`."""
+    if every == 1:
+        return value
+    rest = ir.Op("mod", (ir.Signal(CLOCK), ir.Const(float(every))))
+    due = ir.Predicate(ir.Op("sub", (ir.Const(0.5), rest)))
+    return ir.Where(due, value, ir.Signal(name + ir.BEFORE))

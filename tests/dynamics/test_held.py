@@ -1,0 +1,158 @@
+"""Held values: computed at samples before the flow, constant in between, with values of earlier samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+import stlc
+from stlc.controller.problem.task import Task
+from stlc.diagnostics import StlcError
+from stlc.dynamics.declaration.decl import describe
+from stlc.dynamics.model.system import System
+
+Make = Callable[..., System]
+PLANT = (
+    "time: {dt: 0.1 s, horizon: 20 steps, integrator: rk4}\n"
+    "state: {x: {unit: m}, y: {unit: m}}\n"
+    "init: {mixture: [{draw: {x: 'uniform(0, 2)', y: 1}}]}\n"
+)
+
+
+def rolled(system: System, rows: int = 4) -> dict[str, np.ndarray]:
+    """Columns (batch, steps) of a rollout, which step by step gives, too."""
+    x0 = system.sample(rows, seed=0, dtype=torch.float64)
+    u = torch.zeros(rows, system.horizon, 0, dtype=torch.float64)
+    x = system.rollout(x0, u)
+    one = x0
+    for k in range(system.horizon):
+        one = system.step(one, u[:, k])
+        torch.testing.assert_close(one, x[:, k + 1], atol=1e-12, rtol=1e-12)
+    return {name: x[:, :, i].numpy() for i, name in enumerate(system.names)}
+
+
+def test_a_sampled_controller_acts_without_delay_and_is_constant_within_a_step(make: Make) -> None:
+    system = make(PLANT + "held: {u: {value: -2 * x / 1 s}}\nflow: {x: u}\n")
+    columns = rolled(system)
+    np.testing.assert_allclose(columns["x"], columns["x"][:, :1] * 0.8 ** np.arange(21), atol=1e-12)
+    np.testing.assert_allclose(columns["u"], -2 * columns["x"], atol=1e-12)
+
+
+def test_a_period_holds_the_value_between_its_samples(make: Make) -> None:
+    system = make(PLANT + "held: {u: {every: 0.3 s, value: x}}\nflow: {x: 1 m/s}\n")
+    columns = rolled(system)
+    np.testing.assert_array_equal(columns["u"], columns["x"][:, np.arange(21) // 3 * 3])
+    assert columns["step_count"][0].tolist() == list(range(21))
+
+
+def test_values_of_earlier_samples(make: Make) -> None:
+    system = make(
+        PLANT + "held:\n"
+        "  sum: {value: prev(sum) + x, before: 0}\n"
+        "  three: {value: prev(prev(prev(x)))}\n"
+        "  fib: {value: prev(fib) + prev(prev(fib)), before: 1}\n"
+        "  mean: {every: 2 steps, value: (x + prev(x)) / 2}\n"
+        "  slow: {every: 2 steps, value: prev(prev(slow)) + 1, before: 0}\n"
+        "flow: {x: 1 m/s}\n"
+    )
+    columns = rolled(system)
+    x = columns["x"]
+    np.testing.assert_allclose(columns["sum"], np.cumsum(x, 1), atol=1e-12)
+    np.testing.assert_array_equal(columns["three"], x[:, np.maximum(np.arange(21) - 3, 0)])
+    assert columns["fib"][0, :8].tolist() == [2, 3, 5, 8, 13, 21, 34, 55]
+    ticks = np.arange(21) // 2 * 2
+    np.testing.assert_allclose(
+        columns["mean"], (x[:, ticks] + x[:, np.maximum(ticks - 2, 0)]) / 2, atol=1e-12
+    )
+    assert columns["slow"][0, :10].tolist() == [1, 1, 1, 1, 2, 2, 2, 2, 3, 3]
+
+
+def test_order_follows_from_what_is_read(make: Make) -> None:
+    system = make(PLANT + "held: {b: {value: 2 * a}, a: {value: x + c}, c: {value: y}}\nflow: {x: 1 m/s}\n")
+    columns = rolled(system)
+    np.testing.assert_allclose(columns["b"], 2 * (columns["x"] + columns["y"]))
+
+
+def test_modes_vectors_and_truth(make: Make) -> None:
+    system = make(
+        PLANT + "held:\n"
+        "  mode:\n    enum: [low, high]\n    before: low\n"
+        "    value: if prev(mode) == low then (if x > 1.5 m then high else low)"
+        " else if x < 1 m then low else high\n"
+        "  v: {size: 2, unit: m, value: '[x, prev(v[0])]', before: 0}\n"
+        "  over: {bool: true, value: x > 1 m}\n"
+        "flow: {x: if mode == low then 1 m/s else -1 m/s}\n"
+    )
+    columns = rolled(system)
+    mode, wanted = np.zeros(4), np.zeros((4, 21))
+    for k, x in enumerate(columns["x"].T):
+        mode = np.where(mode == 0, x > 1.5, ~(x < 1)).astype(float)
+        wanted[:, k] = mode
+    np.testing.assert_array_equal(columns["mode"], wanted)
+    assert 0 < wanted.mean() < 1
+    np.testing.assert_array_equal(columns["over"], columns["x"] > 1)
+    np.testing.assert_array_equal(columns["v[1]"][:, 1:], columns["x"][:, :-1])
+    assert system.decl.signature["mode"].labels == (("low", 0.0), ("high", 1.0))
+
+
+def test_c_agrees_with_torch(make: Make) -> None:
+    system = make(
+        PLANT + "inputs: {w: {unit: m/s, range: [-1, 1], pieces: 4, interpolate: linear}}\n"
+        "held: {u: {every: 0.2 s, value: -tanh(prev(x) / 1 m) + prev(u) / 2, before: 0}}\n"
+        "flow: {x: u * 1 m/s + w}\n"
+    )
+    task = Task.of(
+        stlc.parse("state signal x [m]\nstate signal u\nrequire r: always x < 1 m and u < 1"), system
+    )
+    x0, u = task.sample(20, seed=1, dtype=torch.float64), torch.zeros(20, 20, 0, dtype=torch.float64)
+    assert task.native is not None
+    judged = task.judge(x0, u)
+    _, columns = task._judged_by_torch(x0, u)
+    for name in system.names:
+        torch.testing.assert_close(judged.columns[name], columns[name], atol=1e-12, rtol=0)
+
+
+def test_gradients_pass_through_held_values(make: Make) -> None:
+    system = make(PLANT + "held: {u: {value: -2 * x / 1 s}}\nflow: {x: u}\n")
+    x0 = system.sample(1, seed=0, dtype=torch.float64).requires_grad_()
+    last = system.rollout(x0, torch.zeros(1, 20, 0, dtype=torch.float64))[:, -1, 0]
+    (gradient,) = torch.autograd.grad(last.sum(), x0)
+    names = system.names
+    # the first step is moved by the initial value of u, every later one by x
+    assert gradient[0, names.index("x")].item() == pytest.approx(0.8**19)
+    assert gradient[0, names.index("u")].item() == pytest.approx(0.1 * 0.8**19)
+
+
+def test_what_policies_see_and_what_is_shown(make: Make) -> None:
+    system = make(PLANT + "held: {u: {every: 0.2 s, value: prev(x)}}\n")
+    assert [num.name for num in system.decl.policy.observe] == ["x", "y", "u"]
+    assert set(system.decl.hidden) == {"step_count", "x_1_ago_of_2"}
+    assert "u       any  = prev(x)" in describe(system.decl)
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("held: {u: {value: prev(u) + x}}", "S102"),
+        ("held: {u: {value: u + x}}", "S202"),
+        ("held: {a: {value: b}, b: {value: a}}", "S202"),
+        ("held: {u: {value: next(x)}}", "S201"),
+        ("held: {u: {value: 'always[0 s, 1 s] x > 0 m'}}", "S201"),
+        ("held: {u: {value: 'uniform(0, 1)'}}", "S201"),
+        ("held: {u: {every: 0.25 s, value: x}}", "S103"),
+        ("held: {u: {unit: s, value: x}}", "E203"),
+        ("held: {u: {every: 0.2 s}}", "S102"),
+        ("held: {x: {value: 1}}", "E102"),
+        ("held: {u: {value: x}}\nflow: {u: 1}", "S202"),
+        ("held: {u: {value: x}}\njump: [{guard: x > 1 m, reset: {u: 0}}]", "S202"),
+        ("flow: {x: prev(y)}", "S201"),
+        ("def: {d: prev(y)}", "S201"),
+    ],
+)
+def test_wrong_declarations(make: Make, text: str, code: str) -> None:
+    with pytest.raises(StlcError) as error:
+        make(PLANT + text + "\n")
+    assert code in [finding.code for finding in error.value.diagnostics]
