@@ -1,0 +1,236 @@
+"""The plants of the ARCH-COMP falsification category against simulations of their own, and known verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+import stlc
+from stlc.controller.problem.load import load_task
+from stlc.controller.problem.task import Task
+from stlc.dynamics.declaration.inputs import signal_values
+from stlc.dynamics.model.system import System
+
+ROOT = Path(__file__).parent.parent.parent
+Doubles = NDArray[np.float64]
+Rate = Callable[[Doubles], Doubles]
+
+
+def rk4(rate: Rate, x: Doubles, h: float) -> Doubles:
+    """One step of the classical Runge-Kutta method."""
+    a = rate(x)
+    b = rate(x + 0.5 * h * a)
+    c = rate(x + 0.5 * h * b)
+    return x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
+
+
+def simulated(
+    name: str, horizon: str, rows: int = 6
+) -> tuple[System, dict[str, Doubles], dict[str, Doubles]]:
+    """A system, random rollouts of it (rows, steps + 1), and the reference values of its input signals.
+
+    The rollouts are computed in C, and some of their steps also in torch.
+    """
+    system = System.load(ROOT / f"examples/arch/{name}.yaml", {"time.horizon": horizon})
+    task = Task.of(stlc.parse("require all: true"), system)
+    assert task.native is not None
+    x = task.rollout(
+        system.sample(rows, seed=0, dtype=torch.float64),
+        torch.zeros(rows, system.horizon, 0, dtype=torch.float64),
+    )
+    for k in (0, 3, system.horizon - 1):
+        torch.testing.assert_close(
+            system.step(x[:, k], torch.zeros(rows, 0)), x[:, k + 1], rtol=1e-9, atol=1e-9
+        )
+    columns = {each: x[:, :, i].numpy() for i, each in enumerate(system.names)}
+    times = np.arange(system.horizon + 1) * system.dt
+    signals = {
+        each.name: signal_values(each, np.stack([columns[n][:, 0] for n in each.columns], 1), times)
+        for each in system.decl.inputs
+    }
+    for signal, values in signals.items():
+        np.testing.assert_array_equal(columns[signal], values)
+    return system, columns, signals
+
+
+def tables(system: System) -> dict[str, Callable[..., Doubles]]:
+    """The tables of a system, interpolated by SciPy with lines that go on."""
+    found = {}
+    for table in system.decl.tables:
+        values = np.array(table.values)
+        grid = RegularGridInterpolator(
+            table.points, values[0] if len(table.points) == 1 else values, bounds_error=False, fill_value=None
+        )
+        found[table.name] = lambda *at, grid=grid: grid(np.stack(np.broadcast_arrays(*at), -1))
+    return found
+
+
+def constant(system: System, name: str) -> Doubles:
+    """A constant of a system, as a vector if it is one."""
+    known = system.decl.constants
+    parts = [value for key, (value, _) in known.items() if key.startswith(f"{name}[")]
+    return np.array(parts) if parts else np.array(known[name][0])
+
+
+def test_chasing_cars() -> None:
+    system, columns, signals = simulated("chasing_cars", "6 s")
+    y, v = np.tile(np.arange(0.0, 50.0, 10.0), (6, 1)), np.zeros((6, 5))
+    mode = np.zeros((6, 4))  # chasing 0, keeping 1, braking 2
+    for k in range(system.horizon):
+        gap = np.diff(y, axis=1)
+        kept = np.where(gap >= 15, 0, np.where(gap <= 5, 2, 1))
+        mode = np.choose(mode.astype(int), [np.where(gap <= 10, 1, 0), kept, np.where(gap >= 20, 0, 2)])
+        throttle, brake = (signals[name][:, k, None] for name in ("throttle", "brake"))
+
+        def rate(
+            x: Doubles, mode: Doubles = mode, throttle: Doubles = throttle, brake: Doubles = brake
+        ) -> Doubles:
+            v = x[:, 5:]
+            up = np.where(mode == 1, v[:, 1:], -v[:, 1:])
+            pull = np.choose(mode.astype(int), [1.0, 0.0, -v[:, 1:]])
+            return np.concatenate((v[:, :1], up, -throttle - brake * v[:, :1], pull), 1)
+
+        x = rk4(rate, np.concatenate((y, v), 1), system.dt)
+        y, v = x[:, :5], x[:, 5:]
+    np.testing.assert_allclose(np.stack([columns[f"y{i}"][:, -1] for i in range(1, 6)], 1), y, atol=1e-9)
+    assert len({tuple(row) for row in mode.tolist()}) > 1
+
+
+def test_levitated_magnet() -> None:
+    system, columns, signals = simulated("neural_maglev", "1 s")
+    low, span, least, width = (
+        constant(system, name) for name in ("pos_low", "pos_span", "current_low", "current_span")
+    )
+    weights = {n: np.stack([constant(system, f"{n}{k}") for k in range(9)]) for n in ("f", "g")}
+
+    def net(name: str, x: Doubles) -> Doubles:
+        hidden = np.tanh(x @ weights[name].T + constant(system, f"{name}_bias"))
+        return hidden @ constant(system, f"{name}_out")
+
+    state = np.tile([0.5, 0.0], (6, 1))
+    before, one, two = np.zeros(6), np.zeros(6), np.zeros(6)
+    for k in range(system.horizon):
+        z = 2 * (state[:, 0] - low) / span - 1
+        x = np.stack((z, before, one, two), 1)
+        f = 0.9921675075327889 * (net("f", x) + 0.9079050764793414)
+        scale = 0.0004116938262844689 * 0.5996797859290577 * -0.8613021600806045
+        g = scale * (net("g", x) + 0.8636776698074995)
+        wanted = (2 * (signals["ref"][:, k] - low) / span - 1 - f) / g
+        current = np.clip((wanted + 1) * width / 2 + least, -1, 4)
+        if k == 0:
+            np.testing.assert_allclose(f + g * current, columns["predicted"][:, 0])
+        before, one, two = z, 2 * (current - least) / width - 1, one
+
+        def rate(s: Doubles, current: Doubles = current) -> Doubles:
+            force = 5 * np.sign(current) * current**2 / s[:, 0]
+            return np.stack((s[:, 1], -9.8 - 4 * s[:, 1] + force), 1)
+
+        for _ in range(4):
+            state = rk4(rate, state, system.dt / 4)
+    np.testing.assert_allclose(columns["pos"][:, -1], state[:, 0], atol=1e-7)
+    assert columns["predicted"][:, 0] == pytest.approx(-1.4129, abs=5e-5)
+
+
+def test_steam_condenser() -> None:
+    system, columns, signals = simulated("steam_condenser", "10 s")
+    table, mixed = tables(system), np.stack([constant(system, f"V{j}") for j in (1, 2, 3)])
+    u, b, r = (constant(system, name) for name in "ubr")
+    x = np.tile([90.0, 90.0, 80.0, 107.8880952381, *[0.0] * 6], (6, 1))
+    for k in range(system.horizon):
+        goal, steam = 90.0 if k < 40 else 87.0, signals["steam"][:, k]
+
+        def rate(x: Doubles, goal: float = goal, steam: Doubles = steam) -> Doubles:
+            inside, p, outlet, flow, d = x[:, 0], x[:, 1], x[:, 2], x[:, 3], x[:, 4:]
+            z = 2 * (p - goal + 3.7742393716738434) / (5.7997431225043385 + 3.7742393716738434) - 1
+            a = np.tanh(z[:, None] * u + d @ mixed.T + b)
+            c = (-0.33227866684137108 + a @ r + 1) * (66.879264965962932 + 30.855068745036114) / 2
+            boiling = table["boiling"](inside)
+            mean = (outlet - 60) / np.log((boiling - 60) / (boiling - outlet))
+            heat = mean / (0.0872924756541668 / flow**0.8 + 0.00073786772008033)
+            first = 0.153842 * (steam - heat / table["latent"](inside)) * boiling
+            valve = np.clip(c - 30.855068745036114 + 107.8880952381, 0, 200)
+            parts = (first, (inside - p) / 0.5, (heat / 4.2 + (60 - outlet) * flow) / 500, valve - flow)
+            return np.concatenate((np.stack(parts, 1), a - 10 * d[:, :3], d[:, :3] - 10 * d[:, 3:]), 1)
+
+        x = rk4(rate, x, system.dt)
+    for i, name in enumerate(("inside", "p", "outlet", "flow")):
+        np.testing.assert_allclose(columns[name][:, -1], x[:, i], atol=1e-9)
+
+
+def test_transmission() -> None:
+    system, columns, signals = simulated("transmission", "3 s", 3)
+    table = tables(system)
+    x = np.tile([1000.0, 0.0], (3, 1))
+    gear, phase, entered = np.ones(3), np.zeros(3), np.zeros(3)
+    for k in range(system.horizon + 1):
+        throttle, brake = (signals[name][:, k] for name in ("throttle", "brake"))
+        speed = x[:, 1] * 2 * np.pi * 60 / 5280
+        np.testing.assert_allclose(columns["speed"][:, k], speed, atol=1e-9)
+        np.testing.assert_allclose(columns["rpm"][:, k], x[:, 0], atol=1e-7)
+        if k % 4 == 0:
+            for i in range(3):
+                up, down = (table[name](gear[i], throttle[i]).item() for name in ("up", "down"))
+                waited = k // 4 - entered[i] >= 2
+                beyond = speed[i] >= up if phase[i] > 0 else speed[i] <= down
+                if phase[i] and waited:
+                    gear[i], phase[i] = gear[i] + phase[i] * beyond, 0
+                elif phase[i]:
+                    phase[i] = phase[i] if beyond else 0
+                else:
+                    phase[i], entered[i] = int(speed[i] > up) - int(speed[i] < down), k // 4
+        np.testing.assert_array_equal(columns["gear"][:, k], gear)
+
+        def rate(x: Doubles, throttle: Doubles = throttle, brake: Doubles = brake) -> Doubles:
+            ratio = np.array([2.393, 1.450, 1.000, 0.677])[gear.astype(int) - 1]
+            s, mph = 3.23 * x[:, 1] * ratio / x[:, 0], x[:, 1] * 2 * np.pi * 60 / 5280
+            impeller = (x[:, 0] / table["capacity"](s)) ** 2
+            drag = np.sign(mph) * (brake + 40 + 0.02 * mph**2)
+            engine = (table["torque"](throttle, x[:, 0]) - impeller) / 0.021991488283555904
+            wheel = (3.23 * ratio * impeller * table["gain"](s) - drag) / 12.094147857312473
+            return np.stack((engine, wheel), 1)
+
+        x = rk4(rate, x, system.dt)
+        x[:, 0] = np.clip(x[:, 0], 600, 6000)
+    assert gear.max() > 1
+
+
+def judged(
+    spec: str, inputs: list[tuple[float, ...]]
+) -> tuple[dict[str, list[float]], dict[str, torch.Tensor]]:
+    """Robustness by requirement, and states, under constant input signals."""
+    task = load_task(ROOT / f"specs/arch/{spec}.stl")
+    names = task.system.names
+    x0 = task.sample(len(inputs), seed=0, dtype=torch.float64)
+    for decl, values in zip(task.system.decl.inputs, zip(*inputs, strict=True), strict=True):
+        for name in (decl.name, *decl.values):
+            x0[:, names.index(name)] = torch.tensor(values, dtype=torch.float64)
+    found = task.judge(x0, torch.zeros(len(inputs), task.horizon, 0, dtype=torch.float64))
+    return {rule.name: found.requirements[:, i].tolist() for i, rule in enumerate(task.rules)}, dict(
+        found.columns
+    )
+
+
+def test_settled_pressures_of_the_condenser() -> None:
+    rho, columns = judged("steam_condenser", [(3.99,), (4.0,), (4.01,)])
+    np.testing.assert_allclose(columns["p"][-1], [87.258, 87.293, 87.328], atol=5e-4)
+    assert min(rho["SC"]) > 0.17
+
+
+@pytest.mark.slow
+def test_constant_inputs_that_falsify() -> None:
+    cars, _ = judged("chasing_cars", [(1, 0), (0, 0), (0, 1)])
+    assert cars["CC1"][0] < -100
+    assert max(cars["CC2"][1:]) == pytest.approx(-5.0)
+    assert cars["CC3"][0] < -1
+    drive, columns = judged("transmission", [(100, 0), (100, 325), (50, 0)])
+    assert drive["AT1"][0] == pytest.approx(-0.213, abs=5e-4)
+    assert drive["AT2"][1] == pytest.approx(-10.6, abs=0.05)
+    assert columns["rpm"][:1000, 2].max().item() == pytest.approx(3024, abs=1)
+    overshoot, _ = judged("neural_maglev_narrow", [(ref,) for ref in np.linspace(1.95, 2.05, 40)])
+    assert min(overshoot["NNx"]) == pytest.approx(0.0397, abs=2e-4)
