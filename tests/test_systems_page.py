@@ -69,6 +69,18 @@ def test_every_scenario_can_be_laid_over(name: str) -> None:
     assert bool(torch.isfinite(moved(laid.truth)).all())
 
 
+def test_a_plant_with_input_signals_tables_and_held_values() -> None:
+    plant = system("".join(blocks("plant")))
+    assert [each.name for each in plant.decl.inputs] == ["outside", "open"]
+    assert [each.name for each in plant.decl.tables] == ["power", "loss"]
+    assert plant.probe() == ()
+    x = plant.rollout(plant.sample(50, seed=0), torch.zeros(50, plant.horizon, 0))
+    valve, mode = (x[:, :, plant.names.index(name)] for name in ("valve", "mode"))
+    assert bool((valve[:, 1:6] == valve[:, :1]).all())
+    assert 0.0 <= valve.min() < valve.max() == 1.0
+    assert mode.unique().tolist() == [0.0, 1.0]
+
+
 def test_a_file_from_it(tmp_path: Path) -> None:
     (tmp_path / "arm.yaml").write_text("\n".join(blocks("")))
     (tmp_path / "short.yaml").write_text(blocks("separate")[0])
