@@ -156,3 +156,44 @@ def test_wrong_declarations(make: Make, text: str, code: str) -> None:
     with pytest.raises(StlcError) as error:
         make(PLANT + text + "\n")
     assert code in [finding.code for finding in error.value.diagnostics]
+
+
+# -------------------------------------------------------------------------------- delays
+
+
+def test_delays(make: Make) -> None:
+    system = make(
+        PLANT + "inputs: {w: {unit: m/s, range: [-1, 1], pieces: 5}}\n"
+        "delay:\n"
+        "  one: {unit: m, of: x, by: 1}\n"
+        "  late: {unit: cm, of: 2 * x + y, by: 0.5 s, before: 7 cm}\n"
+        "  wind: {of: w, by: 3 steps}\n"
+        "flow: {x: wind, y: (late - y) / 1 s}\n"
+    )
+    columns = rolled(system)
+    steps = np.arange(21)
+    np.testing.assert_array_equal(columns["one"], columns["x"][:, np.maximum(steps - 1, 0)])
+    np.testing.assert_array_equal(columns["wind"], columns["w"][:, np.maximum(steps - 3, 0)])
+    value = 100 * (2 * columns["x"] + columns["y"])
+    wanted = np.where(steps < 5, 7.0, value[:, np.maximum(steps - 5, 0)])
+    np.testing.assert_allclose(columns["late"], wanted, atol=1e-9)
+    assert {"one_now", "late_now", "late_now_4_ago"} <= set(system.decl.hidden)
+    assert [num.name for num in system.decl.policy.observe] == ["x", "y", "w", "one", "late", "wind"]
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("delay: {d: {of: x}}", "S102"),
+        ("delay: {d: {of: x, by: 0.25 s}}", "S103"),
+        ("delay: {d: {of: x, by: 1001}}", "S103"),
+        ("delay: {d: {unit: s, of: x, by: 1}}", "E203"),
+        ("delay: {d: {of: prev(x), by: 1}}", "S201"),
+        ("delay: {x: {of: y, by: 1}}", "E102"),
+        ("delay: {d: {of: d, by: 2, before: 0}, e: {of: x, by: 1}}\nflow: {d: 1}", "S202"),
+    ],
+)
+def test_wrong_delays(make: Make, text: str, code: str) -> None:
+    with pytest.raises(StlcError) as error:
+        make(PLANT + text + "\n")
+    assert code in [finding.code for finding in error.value.diagnostics]

@@ -163,6 +163,14 @@ def _facts(decl: SystemDecl) -> documents.SystemFacts:
             documents.record(documents.ControlRange, control, unit=str(control.unit))
             for control in decl.controls
         ],
+        "inputs": [
+            documents.record(
+                documents.InputSignal,
+                each,
+                **{"unit": str(each.unit), "seconds": float(each.duration), "columns": list(each.columns)},
+            )
+            for each in decl.inputs
+        ],
         "constants": {name: value for name, (value, _) in decl.constants.items()},
         "jumps": [jump.name for jump in decl.jumps],
         "situations": [situation.name for situation in decl.init.mixture],

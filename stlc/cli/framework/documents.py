@@ -603,6 +603,18 @@ class ControlRange(TypedDict):
     high: Num
 
 
+class InputSignal(TypedDict):
+    name: str
+    unit: str
+    low: Num
+    high: Num
+    pieces: int
+    interpolate: Literal["hold", "linear", "pchip"]
+    seconds: Num
+    free_times: bool
+    columns: list[str]
+
+
 class KinematicsCheck(TypedDict):
     name: str
     distance_m: float | None
@@ -622,6 +634,7 @@ class SystemFacts(TypedDict):
     horizon: Horizon
     states: list[StateFacts]
     controls: list[ControlRange]
+    inputs: list[InputSignal]
     constants: dict[str, Num]
     jumps: list[str]
     situations: list[str]

@@ -1,4 +1,4 @@
-"""Section `held`: values that are computed at samples and constant in between, as in a digital controller."""
+"""Sections `held` and `delay`: values computed at samples, as in a digital controller, and earlier ones."""
 
 from __future__ import annotations
 
@@ -8,16 +8,37 @@ from dataclasses import dataclass, field, replace
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_leaves
-from stlc.dynamics.declaration.columns import RANGE, declared_columns, name_columns, unit_text
+from stlc.dynamics.declaration.columns import (
+    RANGE,
+    declared_columns,
+    name_columns,
+    read_ranges,
+    unit_text,
+)
 from stlc.dynamics.declaration.motion import Assign, state_assigns
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
+from stlc.dynamics.schema.expressions import written
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
-from stlc.dynamics.schema.record import FLAG, OF, STEPS, VECTOR, integer, key, raw, values_of
+from stlc.dynamics.schema.record import (
+    EXPRESSION,
+    FLAG,
+    OF,
+    STEPS,
+    VECTOR,
+    integer,
+    key,
+    raw,
+    read,
+    values_of,
+)
 from stlc.dynamics.schema.yaml_nodes import Entry, Node
 from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import Unit
+
+MAX_DELAY = 1000
+"""Largest delay in steps; each is a column of the state."""
 
 
 @dataclass(repr=False, eq=False)
@@ -37,21 +58,37 @@ class HeldKeys:
     size: int | None = key(integer(high=1000), "components of a vector")
 
 
+@dataclass(repr=False, eq=False)
+class DelayKeys:
+    """The keys that the declaration of one delayed value may have."""
+
+    of: Node | None = key(raw(EXPRESSION), "the value that is delayed", required=True)
+    by: int | None = key(STEPS, "the delay, as a time or in steps", required=True)
+    before: Node | None = key(
+        raw(EXPRESSION), "value before the start; that of `of` at the start unless given"
+    )
+    unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
+    ends: Node | None = key(RANGE, "lower and upper end", name="range")
+
+
 @dataclass(frozen=True, slots=True)
 class HeldSection:
-    """The section `held`, of which only names and keys are read.
+    """The sections `held` and `delay`, of which only names and keys are read.
 
     Attributes:
-        entries: the entries of the file, each with its keys.
+        entries: the entries of the section `held`, each with its keys.
+        delays: the entries of the section `delay`, each with its keys.
         ticks: the clock, if a value is not computed at every step.
     """
 
     entries: tuple[tuple[Entry, HeldKeys], ...] = ()
+    delays: tuple[tuple[Entry, DelayKeys], ...] = ()
     ticks: Sampled = field(default_factory=Sampled)
 
 
-def declare_held(node: Node | None, cx: Context) -> HeldSection:
-    """Read the section `held` except for the values, and declare its names."""
+def declare_held(node: Node | None, delay: Node | None, cx: Context) -> HeldSection:
+    """Read the sections `held` (`node`) and `delay` except for the values, and declare their names."""
+    delays = _declared_delays(delay, cx)
     found: list[tuple[Entry, HeldKeys]] = []
     for entry in cx.reader.entries(node, "`held`"):
         name = entry.key.text
@@ -67,12 +104,32 @@ def declare_held(node: Node | None, cx: Context) -> HeldSection:
         found.append((entry, keys))
     name_columns(cx.names, "held value")
     if node is None or all(keys.every == 1 for _, keys in found):
-        return HeldSection(tuple(found))
-    return HeldSection(tuple(found), clock(cx, first_line(node.span), flows=False))
+        return HeldSection(tuple(found), delays)
+    return HeldSection(tuple(found), delays, clock(cx, first_line(node.span), flows=False))
+
+
+def _declared_delays(node: Node | None, cx: Context) -> tuple[tuple[Entry, DelayKeys], ...]:
+    """Read the section `delay` except for the values, and declare its names."""
+    found: list[tuple[Entry, DelayKeys]] = []
+    for entry in cx.reader.entries(node, "`delay`"):
+        name = entry.key.text
+        if not cx.names.declare(entry.key, "delayed value", cx.reader):
+            continue
+        where = f"the delayed value `{name}`"
+        keys = read(DelayKeys, cx.plain, entry.value, where, OF)
+        ranges = read_ranges(keys.ends, keys.unit, 1, where, cx.plain)
+        low, high = ranges[0] if ranges else (None, None)
+        cx.names.columns.append(Column(name, keys.unit, low=low, high=high))
+        if keys.by is not None and keys.by > MAX_DELAY:
+            message = f"{where} is {keys.by} steps late, and {MAX_DELAY} are the most"
+            cx.reader.report("S103", message, entry.place("by"))
+        else:
+            found.append((entry, keys))
+    return tuple(found)
 
 
 def read_held(section: HeldSection, cx: Context) -> Sampled:
-    """Read the values of the section `held`.
+    """Read the values of the sections `held` and `delay`.
 
     The columns that keep earlier values for `prev(…)` are declared.
     """
@@ -86,10 +143,15 @@ def read_held(section: HeldSection, cx: Context) -> Sampled:
     cells: dict[str, _Held] = {}
     for entry, keys in section.entries:
         cells |= {each.column.name: each for each in _cells(entry, keys, inside, cx)}
+    late: tuple[str, ...] = ()
+    for entry, delay in section.delays:
+        pair = _delayed(entry, delay, replace(cx, here=here))
+        cells |= {each.column.name: each for each in pair}
+        late += tuple(each.column.name for each in pair[:1])
     past = _Past(cells, cx)
     initial = tuple(Assign(name, past.at_start(cell), cell.text) for name, cell in cells.items())
     updates = tuple(Assign(name, past.later(cell), cell.text) for name, cell in cells.items())
-    return section.ticks + Sampled((), initial, updates) + past.kept()
+    return section.ticks + Sampled((), initial, updates, (), late) + past.kept()
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +190,28 @@ def _cells(entry: Entry, keys: HeldKeys, inside: Context, cx: Context) -> list[_
         _Held(columns[each.name], keys.every, each.value, each.text, before.get(each.name), entry.key.span)
         for each in values
     ]
+
+
+def _delayed(entry: Entry, keys: DelayKeys, cx: Context) -> tuple[_Held, ...]:
+    """Read the value of one delay: return the column of the value itself, and the delayed one.
+
+    The column of the value itself is declared. Nothing is returned if the declaration is invalid.
+    """
+    name, place = entry.key.text, entry.key.span
+    where = f"the delayed value `{name}`"
+    value = cx.here.stored(keys.of, where, keys.unit)
+    before = value if keys.before is None else cx.here.stored(keys.before, f"`before` of {where}", keys.unit)
+    if value is None or before is None or keys.by is None:
+        return ()
+    (column,) = cx.names.group(name)
+    present = replace(column, name=f"{name}_now")
+    declared(cx, present, place)
+    text = written(keys.of)
+    late = ir.Signal(present.name + ir.BEFORE * keys.by)
+    return (
+        _Held(present, 1, value, text, before, place),
+        _Held(column, 1, late, f"{text}, {keys.by} samples ago", before, place),
+    )
 
 
 class _Past:

@@ -34,7 +34,7 @@ from stlc.dynamics.declaration.deployment import (
     read_scenarios,
 )
 from stlc.dynamics.declaration.functions import FunctionDecl, FunctionKeys, read_functions
-from stlc.dynamics.declaration.held import HeldKeys, HeldSection, declare_held, read_held
+from stlc.dynamics.declaration.held import DelayKeys, HeldKeys, HeldSection, declare_held, read_held
 from stlc.dynamics.declaration.init import InitDecl, InitKeys, read_init
 from stlc.dynamics.declaration.inputs import InputDecl, InputKeys, read_inputs
 from stlc.dynamics.declaration.learning import ObjectiveDecl, PolicyDecl, TrainDecl
@@ -97,6 +97,7 @@ class SystemKeys:
     control: Node | None = key(section(ControlKeys, free=True), "controls")
     table: Node | None = key(section(TableKeys, free=True), "interpolation tables, called as functions")
     held: Node | None = key(section(HeldKeys, free=True), "values computed at samples and held in between")
+    delay: Node | None = key(section(DelayKeys, free=True), "values some time ago")
     def_: Node | None = key(raw(mapping_of(EXPRESSION)), "named sub-expressions", name="def")
     flow: Node | None = key(raw(mapping_of(VECTOR)), "derivatives, or next values of a discrete system")
     jump: Node | None = key(raw(items_of(json_schema(JumpDecl)), JumpDecl), "guarded resets")
@@ -284,7 +285,7 @@ class _Named:
         functions: external functions.
         inputs: input signals.
         sampled: columns of input signals.
-        held: names and keys of the section `held`.
+        held: names and keys of the sections `held` and `delay`.
         tables: interpolation tables.
     """
 
@@ -312,7 +313,7 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
     read_controls(found.control, cx)
     functions = read_functions(found.functions, cx.plain)
     tables = read_tables(found.table, cx.plain)
-    held = declare_held(found.held, cx)
+    held = declare_held(found.held, found.delay, cx)
     read_definitions(found.def_, cx)
     return _Named(cx.plain, clock, states, drawn, functions, inputs.signals, inputs.sampled, held, tables)
 

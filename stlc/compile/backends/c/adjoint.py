@@ -122,8 +122,8 @@ int pull(int64_t batch, int64_t first, int64_t last, const double *x0, const dou
          const double *g_columns, double *g_u, double slope) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules}, ROOM = {room} }};
   lanes *x = malloc(sizeof(lanes) * N), *gx = malloc(sizeof(lanes) * N);
-  inputs *v = malloc(sizeof(double) * M * T * LANES);
-  inputs *gv = malloc(sizeof(double) * M * T * LANES);
+  inputs *v = malloc(sizeof(double) * (M * T + 1) * LANES);
+  inputs *gv = malloc(sizeof(double) * (M * T + 1) * LANES);
   double *room = malloc(sizeof(double) * ROOM * LANES), *adjoint = malloc(sizeof(double) * ROOM * LANES);
   lane *out = malloc(sizeof(double) * (R + 1) * LANES);
   const int failed = !x || !gx || !v || !gv || !room || !adjoint || !out;
