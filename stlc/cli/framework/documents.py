@@ -385,6 +385,45 @@ class Plans(TypedDict):
     trace: str
 
 
+class Violation(TypedDict):
+    margin: Num
+    half_step: Num | None
+    strategy: str
+    simulation: int
+
+
+class FalsifiedRequirement(TypedDict):
+    name: str
+    verdict: Literal["violated", "open"]
+    simulations: int
+    least: Num
+    found: Violation | None
+    simpler: Violation | None
+    spurious: list[Violation]
+    coverage: float
+    rejected: int
+    seconds: float
+    strategies: dict[str, int]
+    file: str | None
+    replay: str | None
+
+
+class FalsifiedSystem(TypedDict):
+    target: str
+    simulations: int
+    seed: int
+    coordinates: int
+    requirements: list[FalsifiedRequirement]
+
+
+class ReplayedCounterexample(TypedDict):
+    requirement: str
+    margin: Num
+    stored_margin: Num
+    identical: bool
+    different: list[str]
+
+
 class PlottedTrace(TypedDict):
     trace: str
     picture: str
@@ -707,6 +746,7 @@ RESULTS: dict[str, Any] = {
     "doctor": InstallationReport,
     "explain": ExplainResult,
     "export": ExportedRun,
+    "falsify": FalsifiedSystem | ReplayedCounterexample,
     "fmt": FormattedFiles,
     "init": CreatedFiles,
     "lint": LintedFiles,

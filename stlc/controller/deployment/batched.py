@@ -6,6 +6,7 @@ An error in a world's code is reported with its location in the world's file.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Disturbance
+from stlc.controller.deployment.tape import Tape
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
 from stlc.controller.guard.candidates import RobustnessMargins
 from stlc.controller.guard.feasibility import solvable, viable
@@ -54,6 +56,8 @@ class Setting:
         margin: name of a safety requirement -> robustness margin by which a plan must satisfy it to be
             accepted by a guard.
         paper_limit: time limit of a decision of the guard "paper", in seconds per agent; None: no limit.
+        draws: for each seed, a point of the unit cube from which its first random numbers are read instead of
+            drawn, (dim,); None: all are drawn.
     """
 
     seeds: tuple[int, ...]
@@ -64,6 +68,7 @@ class Setting:
     ceiling: int = 0
     margin: RobustnessMargins = field(default_factory=dict)
     paper_limit: float | None = None
+    draws: tuple[NDArray[np.float64], ...] | None = None
 
 
 class Worlds:
@@ -82,13 +87,28 @@ class Worlds:
         self.seeds = setting.seeds
         self.parts = [setting.agents] * len(setting.seeds)
         self.generators = [torch.Generator().manual_seed(seed) for seed in setting.seeds]
+        self.tape: Tape | None = None
+        if setting.draws is not None:
+            self.tape = Tape(torch.from_numpy(np.stack(setting.draws)))
+            self.tape.own(self.generators)
         self.disturbance = Disturbance(task.plain, self.generators, setting.agents)
+        if self.tape is not None:
+            for stream in self.disturbance.streams:
+                self.tape.own(stream)
         self.truths = self.disturbance.truths(task.plain.truth)
         self.eventless = torch.ones(setting.agents * len(setting.seeds), dtype=torch.bool)
-        with blamed(make, "__init__", "be made"):
-            pairs = zip(self.truths, self.generators, strict=True)
-            self.worlds = [make(real, setting.agents, generator) for real, generator in pairs]
+        self.worlds = []
+        for row, (real, generator) in enumerate(zip(self.truths, self.generators, strict=True)):
+            with blamed(make, "__init__", "be made"), self.drawing(row):
+                self.worlds.append(make(real, setting.agents, generator))
         self._scene: dict[str, NDArray[Any]] | None = None
+
+    def drawing(self, row: int | None = None) -> AbstractContextManager[None]:
+        """Context in which random numbers are read from the points of the setting, if there are any.
+
+        `row`: index of the seed to which numbers from a world's own generators belong.
+        """
+        return nullcontext() if self.tape is None else self.tape.drawing(row)
 
     def reset(self) -> Tensor:
         """Return the initial states of a new deployment, (rows, n).
@@ -104,11 +124,12 @@ class Worlds:
             RunError: R405, after the maximum number of draws, there is still an initial state without a plan.
         """
         given = []
-        for world in self.worlds:
-            with blamed(world, "reset", "begin"):
+        for row, world in enumerate(self.worlds):
+            with blamed(world, "reset", "begin"), self.drawing(row):
                 given.append(world.reset())
         parts = zip(torch.split(self._checked("reset", given, 0), self.parts), self.generators, strict=True)
-        starts = [self.system.with_added(x, generator) for x, generator in parts]
+        with self.drawing():
+            starts = [self.system.with_added(x, generator) for x, generator in parts]
         self.redrawn = 0
         if self.task.system.decl.test.starts == "any":
             return torch.cat(starts)
@@ -163,15 +184,17 @@ class Worlds:
         """
         known = x[:, : self.size[1]]
         before, given = torch.split(known.clone(), self.parts), []
-        acted = self.disturbance.acted(self.system.commanded(x, action).clone())
+        with self.drawing():
+            acted = self.disturbance.acted(self.system.commanded(x, action).clone())
         acts = torch.split(self.system.planned(x, acted), self.parts)
         alone = [truth.step(state, act) for truth, state, act in zip(self.truths, before, acts, strict=True)]
-        for world, state, act in zip(self.worlds, before, acts, strict=True):
-            with blamed(world, "advance", f"take step {step}"):
+        for row, (world, state, act) in enumerate(zip(self.worlds, before, acts, strict=True)):
+            with blamed(world, "advance", f"take step {step}"), self.drawing(row):
                 given.append(world.advance(state, act))
         reached = self._checked("advance", given, step)
         self.eventless = ((reached - torch.cat(alone)).abs() <= SURPRISE).all(1)
-        moved = self.disturbance.pushed(reached, known, step)
+        with self.drawing():
+            moved = self.disturbance.pushed(reached, known, step)
         return torch.cat((moved, self.system.added_later(x)), 1)
 
     def options(self, x: Tensor) -> Tensor | None:

@@ -51,7 +51,7 @@ class Disturbance:
         self._noises = _drawings(scenario.noise if scenario else ())
         self._errors = scenario.errors if scenario else ErrorsDecl()
         own = [[seeded(each.initial_seed(), key) for key in range(4)] for each in generators]
-        self._streams = tuple(zip(*own, strict=True))
+        self.streams = tuple(zip(*own, strict=True))
         angles = [control.squash == "angle" for control in system.decl.controls]
         self._angle = torch.tensor(angles, dtype=torch.bool)
         self._factor, self._offset = self._wrong_gains()
@@ -93,7 +93,7 @@ class Disturbance:
         Every seed has several generators of random numbers; `stream` tells which of them draws.
         """
         shape = (self._agents, count)
-        drawn = [torch.randint(2, shape, generator=each) for each in self._streams[stream]]
+        drawn = [torch.randint(2, shape, generator=each) for each in self.streams[stream]]
         return 2.0 * torch.cat(drawn).double() - 1.0
 
     def _normal(self, stream: int, count: int) -> Tensor:
@@ -102,7 +102,7 @@ class Disturbance:
         Every seed has several generators of random numbers; `stream` tells which of them draws.
         """
         shape = (self._agents, count)
-        streams = self._streams[stream]
+        streams = self.streams[stream]
         return torch.cat([torch.randn(shape, generator=each, dtype=torch.float64) for each in streams])
 
     def pushed(self, x: Tensor, before: Tensor, step: int) -> Tensor:

@@ -270,7 +270,8 @@ def simulate(
     recorder.start(x, worlds.snapshot())
     recorder.units, recorder.redrawn = worlds.units(), worlds.redrawn
     for step in range(setting.steps):
-        seen = worlds.disturbance.seen(x, step)
+        with worlds.drawing():
+            seen = worlds.disturbance.seen(x, step)
         due = pilot.due(x, seen, step)
         options, began = worlds.options(x), perf_counter()
         if options is not None:

@@ -30,7 +30,7 @@ _HARD = Hard()
 _SAMPLERS = frozenset(sampler_names())
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Rows:
     """Source of random numbers for drawing `count` states at once, one number per state.
 
@@ -61,6 +61,20 @@ class Rows:
         edges = torch.tensor(weights, dtype=torch.float64).cumsum(0)
         edges = (edges / edges[-1])[:-1].to(self.generator.device)
         return torch.bucketize(self.uniforms(), edges, right=True)
+
+    def index(self, count: int) -> Tensor:
+        """Random indices from 0 to `count` - 1, (self.count,).
+
+        They are drawn evenly: any two indices occur equally often, or one of them once more than the other.
+        """
+        generator, device = self.generator, self.generator.device
+        rounds = -(-self.count // count)
+        orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]
+        return torch.cat(orders)[: self.count] if orders else torch.zeros(0, dtype=torch.int64, device=device)
+
+    def subset(self, at: Tensor) -> Rows:
+        """Source of random numbers for the states with indices `at`, (k,)."""
+        return Rows(len(at), self.generator)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +217,7 @@ class _Mixture:
         picked = rows.pick(self.weights)
         where = [torch.nonzero(picked == index).flatten() for index in range(len(self.parts))]
         drawn = [
-            part({name: column[at] for name, column in table.items()}, Rows(len(at), rows.generator))
+            part({name: column[at] for name, column in table.items()}, rows.subset(at))
             for part, at in zip(self.parts, where, strict=True)
         ]
         names = set(drawn[0]).intersection(*drawn[1:])
@@ -262,7 +276,10 @@ class InitialStates:
 
     def _propose(self, n: int, generator: torch.Generator) -> Tensor:
         """Draw states (n, dim) without applying the conditions of `where`."""
-        rows = Rows(n, generator)
+        return self.proposed(Rows(n, generator))
+
+    def proposed(self, rows: Rows) -> Tensor:
+        """Draw states (n, dim) with the random numbers `rows`, without the conditions of `where`."""
         table = {"": rows.blank()}
         for drawing in self._params:
             table[drawing.name] = drawing(table, rows)
@@ -333,10 +350,9 @@ class _Grid:
     def __call__(self, rows: Rows) -> dict[str, Tensor]:
         if self._count > SHUFFLED:
             return {
-                name: values.to(rows.generator.device)[_picked(len(values), rows)]
-                for name, values in self._axes
+                name: values.to(rows.generator.device)[rows.index(len(values))] for name, values in self._axes
             }
-        number = _picked(self._count, rows)
+        number = rows.index(self._count)
         found: dict[str, Tensor] = {}
         for name, values in reversed(self._axes):
             found[name] = values.to(number.device)[number % len(values)]
@@ -359,7 +375,7 @@ class _File:
         if not self._columns:
             self._columns = self._read()
         first = next(iter(self._columns.values()))
-        number = _picked(len(first), rows)
+        number = rows.index(len(first))
         return {name: column.to(number.device)[number] for name, column in self._columns.items()}
 
     def _read(self) -> dict[str, Tensor]:
@@ -402,14 +418,3 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
     if values is None or values.dtype.kind not in "biuf":
         return None
     return values.astype(np.float64).ravel()
-
-
-def _picked(count: int, rows: Rows) -> Tensor:
-    """Return random indices from 0 to `count` - 1, (rows.count,).
-
-    They are drawn evenly: any two indices occur equally often, or one of them once more than the other.
-    """
-    generator, device = rows.generator, rows.generator.device
-    rounds = -(-rows.count // count)
-    orders = [torch.randperm(count, generator=generator, device=device) for _ in range(rounds)]
-    return torch.cat(orders)[: rows.count] if orders else torch.zeros(0, dtype=torch.int64, device=device)

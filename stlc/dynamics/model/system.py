@@ -160,10 +160,13 @@ class System:
 
         The parameters are drawn with `generator`; the timers get their initial values.
         """
+        return self.with_drawn(states, Rows(len(states), generator))
+
+    def with_drawn(self, states: Tensor, rows: Rows) -> Tensor:
+        """Append parameters, drawn with the random numbers `rows`, and timers: (B, n - added) -> (B, n)."""
         if not self.added:
             return states
         table = dict(zip(self.decl.signature.names, states.double().unbind(1), strict=True))
-        rows = Rows(len(states), generator)
         for drawing in self._drawings:
             table[drawing.name] = drawing(table, rows)
         drawn = [table[each.column.name].to(states) for each in self.parameters]

@@ -1,0 +1,1 @@
+"""Evidence for and against a controller: searches for violations, and bounds on their probability."""

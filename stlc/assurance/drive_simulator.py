@@ -1,0 +1,112 @@
+"""Closed-loop drives of a trained policy in its world, as a function of the random numbers of the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.assurance.falsify import Simulations
+from stlc.assurance.search_space import SearchSpace
+from stlc.controller.deployment.batched import Setting, Worlds
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder
+from stlc.controller.deployment.simulator import simulate as run_worlds
+from stlc.controller.evaluation.archive import trace_of
+from stlc.controller.evaluation.rules import Rules, rules_of, verdict_on_runs
+from stlc.controller.guard.candidates import Limits, Mode
+from stlc.controller.guard.guard import Guard
+from stlc.controller.world import world_type
+
+if TYPE_CHECKING:
+    from stlc.controller.training.run import Run
+    from stlc.monitor.judgement import Verdict
+    from stlc.trace import Trace
+
+MOST_COORDINATES = 2000
+"""Random numbers of a drive at most that are searched; later ones keep the values that the seed gives."""
+
+
+@dataclass(frozen=True)
+class DriveSimulator:
+    """Simulator of drives: one world per point, whose random numbers are read from the point.
+
+    Attributes:
+        run: the trained policy, with its scenario.
+        guard: kind of guard.
+        setting: agents, steps and replanning period; its only seed draws what the points do not give.
+        batch: number of worlds that are simulated side by side.
+    """
+
+    run: Run
+    guard: Mode
+    setting: Setting
+    batch: int = 16
+
+    @cached_property
+    def _rules(self) -> Rules:
+        """Specification by which drives are judged: that of the section `test`, or else that of the plans."""
+        found = rules_of(self.run)
+        compiled = self.run.task.compiled
+        return found or Rules(compiled.spec, compiled.name, self.run.task.system.decl.overrides)
+
+    @cached_property
+    def _guard(self) -> Guard:
+        limits = Limits(
+            seconds=self.setting.limit, margin=self.setting.margin, paper=self.setting.paper_limit
+        )
+        return Guard(self.run.task, self.run.policy, self.guard, limits=limits)
+
+    @cached_property
+    def space(self) -> SearchSpace:
+        """The search space: the random numbers that one simulation uses, `MOST_COORDINATES` at most."""
+        point = np.random.default_rng(0).random(MOST_COORDINATES)
+        worlds = Worlds(self.run.task, world_type(self.run.task.system.decl), self._at(point[None]))
+        worlds.reset()
+        first = 0 if worlds.tape is None else worlds.tape.used[0]
+        return SearchSpace(min(max(2 * first, first + 4 * self.setting.steps, 1), MOST_COORDINATES))
+
+    @cached_property
+    def requirements(self) -> tuple[str, ...]:
+        """Names of the requirements on drives."""
+        return tuple(each.name for each in self._verdict(self.drive(np.full((1, 1), 0.5))))
+
+    def seen(self, requirement: int) -> float:  # noqa: ARG002
+        """1: a drive has no input signals."""
+        return 1.0
+
+    def simulate(self, points: NDArray[np.float64]) -> Simulations:
+        """Simulate `points`, (count, dim), and judge the drives."""
+        margins = self.margins(self.drive(points))
+        return Simulations(margins, margins, np.ones(len(points), dtype=bool))
+
+    def drive(self, points: NDArray[np.float64]) -> DeploymentRecording:
+        """Simulate `points`, (count, dim), side by side, and return the recorded drives."""
+        recorder = Recorder(self.setting.agents, pictured=False)
+        run_worlds(self._guard, world_type(self.run.task.system.decl), self._at(points), recorder)
+        recording = recorder.recording()
+        assert recording is not None
+        return recording
+
+    def margins(self, recording: DeploymentRecording) -> NDArray[np.float64]:
+        """Least robustness of the agents of each simulation, (count, requirements)."""
+        each = [judgement.high.min(0) for judgement in self._verdict(recording)]
+        return np.stack([rho.reshape(-1, self.setting.agents).min(1) for rho in each], 1)
+
+    def trace(self, points: NDArray[np.float64]) -> Trace:
+        """Drives at `points`, (count, dim), as a trace with one row per agent."""
+        return trace_of(self.run, self.drive(points), self._at(points), self._rules)
+
+    def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:  # noqa: ARG002
+        """None: a world has the time step for which it was written, and the policy that of its training."""
+        return None
+
+    def _verdict(self, recording: DeploymentRecording) -> Verdict:
+        return verdict_on_runs(self._rules, self.run.task, recording)
+
+    def _at(self, points: NDArray[np.float64]) -> Setting:
+        seeds: Sequence[int] = self.setting.seeds * len(points)
+        return replace(self.setting, seeds=tuple(seeds), draws=tuple(points))

@@ -1,0 +1,152 @@
+"""Search space of falsification: the unit cube of everything that a simulation draws at random.
+
+A coordinate is the quantile of one random number: a part of the initial state, a parameter, or a value of an
+input signal. A uniformly distributed point is therefore a simulation as the system file declares it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+Point = NDArray[np.float64]
+"""Point of the unit cube, (dim,)."""
+MOST_VERTICES = 64
+"""Maximum number of constant vertices that are simulated."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignalBlock:
+    """Coordinates of the successive values of one input signal.
+
+    Attributes:
+        name: name of the input signal.
+        values: coordinates of its values, in the order of time, (pieces,).
+        times: coordinates of its free switching times, in the order of time; empty if they are fixed.
+        fractions: start of each piece as a share of the signal's duration if the times are fixed, (pieces,).
+    """
+
+    name: str
+    values: tuple[int, ...]
+    times: tuple[int, ...] = ()
+    fractions: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SearchSpace:
+    """The unit cube with the meaning of its coordinates.
+
+    Attributes:
+        dim: number of coordinates.
+        blocks: input signals.
+    """
+
+    dim: int
+    blocks: tuple[SignalBlock, ...] = ()
+
+    @property
+    def rest(self) -> tuple[int, ...]:
+        """Coordinates that belong to no input signal."""
+        taken = {each for block in self.blocks for each in (*block.values, *block.times)}
+        return tuple(each for each in range(self.dim) if each not in taken)
+
+    @property
+    def handles(self) -> tuple[tuple[int, ...], ...]:
+        """Coordinates that move together while inputs are constant: a group per input or other number."""
+        return (*(block.values for block in self.blocks), *((each,) for each in self.rest))
+
+    def visible(self, share: float) -> PartOfSpace:
+        """The part of the space in which inputs are varied up to a share of their duration, 0 to 1."""
+        kept: list[int] = []
+        blocks = []
+        dropped = set()
+        for block in self.blocks:
+            count = (
+                sum(1 for each in block.fractions if each < share) if block.fractions else len(block.values)
+            )
+            count = max(count, 1)
+            dropped |= set(block.values[count:]) if not block.times else set()
+            blocks.append(
+                block
+                if block.times
+                else replace(block, values=block.values[:count], fractions=block.fractions[:count])
+            )
+        kept = [each for each in range(self.dim) if each not in dropped]
+        index = {old: new for new, old in enumerate(kept)}
+        moved = tuple(
+            replace(
+                block,
+                values=tuple(index[each] for each in block.values),
+                times=tuple(index[each] for each in block.times),
+            )
+            for block in blocks
+        )
+        return PartOfSpace(SearchSpace(len(kept), moved), tuple(kept), self.dim)
+
+    def middle(self) -> Point:
+        """Centre of the cube, (dim,); free switching times are evenly spread."""
+        point = np.full(self.dim, 0.5)
+        for block in self.blocks:
+            point[list(block.times)] = (np.arange(len(block.times)) + 1.0) / (len(block.times) + 1.0)
+        return point
+
+    def constant_vertices(self) -> Iterator[Point]:
+        """Points at which each input is constant at an end of its range, and other numbers at ends of theirs.
+
+        If there are too many, inputs alone are at their ends, and other numbers at their medians; with too
+        many inputs, all are at the same end.
+        """
+        handles = self.handles
+        if 2 ** len(handles) > MOST_VERTICES:
+            handles = tuple(block.values for block in self.blocks)
+        if not handles:
+            return
+        if 2 ** len(handles) > MOST_VERTICES:
+            handles = (tuple(each for handle in handles for each in handle),)
+        for ends in product((1.0, 0.0), repeat=len(handles)):
+            point = self.middle()
+            for handle, end in zip(handles, ends, strict=True):
+                point[list(handle)] = end
+            yield point
+
+    def held(self, generator: np.random.Generator, most: int = 5) -> NDArray[np.int64]:
+        """Labels (dim,): coordinates with one label hold one value, in 1 to `most` pieces per input.
+
+        The cuts between the pieces are random; a coordinate outside of inputs has a label of its own.
+        """
+        labels, count = np.zeros(self.dim, dtype=np.int64), 0
+        for block in self.blocks:
+            pieces = min(int(generator.integers(1, most + 1)), len(block.values))
+            cuts = np.sort(generator.choice(np.arange(1, len(block.values)), pieces - 1, replace=False))
+            labels[list(block.values)] = count + np.searchsorted(cuts, np.arange(len(block.values)), "right")
+            count += pieces
+            for each in block.times:
+                labels[each], count = count, count + 1
+        for each in self.rest:
+            labels[each], count = count, count + 1
+        return labels
+
+
+@dataclass(frozen=True, slots=True)
+class PartOfSpace:
+    """Search space with some coordinates of a larger one, the others at 0.5.
+
+    Attributes:
+        space: the smaller space.
+        coordinates: its coordinates in the larger space, (space.dim,).
+        dim: number of coordinates of the larger space.
+    """
+
+    space: SearchSpace
+    coordinates: tuple[int, ...]
+    dim: int
+
+    def whole(self, point: Point) -> Point:
+        """Point of the larger space, (dim,), for a point of the smaller one, (space.dim,)."""
+        found = np.full(self.dim, 0.5)
+        found[list(self.coordinates)] = point
+        return found

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stlc.assurance.falsify import coverage
+from stlc.assurance.search_space import SearchSpace, SignalBlock
+from stlc.assurance.strategies import (
+    CovarianceAdaptation,
+    HillClimbing,
+    PeriodicInputs,
+    VertexSampling,
+    quantiles_of,
+)
+
+TWO = SearchSpace(
+    7,
+    (
+        SignalBlock("throttle", (0, 1, 2), fractions=(0.0, 1 / 3, 2 / 3)),
+        SignalBlock("brake", (3, 4, 5), fractions=(0.0, 1 / 3, 2 / 3)),
+    ),
+)
+
+
+def test_constant_vertices_hold_every_input_at_an_end():
+    points = list(TWO.constant_vertices())
+    assert len(points) == 8  # two inputs and one other number
+    assert all(set(point[:3]) in ({0.0}, {1.0}) and set(point[3:6]) in ({0.0}, {1.0}) for point in points)
+    assert len({tuple(point) for point in points}) == 8
+
+
+def test_many_other_numbers_stay_at_their_medians():
+    space = SearchSpace(20, (SignalBlock("u", (0, 1)),))
+    points = list(space.constant_vertices())
+    assert [tuple(point[:3]) for point in points] == [(1.0, 1.0, 0.5), (0.0, 0.0, 0.5)]
+
+
+def test_inputs_beyond_the_horizon_of_a_requirement_are_not_searched():
+    part = TWO.visible(0.5)
+    assert part.space.dim == 5
+    assert [block.values for block in part.space.blocks] == [(0, 1), (2, 3)]
+    assert part.whole(np.arange(5.0)).tolist() == [0.0, 1.0, 0.5, 2.0, 3.0, 0.5, 4.0]
+    assert TWO.visible(1.0).space == TWO
+
+
+@given(st.integers(0, 1000))
+def test_held_values_change_at_most_four_times(seed):
+    labels = TWO.held(np.random.default_rng(seed), most=5)
+    for block in TWO.blocks:
+        own = labels[list(block.values)]
+        assert (np.diff(own) >= 0).all()
+        assert not set(own) & set(np.delete(labels, list(block.values)))
+
+
+@given(st.integers(0, 200), st.sampled_from([VertexSampling, HillClimbing, PeriodicInputs]))
+def test_strategies_stay_in_the_cube(seed, kind):
+    generator = np.random.default_rng(seed)
+    strategy = kind(TWO, generator)
+    for _ in range(30):
+        point = strategy.propose()
+        assert point.shape == (7,)
+        assert (point >= 0.0).all()
+        assert (point <= 1.0).all()
+        strategy.tell(point, float(generator.normal()))
+
+
+@pytest.mark.parametrize("kind", [HillClimbing, CovarianceAdaptation])
+def test_searches_approach_the_minimum(kind):
+    if kind is CovarianceAdaptation:
+        pytest.importorskip("cma")
+    space = SearchSpace(4)
+    strategy = kind(space, np.random.default_rng(3))
+    best = np.inf
+    for _ in range(300):
+        point = strategy.propose()
+        value = float(((point - 0.3) ** 2).sum())
+        best = min(best, value)
+        strategy.tell(point, value)
+    uniform = np.random.default_rng(3).random((300, 4))
+    assert best < 0.5 * ((uniform - 0.3) ** 2).sum(1).min()
+
+
+def test_covariance_adaptation_takes_points_out_of_order():
+    pytest.importorskip("cma")
+    strategy = CovarianceAdaptation(SearchSpace(3), np.random.default_rng(0))
+    for _ in range(6):
+        points = [strategy.propose() for _ in range(12)]  # more than a generation
+        for point in reversed(points):
+            strategy.tell(point, float(point.sum()))
+    assert strategy.best < 1.0
+
+
+def test_periodic_inputs_alternate_between_ends():
+    strategy = PeriodicInputs(
+        SearchSpace(40, (SignalBlock("u", tuple(range(40))),)), np.random.default_rng(1)
+    )
+    point = strategy.propose()
+    assert set(point) == {0.0, 1.0}
+    runs = np.diff(np.flatnonzero(np.diff(point)))
+    assert runs.size == 0 or runs.max() - runs.min() <= 1
+
+
+@given(st.lists(st.floats(0.0, 0.999), min_size=1, max_size=6))
+def test_quantiles_of_switching_times_give_these_times(times):
+    times = np.sort(times)
+    rest, found = 1.0, []
+    for index, uniform in enumerate(quantiles_of(times)):
+        rest *= uniform ** (1.0 / (len(times) - index))
+        found.append(1.0 - rest)
+    assert np.allclose(found, times, atol=1e-9)
+
+
+def test_coverage_of_a_grid_is_one_and_of_a_point_small():
+    grid = np.stack(np.meshgrid(*[np.linspace(0.1, 0.9, 4)] * 2), -1).reshape(-1, 2)
+    assert coverage(grid) == 1.0
+    assert coverage(grid[:1]) == 1 / 16
+    assert coverage(np.zeros((0, 2))) == 0.0
+    assert coverage(np.zeros((3, 0))) == 1.0
+    assert coverage(np.array([[0.0], [0.9]])) == 0.5

@@ -1,0 +1,119 @@
+"""`stlc falsify` on a run: counterexamples that can be replayed, baselines, bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.documents import misfits
+
+from stlc.assurance.drive_simulator import DriveSimulator
+from stlc.cli.commands.schema import load_schema
+from stlc.cli.framework.app import main
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.training.run import Run
+from stlc.trace import load_trace
+
+SYSTEM = """
+stlc: 1
+name: cart
+time: {dt: 0.1 s, horizon: 8 steps}
+state: {x: {unit: m, range: [-4, 4]}, push: {range: [-1, 1], role: env}}
+control: {u: {unit: m/s, range: [-0.2, 0.2]}}
+flow: {x: "u + push * (1 m/s)"}
+init: {mixture: [{draw: {x: "uniform(-0.5, 0.5)", push: 0}}]}
+test:
+  agents: 2
+  steps: 20
+  events:
+    - {name: gust, every: 0.5 s, set: {push: "uniform(-1, 1)"}}
+"""
+SPEC = """
+system "cart.yaml"
+signal x [m]
+require near: always[0 s, T] x in [-1.3 m, 1.3 m]
+require far: always[0 s, T] x < 30 m
+"""
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        Path("cart.yaml").write_text(SYSTEM)
+        Path("cart.stl").write_text(SPEC)
+        command = ["train", "cart.stl", "--steps", "10", "--batch", "16", "--held-out", "50"]
+        assert main([*command, "--no-pictures"]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(home)
+    capsys.readouterr()
+
+
+def found(capsys: pytest.CaptureFixture[str], *args: str) -> dict:
+    main(["falsify", "latest", "--simulations", "64", *args, "--json"])
+    return json.loads(capsys.readouterr().out)["result"]
+
+
+def test_gusts_that_push_the_cart_out_are_found_and_replayed(capsys, tmp_path):
+    assert main(["falsify", "latest", "--simulations", "64", "-o", str(tmp_path)]) == 1
+    text = capsys.readouterr().out
+    assert "near: violated, robustness -" in text
+    assert "far: no violation in 64 simulations" in text
+    assert "this is no proof" in text
+    trace = load_trace(tmp_path / "near.npz")
+    assert np.abs(trace.data["x"]).max() > 1.3
+    assert not (tmp_path / "far.json").exists()
+    assert main(["falsify", "latest", "--replay", str(tmp_path / "near.json")]) == 1
+    assert "the same, bit for bit" in capsys.readouterr().out
+
+
+def test_the_search_beats_the_baseline(capsys, tmp_path):
+    searched = found(capsys, "--require", "far", "-o", str(tmp_path))
+    sampled = found(capsys, "--require", "far", "--random", "-o", str(tmp_path))
+    assert searched["requirements"][0]["least"] < sampled["requirements"][0]["least"]
+    assert sampled["requirements"][0]["strategies"] == {"uniform": 64}
+    assert misfits(searched, load_schema("falsify")["properties"]["result"]) == []
+
+
+def test_points_decide_the_drives():
+    run = Run.open("latest")
+    simulator = DriveSimulator(run, "none", Setting((0,), 2, 20, 1))
+    points = np.random.default_rng(0).random((3, simulator.space.dim))
+    together = simulator.simulate(points).margins
+    alone = np.concatenate([simulator.simulate(each[None]).margins for each in points])
+    assert np.allclose(together, alone, atol=1e-6)
+    low = np.zeros((1, simulator.space.dim))
+    assert simulator.drive(low).states[0, 0, 0] == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["falsify", "cart.stl"], "has controls (`u`)"),
+        (["falsify", "latest", "--require", "nea"], "did you mean `near`?"),
+        (["falsify", "latest", "--guard", "some"], "there is no guard `some`"),
+        (["falsify", "latest", "--system", "cart.yaml"], "`--system` is for a specification"),
+        (["falsify", "cart.stl", "--agents", "2"], "`--agents` is for a run"),
+        (["falsify", "latest", "--replay", "none.json"], "there is no file `none.json`"),
+        (["falsify", "latest", "--replay", "cart.yaml"], "`cart.yaml` is not a counterexample"),
+    ],
+)
+def test_bad_input_is_named(args, message, capsys):
+    assert main(args) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_counterexample_of_another_system_is_refused(capsys, tmp_path):
+    found(capsys, "--require", "near", "-o", str(tmp_path))
+    stored = json.loads((tmp_path / "near.json").read_text())
+    for point in ([0.5], [*stored["point"][:-1], 2.0], ["a"]):
+        (tmp_path / "other.json").write_text(json.dumps({**stored, "point": point}))
+        assert main(["falsify", "latest", "--replay", str(tmp_path / "other.json")]) == 2
+        assert "does not belong to this system" in capsys.readouterr().err
