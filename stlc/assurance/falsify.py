@@ -7,6 +7,7 @@ when none is found is what was searched, which is never a proof.
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -28,6 +29,10 @@ from stlc.assurance.strategies import (
 )
 from stlc.compile.semantics.semantics import TOLERANCE
 
+FALSIFIER_VERSION = 1
+"""Version of the search; results of older versions are recomputed."""
+FLAT, FLAT_VALUES = 0.9, 20
+"""Share of equal values, and number of last values, at which robustness counts as flat."""
 CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""
 MOST_PAIRED = 40
@@ -150,39 +155,57 @@ class Proposal:
 
 
 class Portfolio:
-    """The strategies of a search, in turn: constant vertices first, then the others one point each."""
+    """The strategies of a search, in turn: constant vertices first, then the others.
+
+    Every other turn goes to the strategy that has found the least robust point.
+
+    While the robustness is flat, that is, hardly ever changes, nothing can be learnt from it: then points are
+    uniform.
+    """
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator, *, random: bool = False) -> None:
         """Take turns between all strategies, or sample uniformly if `random`."""
-        if random or not space.dim:
-            self._first: Strategy | None = None
-            self._turns: list[Strategy] = [UniformSampling(space, generator)]
-        else:
+        self._uniform = UniformSampling(space, generator)
+        self._first: Strategy | None = None
+        self._turns: list[Strategy] = []
+        if not random and space.dim:
             self._first = ConstantVertices(space, generator)
-            hill = HillClimbing(space, generator)
-            self._turns = [VertexSampling(space, generator), hill]
+            self._turns = [VertexSampling(space, generator), HillClimbing(space, generator)]
             if CovarianceAdaptation.available(space):
                 self._turns.append(CovarianceAdaptation(space, generator))
             if space.blocks:
                 self._turns.append(PeriodicInputs(space, generator))
         self._turn = 0
+        self._values: deque[float] = deque(maxlen=FLAT_VALUES)
+
+    @property
+    def flat(self) -> bool:
+        """Whether nearly all of the last values are the same."""
+        count = len(self._values)
+        return count > 1 and Counter(self._values).most_common(1)[0][1] >= FLAT * count
 
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
+        if not self._turns or self.flat:
+            return Proposal(self._uniform, self._uniform.propose())
         if self._first is not None:
             point = self._first.propose()
             if point is not None:
                 return Proposal(self._first, point)
             self._first = None
-        while True:
-            strategy = self._turns[self._turn % len(self._turns)]
-            self._turn += 1
-            point = strategy.propose()
-            if point is not None:
-                return Proposal(strategy, point)
+        leads = self._turn % 2 == 1
+        self._turn += 1
+        strategy = min(self._turns, key=lambda each: each.best) if leads else self._turns[0]
+        if not leads:
+            self._turns = [*self._turns[1:], strategy]
+        point = strategy.propose()
+        return (
+            Proposal(self._uniform, self._uniform.propose()) if point is None else Proposal(strategy, point)
+        )
 
     def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others."""
+        self._values.append(value)
         proposal.strategy.tell(proposal.point, value)
         for other in self._turns:
             if other is not proposal.strategy:

@@ -65,6 +65,12 @@ class ModelSimulator:
         }
         return cls(task, None if decl.discrete else lambda: load_task(spec, system, halved))
 
+    def renewed(self) -> ModelSimulator:
+        """Return the same simulator before its first simulation: its guidance is scaled anew."""
+        made = ModelSimulator(self.task, self.finer, self.batch)
+        made.__dict__.update(points=self.points, space=self.space, _finer=self._finer)
+        return made
+
     @cached_property
     def points(self) -> InitialPoints:
         """Map from the unit cube to initial states."""
