@@ -1,1 +1,1 @@
-"""Evidence for and against a controller: searches for violations, and bounds on their probability."""
+"""Evidence about controllers beyond single verdicts: searches for violations, statistical bounds, certificates."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -109,7 +109,14 @@ class WorldType(Protocol):
 
 
 class ModelWorld:
-    """Independent agents that follow the model exactly and are subject to the events of the system file."""
+    """Independent agents that follow the model exactly and are subject to the events of the system file.
+
+    Attributes:
+        independent: whether no agent influences another, directly or through random numbers that they share.
+            Any world may have this attribute; without it, its agents are not taken to be independent.
+    """
+
+    independent: ClassVar[bool] = True
 
     def __init__(self, system: System, agents: int, generator: torch.Generator) -> None:
         self._system, self._agents, self._generator = system, agents, generator
@@ -179,6 +186,14 @@ class ModelWorld:
         for name, count in counts.items():
             self._counts[name] += count
         return self._x
+
+
+def independent_agents(make: WorldType) -> bool:
+    """True if a world class says that no agent influences another; see `ModelWorld.independent`.
+
+    The attribute is not inherited: a world that is derived from an independent one may couple its agents.
+    """
+    return vars(make).get("independent") is True
 
 
 _METHODS = ("reset", "advance", "progress", "units", "snapshot", "draw")

@@ -76,6 +76,7 @@ class Work:
         chunk: samples per chunk; 0: the file is read as a whole if it fits into memory.
         color: whether the text of the result has colour codes.
         mode: value of `--color`; the worker process uses the same value.
+        certify: whether the traces are returned as a sample for bounds.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Work:
     chunk: int = 0
     color: bool = False
     mode: ColorMode = "never"
+    certify: bool = False
 
 
 def found(name: str, runs: Path) -> Path:

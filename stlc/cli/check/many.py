@@ -6,7 +6,9 @@ import multiprocessing
 import os
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stlc.cli.check.judge import Work, found, judge
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
@@ -14,6 +16,10 @@ from stlc.cli.framework.documents import InvalidTrace
 from stlc.cli.framework.output import COLOR, table
 from stlc.diagnostics import StlcError, usage
 from stlc.stopping import leaving
+
+if TYPE_CHECKING:
+    from stlc.assurance.certificate import Sample
+    from stlc.cli.check.outcome import Checked
 
 SMALL = 1_000_000
 """File size in bytes below which the unpacked content always fits into memory."""
@@ -66,7 +72,7 @@ def outcome_of(work: Work) -> Outcome:
     if work.chunk or _too_large(path):
         from stlc.cli.check.online import outcome_in_chunks
 
-        return outcome_in_chunks(path, work)
+        return with_sample(outcome_in_chunks(path, work)) if work.certify else outcome_in_chunks(path, work)
     result = judge(work.name, work.question, work.runs)
     if work.out is not None:
         from stlc.cli.check.document import write_robustness
@@ -85,7 +91,21 @@ def outcome_of(work: Work) -> Outcome:
         seconds=time.perf_counter() - begun,
         warnings=result.warnings,
         remarks=result.remarks,
+        sample=_sample(result) if work.certify else None,
     )
+
+
+def _sample(result: Checked) -> Sample | None:
+    from stlc.cli.certify.traces import sample_of_verdict
+
+    return sample_of_verdict(result)
+
+
+def with_sample(outcome: Outcome) -> Outcome:
+    """Return the outcome of a trace that was judged in chunks with its observation for bounds."""
+    from stlc.cli.certify.traces import sample_of_rows
+
+    return replace(outcome, sample=sample_of_rows(outcome.rows))
 
 
 def _too_large(path: Path) -> bool:

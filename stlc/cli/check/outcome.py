@@ -14,6 +14,7 @@ from stlc.source import Source
 from stlc.trace import Trace
 
 if TYPE_CHECKING:
+    from stlc.assurance.certificate import Sample
     from stlc.monitor.judgement import Status
 
 WORDS: dict[Status, str] = {
@@ -73,6 +74,7 @@ class Outcome:
         remarks: further messages for the user.
         errors: reasons for which the file could not be judged.
         exit_code: exit code of the command for these errors; 0 without errors.
+        sample: its traces as observations, with `--certify`; None if no trace is in scope.
     """
 
     name: str
@@ -88,6 +90,7 @@ class Outcome:
     remarks: tuple[str, ...] = ()
     errors: tuple[Diagnostic, ...] = ()
     exit_code: int = 0
+    sample: Sample | None = None
 
 
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
 from stlc.cli.check import options as given
 from stlc.cli.check.judge import End, Work
-from stlc.cli.framework.documents import CheckResult
+from stlc.cli.framework.documents import Assurance, CheckResult
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     "stlc check trace.npz",
     "stlc check specs/traffic.stl drive.csv --require give_way",
     "stlc check specs/traffic.stl drives/*.parquet --jobs 0 --junit checks.xml",
+    "stlc check specs/traffic.stl logs/*.csv --certify .95",
     "stlc check specs/traffic.stl bag.mcap --resample 0.1s --map dx=lead.gap",
 )
 def check(
@@ -56,6 +58,7 @@ def check(
         float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
     ] = 1e-6,
     fail_under: FailUnderOption = None,
+    certify: CertifyOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -84,7 +87,7 @@ def check(
     Otherwise it is judged by the specification and the constants that it stores. If the trace is -, samples
     come from the standard input, as CSV with a header or as one JSON object per line. A file larger than
     memory is judged in chunks. Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short); with
-    -q nothing is printed.
+    --certify 0 certified, 1 refuted, 4 undecided; with -q nothing is printed.
     """
     from stlc.cli.check.document import document
     from stlc.cli.check.document import junit as junit_xml
@@ -94,6 +97,9 @@ def check(
     spec, traces = _split_files(files, reading.spec)
     if not 0 <= tolerance < math.inf:
         raise usage(f"`--tolerance {tolerance}` is not a number from 0 on")
+    require_claim(certify, fail_under)
+    if certify is not None and STDIN in traces:
+        raise usage("`--certify` needs several traces, and the standard input is one")
     question = reading.question(spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics)
     talk = not (QUIET.get() or json)
     if STDIN in traces:
@@ -108,19 +114,37 @@ def check(
     else:
         color, paths = wants_color(sys.stdout), out_paths(out, traces)
         works = [
-            Work(name, question, reading.runs, path, chunk, color, COLOR.get())
+            Work(name, question, reading.runs, path, chunk, color, COLOR.get(), certify is not None)
             for name, path in zip(traces, paths, strict=True)
         ]
         outcomes = list(all_outcomes(works, jobs))
     if junit is not None:
         write_atomic(junit, junit_xml(outcomes))
     findings = dict.fromkeys(f for outcome in outcomes for f in (*outcome.errors, *outcome.warnings))
-    show = partial(_print, outcomes) if talk else lambda: None
-    return Answer(document(outcomes), show, exit_code(outcomes, fail_under), findings)
+    code, record = exit_code(outcomes, fail_under), document(outcomes)
+    if certify is not None:
+        code = _bounded(record, outcomes, certify, code)
+    show = partial(_print, outcomes, record.get("assurance")) if talk else lambda: None
+    return Answer(record, show, code, findings)
 
 
-def _print(outcomes: Sequence[Outcome]) -> None:
-    """Print remarks, errors and warnings, then the results of the judged files.
+def _bounded(record: CheckResult, outcomes: Sequence[Outcome], share: float, code: int) -> int:
+    """Add bounds on the share of satisfied traces to the record, and return the exit code.
+
+    The code is that of the answer, or `code` if a file cannot be judged; 4 if no trace is in scope.
+    """
+    from stlc.cli.certify.traces import assess_outcomes
+    from stlc.cli.check.outcome import INCONCLUSIVE, INVALID
+
+    found = assess_outcomes(outcomes, share)
+    if found is None:
+        return code if code >= INVALID else INCONCLUSIVE
+    record["assurance"] = bounds_record(found)
+    return code if any(outcome.errors for outcome in outcomes) else found.exit_code
+
+
+def _print(outcomes: Sequence[Outcome], assurance: Assurance | None) -> None:
+    """Print remarks, errors and warnings, then the results of the judged files, then bounds, if any.
 
     A single result is printed in full. Of several results, those that are not satisfied are printed in full,
     and a summary table follows.
@@ -137,9 +161,11 @@ def _print(outcomes: Sequence[Outcome]) -> None:
         shown.update(fresh)
     if len(outcomes) == 1:
         emit(outcomes[0].text, styled=True)
-        return
-    parts = [outcome.text for outcome in outcomes if outcome.text and outcome.status != "satisfied"]
-    emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
+    else:
+        parts = [outcome.text for outcome in outcomes if outcome.text and outcome.status != "satisfied"]
+        emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
+    if assurance is not None:
+        emit("\n".join(["", *bounds_lines(assurance)]))
 
 
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:

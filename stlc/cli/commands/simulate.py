@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.framework.documents import ScenarioResult, Simulation
+from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
+from stlc.cli.framework.documents import Assurance, ScenarioResult, Simulation
 from stlc.cli.framework.options import (
     FailUnderOption,
     JsonOption,
@@ -31,7 +33,7 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.deployment.simulator import Setting
@@ -102,6 +104,7 @@ def simulate(
         typer.Option(metavar="FILE", help="Also write the trace to this file (.npz, .csv, .mcap)."),
     ] = None,
     fail_under: FailUnderOption = None,
+    certify: CertifyOption = None,
     scenario: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="A scenario, `all` scenarios of the system file, or `disturbed`."),
@@ -159,6 +162,7 @@ def simulate(
     if record is not None:
         check_writable(record)
     require_writable(margins)
+    require_claim(certify, fail_under)
     overrides = parse_overrides(set_)
     run = _run_of(run, _planner(method, option, budget, system), system, overrides, runs)
     opened = Run.open(run, root=runs, overrides=overrides)
@@ -175,11 +179,11 @@ def simulate(
         limit = parse_limit(time_limit)
         setting = replace(setting, limit=limit, paper_limit=limit)
     requested = parse_margins(margin or ())
-    order = _Order(opened, chosen, setting, record, live, margins, overrides, requested)
+    order = _Order(opened, chosen, setting, record, live, margins, overrides, requested, certify)
     several = _several(opened, scenario)
     document = _all(order, several) if several else _deployed(order, scenario)
     if not json:  # before the pictures, so that they do not affect the measurements
-        for line in screen(document, windows=windows):
+        for line in chain(screen(document, windows=windows), _bounds_shown(document, chosen)):
             printed(line)
     drawn = _pictures(opened) if pictures else {}
 
@@ -194,7 +198,7 @@ def simulate(
     made: Any = {**document, **drawn}
     result: Simulation = made
     missed = fail_under is not None and _satisfied(document, chosen) < fail_under
-    return Answer(result, show, int(missed))
+    return Answer(result, show, int(missed) if certify is None else _certified(document, chosen))
 
 
 def _planner(
@@ -261,6 +265,7 @@ class _Order:
     margins: str | None
     overrides: Mapping[str, str]
     requested: MarginRequest
+    certify: float | None = None
 
 
 def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simulation:
@@ -334,6 +339,24 @@ def _satisfied(document: Simulation, guard: Mode) -> float:
     guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
     runs = [each[guard]["drives"] for each in guards]
     return min(float(each["obeyed"] / each["count"]) for each in runs)
+
+
+def _bounds(document: Simulation, guard: Mode) -> dict[str, Assurance]:
+    """Bounds on the drives with a guard: scenario -> bounds; empty without `--certify`."""
+    each = {"": document["guards"], **{k: v["guards"] for k, v in document.get("scenarios", {}).items()}}
+    return {name: guards[guard]["assurance"] for name, guards in each.items() if "assurance" in guards[guard]}
+
+
+def _bounds_shown(document: Simulation, guard: Mode) -> Iterator[str]:
+    for name, record in _bounds(document, guard).items():
+        yield f"\n  {name}" if name else ""
+        yield from bounds_lines(record)
+
+
+def _certified(document: Simulation, guard: Mode) -> int:
+    """Exit code of `--certify`: 0 if the share is certified in all scenarios, 1 if refuted in one, else 4."""
+    answers = {record["answer"] for record in _bounds(document, guard).values()}
+    return 1 if "refuted" in answers else 0 if answers == {"certified"} else 4
 
 
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
@@ -422,9 +445,20 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
         "overrides": dict(order.overrides),
     }
     made: Any = as_json(found, order.setting, facts)
+    if order.certify is not None:
+        for name, each in found.items():
+            made["guards"][name]["assurance"] = _assured(run, each, rules, order.certify)
     document: Simulation = made
     run.dir.write_json(SIMULATION, document)
     return document
+
+
+def _assured(run: Run, found: Deployment, rules: Rules | None, share: float) -> Assurance:
+    """Bounds on the share of drives that satisfy everything; the number of drives was fixed in advance."""
+    from stlc.assurance.certificate import Claim, assess
+    from stlc.assurance.drives import sample_of
+
+    return bounds_record(assess(sample_of(run.task, found.recording, rules), Claim(share, online=True)))
 
 
 # ------------------------------------------------------------------------- pictures

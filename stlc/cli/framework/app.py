@@ -16,7 +16,7 @@ PROGRAM = Program(
     ),
     package="stlc.cli.commands",
     order=(
-        *("train", "simulate", "check", "explain", "plot", "report", "runs", "export"),
+        *("train", "simulate", "certify", "check", "explain", "plot", "report", "runs", "export"),
         *("init", "lint", "fmt", "compile", "system", "lsp", "schema", "doctor", "help"),
     ),
     moved={

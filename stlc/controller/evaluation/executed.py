@@ -92,6 +92,20 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
     return replace(executed, viable=found | executed.agents(safety))
 
 
+def executed_robustness(task: Task, recording: DeploymentRecording) -> dict[str, NDArray[np.float64]]:
+    """Least robustness of each trajectory, requirement -> (rows,), over the start instants of `Executed`.
+
+    It is -inf for a requirement without a start instant: the recording is too short.
+    """
+    columns = dict(
+        zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
+    )
+    margins = {rule.name: _margins(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
+    return {
+        name: each.min(0) if len(each) else np.full(each.shape[1], -np.inf) for name, each in margins.items()
+    }
+
+
 def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
     """Return a requirement in the form in which it is judged on a recorded trajectory.
 
@@ -108,20 +122,27 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
 
 
 def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
-    """Verdicts on one requirement, (starts, rows) booleans.
+    """Verdicts on one requirement, (starts, rows) booleans; see `_margins`."""
+    return _margins(rule, columns, horizon) >= -TOLERANCE
+
+
+def _margins(
+    rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int
+) -> NDArray[np.float64]:
+    """Robustness of one requirement, (starts, rows).
 
     `columns`: state -> samples, (time, rows). `horizon`: number of steps of a planning window.
     """
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:
-        return _margin(rule, columns, 1) >= -TOLERANCE
+        return _margin(rule, columns, 1)
     count = samples - max(horizon, rule.reach)
     if count <= 0:
-        return np.ones((0, rows), dtype=bool)
+        return np.ones((0, rows))
     if not rule.uses_end:
-        return _margin(rule, columns, count) >= -TOLERANCE
+        return _margin(rule, columns, count)
     windows = ({name: column[k : k + horizon + 1] for name, column in columns.items()} for k in range(count))
-    return np.concatenate([_margin(rule, window, 1) for window in windows]) >= -TOLERANCE
+    return np.concatenate([_margin(rule, window, 1) for window in windows])
 
 
 def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[Any]:

@@ -211,12 +211,16 @@ def rules_of(run: Run) -> Rules | None:
         SystemFileError: S210, the file of rules does not exist.
         SpecError: the file is not a specification.
     """
-    decl = run.task.system.decl
+    return rules_for(run.dir, run.task.system.decl)
+
+
+def rules_for(folder: RunDir, decl: SystemDecl) -> Rules | None:
+    """Rules for the closed-loop runs of the run in a folder, whose system is `decl`; see `rules_of`."""
     judge, overrides = decl.test.judge, decl.overrides
-    if (run.dir.path / _INDEX).is_file():
-        return None if judge is None else _copied(run.dir, judge, overrides)
+    if (folder.path / _INDEX).is_file():
+        return None if judge is None else _copied(folder, judge, overrides)
     if judge is None:
-        judge = _named_since(run.dir, decl)
+        judge = _named_since(folder, decl)
     if judge is None:
         return None
     spec = read_rules(judge)

@@ -1,0 +1,579 @@
+"""Statistical certificates: what judged drives say about future ones, with the assumptions in words.
+
+A drive is one agent in one simulated world, or one recorded trace. The drives of a world may influence each
+other, so the observations that bounds count are independent *units*: worlds, or drives if nothing couples
+them. The observed value of a unit is the share of its drives that satisfy a requirement.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.assurance.bounds import (
+    Bounds,
+    Tally,
+    betting_lower,
+    betting_upper,
+    clopper_pearson,
+    clopper_pearson_lower,
+    clopper_pearson_upper,
+)
+from stlc.assurance.conformal import (
+    SAME,
+    AdaptiveBound,
+    OnlineBound,
+    Shift,
+    adaptive_bound,
+    calibrate_online,
+    lower_bound,
+    tolerance_bound,
+)
+
+FORMAT = "stlc-certificate/1"
+ALL = "all requirements"
+Noun: TypeAlias = Literal["world", "drive", "trace"]
+Answer: TypeAlias = Literal["certified", "refuted", "undecided", "measured"]
+_AGREE = 1e-9
+"""Largest difference of a recomputed bound that counts as rounding."""
+
+
+# ---------------------------------------------------------------------- what was observed
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Verdicts on drives under one requirement, or under all of them.
+
+    Attributes:
+        name: name of the requirement.
+        unit: unit of the robustness; "" if there is none.
+        satisfied: whether the drive certainly satisfies it, (drives,).
+        violated: whether the drive certainly violates it, (drives,).
+        robustness: least robustness over all continuations of the drive, (drives,); -inf if unknown.
+    """
+
+    name: str
+    unit: str
+    satisfied: NDArray[np.bool_]
+    violated: NDArray[np.bool_]
+    robustness: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Judged drives and the independent units that they belong to.
+
+    Attributes:
+        overall: verdicts under all requirements together.
+        requirements: verdicts under each requirement.
+        units: unit of each drive, (drives,): numbers from 0 without gaps.
+        noun: what a unit is.
+        predicted: robustness of the plan followed at each step, (drives, steps); None if not recorded.
+    """
+
+    overall: Judged
+    requirements: tuple[Judged, ...]
+    units: NDArray[np.int64]
+    noun: Noun
+    predicted: NDArray[np.float64] | None = None
+
+    @property
+    def drives(self) -> int:
+        """Number of drives."""
+        return len(self.units)
+
+    @property
+    def count(self) -> int:
+        """Number of units."""
+        return int(self.units.max(initial=-1)) + 1
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Number of drives of each unit, (units,)."""
+        return np.bincount(self.units, minlength=self.count)
+
+    def shares(self, marked: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Share of the marked drives of each unit, (units,)."""
+        return np.bincount(self.units, weights=marked, minlength=self.count) / self.sizes
+
+    def least(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Least value over the drives of each unit, (units,)."""
+        found = np.full(self.count, np.inf)
+        np.minimum.at(found, self.units, values)
+        return found
+
+
+def joined(samples: Sequence[Sample]) -> Sample:
+    """Join samples of the same requirements, in order; their units stay apart.
+
+    Raises:
+        ValueError: the samples are about different requirements.
+    """
+    names = {tuple(each.name for each in sample.requirements) for sample in samples}
+    if len(names) != 1:
+        raise ValueError("the samples are about different requirements")
+    offsets = np.cumsum([0, *(sample.count for sample in samples)])
+    units = [sample.units + offset for sample, offset in zip(samples, offsets, strict=False)]
+    predicted = [sample.predicted for sample in samples if sample.predicted is not None]
+    same = len(predicted) == len(samples) and len({each.shape[1] for each in predicted}) == 1
+    return Sample(
+        _joined([sample.overall for sample in samples]),
+        tuple(_joined(each) for each in zip(*(sample.requirements for sample in samples), strict=True)),
+        np.concatenate(units),
+        max((sample.noun for sample in samples), key=lambda noun: noun == "world"),
+        np.concatenate(predicted) if same else None,
+    )
+
+
+def _joined(parts: Sequence[Judged]) -> Judged:
+    return Judged(
+        parts[0].name,
+        parts[0].unit,
+        np.concatenate([part.satisfied for part in parts]),
+        np.concatenate([part.violated for part in parts]),
+        np.concatenate([part.robustness for part in parts]),
+    )
+
+
+def together(judged: Sequence[Judged], weights: Mapping[str, float] | None = None) -> Judged:
+    """Verdicts under all requirements together: the least weighted robustness, without a unit.
+
+    `weights`: requirement -> factor of its robustness, weight / scale; 1 for requirements left out.
+    """
+    factors = weights or {}
+    if len(judged) == 1:
+        return replace(judged[0], name=ALL)
+    with np.errstate(invalid="ignore"):
+        scaled = [each.robustness * factors.get(each.name, 1.0) for each in judged]
+    return Judged(
+        ALL,
+        "",
+        np.logical_and.reduce([each.satisfied for each in judged]),
+        np.logical_or.reduce([each.violated for each in judged]),
+        np.nan_to_num(np.minimum.reduce(scaled), nan=-np.inf, posinf=np.inf, neginf=-np.inf),
+    )
+
+
+# ---------------------------------------------------------------------- what is claimed
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What is asked of the drives.
+
+    Attributes:
+        share: share of future drives to certify; None if the share is only measured.
+        confidence: confidence of each bound.
+        shift: distance of the distribution of future drives from that of the observed ones.
+        any_time: whether the drives were stopped by their results; only betting bounds are then valid.
+        calibration: number of first units that calibrate the conformal bounds, fixed in advance; None: all.
+        online: whether the bound while driving is calibrated.
+        adaptive: whether the drives are in order, and the adaptive bound is computed.
+    """
+
+    share: float | None = 0.99
+    confidence: float = 0.95
+    shift: Shift = SAME
+    any_time: bool = False
+    calibration: int | None = None
+    online: bool = False
+    adaptive: bool = False
+
+    @property
+    def target(self) -> float:
+        """Share whose robustness is bounded: the share to certify, else the confidence."""
+        return self.confidence if self.share is None else self.share
+
+
+@dataclass(frozen=True, slots=True)
+class Shares:
+    """Bounds on the mean of observed values of units in [0, 1].
+
+    Attributes:
+        lower: one-sided lower bound.
+        upper: one-sided upper bound.
+        interval: two-sided interval.
+        exact: whether these are Clopper-Pearson bounds; else betting bounds.
+        any_time: one-sided lower betting bound, valid at any stopping time.
+        fixed: one-sided lower Clopper-Pearson bound, valid for a number of units fixed in advance; None if a
+            unit's value is neither 0 nor 1.
+    """
+
+    lower: float
+    upper: float
+    interval: Bounds
+    exact: bool
+    any_time: float
+    fixed: float | None
+
+
+def shares_of(low: Tally, high: Tally, confidence: float, *, any_time: bool) -> Shares:
+    """Bounds on the mean of units of which a part is undecided.
+
+    Clopper-Pearson bounds are used if they are valid: if the number of units was fixed in advance and each
+    value is 0 or 1. Otherwise betting bounds are used.
+
+    Args:
+        low: the values if nothing undecided is satisfied; they bound the mean from below.
+        high: the values if everything undecided is satisfied; they bound the mean from above.
+        confidence: confidence of each bound.
+        any_time: whether the units were stopped by their results.
+    """
+    sided = 0.5 + confidence / 2
+    counts = (_counted(low), _counted(high))
+    bet = betting_lower(low, confidence)
+    if counts[0] is None or counts[1] is None:
+        fixed = None
+    else:
+        fixed = clopper_pearson_lower(*counts[0], confidence)
+        if not any_time:
+            least, most = (clopper_pearson(*each, confidence) for each in (counts[0], counts[1]))
+            upper = clopper_pearson_upper(*counts[1], confidence)
+            return Shares(fixed, upper, Bounds(least.low, most.high), exact=True, any_time=bet, fixed=fixed)
+    upper = betting_upper(high, confidence)
+    ends = Bounds(betting_lower(low, sided), betting_upper(high, sided))
+    return Shares(bet, upper, ends, exact=False, any_time=bet, fixed=fixed)
+
+
+def _counted(tally: Tally) -> tuple[int, int] | None:
+    """Successes and trials; None if a value is neither 0 nor 1."""
+    if not set(tally.values.tolist()) <= {0.0, 1.0}:
+        return None
+    return int(tally.values @ tally.counts), int(tally.counts.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """What the drives say about one requirement.
+
+    Attributes:
+        name: name of the requirement.
+        unit: unit of the robustness.
+        drives: number of drives.
+        satisfied: number of drives that satisfy the requirement.
+        undecided: number of drives without verdict; they count as not satisfied in lower bounds.
+        shares: bounds on the share of drives that satisfy it.
+        deployed: lower bound on that share among future drives, after the shift.
+        whole: number of units in which every drive satisfies it.
+        whole_lower: lower bound on the share of such units.
+        next_robustness: conformal lower bound on the robustness of the next unit's worst drive.
+        reached: robustness that at least the requested share of units reaches, with confidence.
+        low: observed values of the units.
+        high: the same if everything undecided were satisfied.
+    """
+
+    name: str
+    unit: str
+    drives: int
+    satisfied: int
+    undecided: int
+    shares: Shares
+    deployed: float
+    whole: int
+    whole_lower: float
+    next_robustness: float
+    reached: float
+    low: Tally
+    high: Tally
+
+    @property
+    def share(self) -> float:
+        """Observed mean share: that of satisfying drives, if all units have equally many."""
+        return float(self.low.values @ self.low.counts / self.low.counts.sum())
+
+    @property
+    def units(self) -> int:
+        """Number of units."""
+        return int(self.low.counts.sum())
+
+    def answer(self, claim: Claim) -> Answer:
+        """Whether the share of the claim is certified or refuted, each with the confidence of the claim."""
+        if claim.share is None:
+            return "measured"
+        if self.deployed >= claim.share:
+            return "certified"
+        return "refuted" if claim.shift.least(self.shares.upper) < claim.share else "undecided"
+
+    def summary(self) -> dict[str, Any]:
+        """The statement as a JSON object."""
+        bounds = self.shares
+        return {
+            "name": self.name,
+            "drives": self.drives,
+            "satisfied": self.satisfied,
+            "undecided": self.undecided,
+            "units": self.units,
+            "share": self.share,
+            "lower": bounds.lower,
+            "upper": bounds.upper,
+            "interval": [bounds.interval.low, bounds.interval.high],
+            "method": "Clopper-Pearson" if bounds.exact else "betting",
+            "lower_any_time": bounds.any_time,
+            "lower_fixed": bounds.fixed,
+            "lower_deployed": self.deployed,
+            "whole_units": self.whole,
+            "whole_units_lower": self.whole_lower,
+            "next_robustness": self.next_robustness,
+            "reached_robustness": self.reached,
+            "robustness_unit": self.unit,
+            "observed": _pairs(self.low),
+            "observed_high": _pairs(self.high),
+        }
+
+
+def _pairs(tally: Tally) -> list[list[float]]:
+    return [[float(value), int(count)] for value, count in zip(tally.values, tally.counts, strict=True)]
+
+
+def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
+    """Compute all bounds on one requirement from a sample of at least one drive."""
+    values = sample.shares(judged.satisfied)
+    low, high = Tally.of(values), Tally.of(sample.shares(~judged.violated))
+    found = shares_of(low, high, claim.confidence, any_time=claim.any_time)
+    whole = Tally.of(values == 1.0)
+    least = sample.least(judged.robustness)
+    return Statement(
+        name=judged.name,
+        unit=judged.unit,
+        drives=sample.drives,
+        satisfied=int(judged.satisfied.sum()),
+        undecided=int((~judged.satisfied & ~judged.violated).sum()),
+        shares=found,
+        deployed=claim.shift.least(found.lower),
+        whole=int((values == 1.0).sum()),
+        whole_lower=shares_of(whole, whole, claim.confidence, any_time=claim.any_time).lower,
+        next_robustness=lower_bound(least[: claim.calibration], claim.confidence, claim.shift),
+        reached=_reached(least, claim),
+        low=low,
+        high=high,
+    )
+
+
+def _reached(least: NDArray[np.float64], claim: Claim) -> float:
+    """Robustness that the requested share of future units reaches; without that shift, of observed ones."""
+    share = 1.0 - _before(claim.shift, 1.0 - claim.target)
+    if not 0.0 < share < 1.0:
+        return -math.inf
+    return tolerance_bound(least, share, claim.confidence, any_time=claim.any_time)
+
+
+def _before(shift: Shift, miss: float) -> float:
+    """Greatest probability of an event before the shift with which it is at most `miss` after it."""
+    low, high = 0.0, miss
+    if shift.greatest(high) <= miss:
+        return high
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if shift.greatest(middle) <= miss else (low, middle)
+    return low
+
+
+# ---------------------------------------------------------------------- the whole answer
+
+
+@dataclass(frozen=True, slots=True)
+class Assessment:
+    """What a sample of drives says about future drives.
+
+    Attributes:
+        claim: what was asked.
+        overall: statement on all requirements together.
+        requirements: statement on each requirement.
+        noun: what an independent unit is.
+        sizes: smallest and greatest number of drives in a unit.
+        online: bound while driving, on the plans' robustness; None if it was not asked for or not recorded.
+        adaptive: adaptive bound on the next drive; None if it was not asked for.
+        calibration: number of units that calibrated the conformal bounds.
+    """
+
+    claim: Claim
+    overall: Statement
+    requirements: tuple[Statement, ...]
+    noun: Noun
+    sizes: tuple[int, int]
+    online: OnlineBound | None
+    adaptive: AdaptiveBound | None
+    calibration: int
+
+    @property
+    def answer(self) -> Answer:
+        """Answer to the claim, for all requirements together."""
+        return self.overall.answer(self.claim)
+
+    @property
+    def width(self) -> float:
+        """Width of the two-sided interval of the share of drives that satisfy everything."""
+        return self.overall.shares.interval.width
+
+    @property
+    def exit_code(self) -> int:
+        """0 if the share is certified or only measured, 1 if it is refuted, 4 if it is undecided."""
+        return {"certified": 0, "measured": 0, "refuted": 1, "undecided": 4}[self.answer]
+
+    def assumptions(self) -> list[str]:
+        """Conditions under which the bounds hold, a sentence each, from the most particular on."""
+        return list(_assumptions(self))
+
+    def summary(self) -> dict[str, Any]:
+        """Everything as a JSON object."""
+        claim, online, adaptive = self.claim, self.online, self.adaptive
+        return {
+            "answer": self.answer,
+            "share": claim.share,
+            "confidence": claim.confidence,
+            "shift": None if claim.shift == SAME else str(claim.shift),
+            "sequential": claim.any_time,
+            "unit": self.noun,
+            "calibration": self.calibration,
+            "overall": self.overall.summary(),
+            "requirements": [each.summary() for each in self.requirements],
+            "online": None
+            if online is None
+            else {
+                "margins": online.margins,
+                "confidence": online.confidence,
+                "units": online.drives,
+            },
+            "adaptive": None
+            if adaptive is None
+            else {
+                "next_robustness": adaptive.low,
+                "level": adaptive.level,
+                "judged": adaptive.judged,
+                "missed": adaptive.missed,
+                "slack": adaptive.slack,
+            },
+            "assumptions": self.assumptions(),
+        }
+
+
+def assess(sample: Sample, claim: Claim) -> Assessment:
+    """Compute what a sample of at least one drive says."""
+    sizes = sample.sizes
+    ordered = sample.least(sample.overall.robustness).tolist() if claim.adaptive else None
+    return Assessment(
+        claim,
+        statement(sample.overall, sample, claim),
+        tuple(statement(each, sample, claim) for each in sample.requirements),
+        sample.noun,
+        (int(sizes.min()), int(sizes.max())),
+        _online(sample, claim) if claim.online else None,
+        None if ordered is None else adaptive_bound(ordered, claim.confidence),
+        min(sample.count, claim.calibration or sample.count),
+    )
+
+
+def _online(sample: Sample, claim: Claim) -> OnlineBound | None:
+    sizes = sample.sizes
+    if sample.predicted is None or len(set(sizes.tolist())) != 1:
+        return None
+    first = slice(None, claim.calibration)
+    steps = sample.predicted.shape[1]
+    predicted = sample.predicted.reshape(sample.count, -1, steps)[first]
+    final = sample.overall.robustness.reshape(sample.count, -1)[first]
+    return calibrate_online(predicted, final, claim.confidence, claim.shift)
+
+
+def _assumptions(found: Assessment) -> Iterator[str]:
+    claim, noun = found.claim, found.noun
+    most = found.sizes[1]
+    if noun == "trace":
+        yield "the traces are independent of each other, and none was chosen or left out by its result"
+    elif noun == "drive":
+        yield "the agents of a world do not influence each other, so each drive is one observation"
+    elif most == 1:
+        yield "each world has its own seed, and is one observation"
+    else:
+        yield f"the {most} agents of a world may influence each other, so a world is one observation"
+        yield f"{found.calibration} worlds: the robustness of a world is that of its worst drive"
+    if noun != "trace":
+        yield "worlds of different seeds are independent, as the numbers of a pseudo-random generator are"
+    if claim.shift == SAME:
+        what = "the same source and conditions" if noun == "trace" else "the same world, scenario and starts"
+        yield f"future drives come from {what} as these"
+    else:
+        yield f"the distribution of future drives is within {_distance(claim.shift)} of that of these"
+    if claim.any_time:
+        yield "the drives were stopped by their results; bounds on shares hold at any stopping time"
+        yield (
+            f"bounds on the next robustness use the first {found.calibration} {noun}s, a number fixed before"
+        )
+    else:
+        yield f"the number of {noun}s was fixed before their results were known"
+    percent = f"{100 * claim.confidence:g} %"
+    yield f"each bound holds by itself with {percent} confidence, not all of them together"
+    yield "a bound on the next robustness holds on average over such samples, not given these drives"
+    if found.overall.undecided:
+        yield f"{found.overall.undecided} drives without a verdict count as not satisfied in lower bounds"
+    if noun != "trace":
+        yield "nothing is said about what the simulated world leaves out"
+
+
+def _distance(shift: Shift) -> str:
+    names = {"tv": "total variation", "kl": "Kullback-Leibler divergence", "chi2": "chi-square divergence"}
+    return f"{names[shift.kind]} {shift.size:g}"
+
+
+# ---------------------------------------------------------------------- certificate files
+
+
+def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
+    """Bounds in a certificate that do not follow from its counts, such as `overall.lower`.
+
+    Args:
+        document: content of a certificate file.
+
+    Raises:
+        KeyError, TypeError, ValueError: the document is no certificate.
+    """
+    confidence, any_time = float(document["confidence"]), bool(document["sequential"])
+    claim = Claim(
+        None if document["share"] is None else float(document["share"]),
+        confidence,
+        SAME if document["shift"] is None else Shift.parse(str(document["shift"])),
+        any_time,
+    )
+    wrong = []
+    for place, each in _places(document):
+        low, high = (_tally(each[name]) for name in ("observed", "observed_high"))
+        found = shares_of(low, high, confidence, any_time=any_time)
+        expected = {
+            "units": float(low.counts.sum()),
+            "share": float(low.values @ low.counts / low.counts.sum()),
+            "lower": found.lower,
+            "upper": found.upper,
+            "lower_deployed": claim.shift.least(found.lower),
+        }
+        wrong += [
+            f"{place}.{name}" for name, value in expected.items() if abs(float(each[name]) - value) > _AGREE
+        ]
+    overall = document["overall"]
+    lower, upper = float(overall["lower_deployed"]), claim.shift.least(float(overall["upper"]))
+    answer = "certified" if claim.share is not None and lower >= claim.share else "undecided"
+    answer = "refuted" if answer == "undecided" and upper < (claim.share or 0.0) else answer
+    if document["answer"] != ("measured" if claim.share is None else answer):
+        wrong.append("answer")
+    return wrong
+
+
+def _places(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    yield "overall", document["overall"]
+    for each in document["requirements"]:
+        yield str(each["name"]), each
+
+
+def _tally(pairs: Sequence[Sequence[float]]) -> Tally:
+    values, counts = zip(*pairs, strict=True)
+    whole = np.array([int(count) for count in counts], dtype=np.int64)
+    if (whole < 0).any() or not whole.sum():
+        raise ValueError("there are no counts")
+    given = np.array([float(value) for value in values])
+    if not bool(((given >= 0.0) & (given <= 1.0)).all()):
+        raise ValueError("an observation is outside of [0, 1]")
+    return Tally(given, whole)

@@ -1,0 +1,1 @@
+"""Statistical bounds in `stlc certify`, `simulate --certify` and `check --certify`."""
