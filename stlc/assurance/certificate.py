@@ -23,6 +23,7 @@ from stlc.assurance.bounds import (
     clopper_pearson,
     clopper_pearson_lower,
     clopper_pearson_upper,
+    drives_needed,
 )
 from stlc.assurance.conformal import (
     SAME,
@@ -31,6 +32,7 @@ from stlc.assurance.conformal import (
     Shift,
     adaptive_bound,
     calibrate_online,
+    drives_for_bound,
     lower_bound,
     tolerance_bound,
 )
@@ -260,6 +262,7 @@ class Statement:
         undecided: number of drives without verdict; they count as not satisfied in lower bounds.
         shares: bounds on the share of drives that satisfy it.
         deployed: lower bound on that share among future drives, after the shift.
+        most: upper bound on that share among future drives, if they shift as far as allowed.
         whole: number of units in which every drive satisfies it.
         whole_lower: lower bound on the share of such units.
         next_robustness: conformal lower bound on the robustness of the next unit's worst drive.
@@ -275,6 +278,7 @@ class Statement:
     undecided: int
     shares: Shares
     deployed: float
+    most: float
     whole: int
     whole_lower: float
     next_robustness: float
@@ -298,7 +302,7 @@ class Statement:
             return "measured"
         if self.deployed >= claim.share:
             return "certified"
-        return "refuted" if claim.shift.least(self.shares.upper) < claim.share else "undecided"
+        return "refuted" if self.most < claim.share else "undecided"
 
     def summary(self) -> dict[str, Any]:
         """The statement as a JSON object."""
@@ -317,6 +321,7 @@ class Statement:
             "lower_any_time": bounds.any_time,
             "lower_fixed": bounds.fixed,
             "lower_deployed": self.deployed,
+            "upper_deployed": self.most,
             "whole_units": self.whole,
             "whole_units_lower": self.whole_lower,
             "next_robustness": self.next_robustness,
@@ -346,6 +351,7 @@ def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
         undecided=int((~judged.satisfied & ~judged.violated).sum()),
         shares=found,
         deployed=claim.shift.least(found.lower),
+        most=claim.shift.least(found.upper),
         whole=int((values == 1.0).sum()),
         whole_lower=shares_of(whole, whole, claim.confidence, any_time=claim.any_time).lower,
         next_robustness=lower_bound(least[: claim.calibration], claim.confidence, claim.shift),
@@ -431,6 +437,10 @@ class Assessment:
             "sequential": claim.any_time,
             "unit": self.noun,
             "calibration": self.calibration,
+            "needed": {
+                "units": drives_needed(claim.target, claim.confidence, any_time=claim.any_time),
+                "robustness": drives_for_bound(claim.confidence, claim.shift),
+            },
             "overall": self.overall.summary(),
             "requirements": [each.summary() for each in self.requirements],
             "online": None
@@ -491,7 +501,7 @@ def _assumptions(found: Assessment) -> Iterator[str]:
         yield "each world has its own seed, and is one observation"
     else:
         yield f"the {most} agents of a world may influence each other, so a world is one observation"
-        yield f"{found.calibration} worlds: the robustness of a world is that of its worst drive"
+        yield "the robustness of a world is that of its worst drive"
     if noun != "trace":
         yield "worlds of different seeds are independent, as the numbers of a pseudo-random generator are"
     if claim.shift == SAME:
@@ -549,12 +559,13 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
             "lower": found.lower,
             "upper": found.upper,
             "lower_deployed": claim.shift.least(found.lower),
+            "upper_deployed": claim.shift.least(found.upper),
         }
         wrong += [
             f"{place}.{name}" for name, value in expected.items() if abs(float(each[name]) - value) > _AGREE
         ]
     overall = document["overall"]
-    lower, upper = float(overall["lower_deployed"]), claim.shift.least(float(overall["upper"]))
+    lower, upper = float(overall["lower_deployed"]), float(overall["upper_deployed"])
     answer = "certified" if claim.share is not None and lower >= claim.share else "undecided"
     answer = "refuted" if answer == "undecided" and upper < (claim.share or 0.0) else answer
     if document["answer"] != ("measured" if claim.share is None else answer):

@@ -66,6 +66,8 @@ class Shift:
         Robust validation, Journal of the American Statistical Association 119, 2024, Lemma A.1 ff.).
         """
         p = min(max(chance, 0.0), 1.0)
+        if not self.size:
+            return p
         match self.kind:
             case "tv":
                 return min(1.0, p + self.size)
@@ -85,7 +87,7 @@ class Shift:
 
     def least(self, chance: float) -> float:
         """Least probability under Q of an event with probability `chance` under P."""
-        return 1.0 - self.greatest(1.0 - chance) if self.size else chance
+        return 1.0 - self.greatest(1.0 - chance) if self.size else chance  # without a rounding error
 
 
 def _binary_kl(q: float, p: float) -> float:
@@ -139,12 +141,10 @@ def lower_bound(values: ArrayLike, confidence: float = 0.95, shift: Shift = SAME
 def drives_for_bound(confidence: float = 0.95, shift: Shift = SAME) -> int | None:
     """Smallest number of drives with which `lower_bound` is finite; None if the shift allows none."""
     miss = 1.0 - confidence
-    if shift.greatest(0.0) > miss:
+    if shift.greatest(0.0) >= miss - _ROUNDING:
         return None
     few, many = 0, 1
     while not rank(many, miss, shift):
-        if many > 1 << 40:
-            return None
         few, many = many, 2 * many
     while many - few > 1:
         middle = (few + many) // 2

@@ -87,7 +87,9 @@ def answer(record: Mapping[str, Any]) -> str:
         case "certified":
             return f"certified: {least}, {sure}"
         case "refuted":
-            return f"refuted: at most {raised(overall['upper'])} of {noun} satisfy everything, {sure}"
+            return (
+                f"refuted: at most {raised(overall['upper_deployed'])} of {noun} satisfy everything, {sure}"
+            )
     return f"undecided, {sure}, whether {least}"
 
 
@@ -110,6 +112,11 @@ def _more(record: Mapping[str, Any]) -> Iterator[str]:
     if overall["drives"] > overall["units"]:
         whole = f"{overall['whole_units']:,} of {overall['units']:,} {noun}s satisfy everything as a whole"
         yield f"  {whole}: at least {floored(overall['whole_units_lower'])} of {noun}s"
+    needed = record["needed"]
+    if record["answer"] == "undecided" and overall["units"] < needed["units"]:
+        yield f"  {percent(record['share'])} needs {needed['units']:,} {noun}s without a failure"
+    if needed["robustness"] is not None and record["calibration"] < needed["robustness"]:
+        yield f"  a bound on the next robustness needs {needed['robustness']:,} {noun}s"
     if record["sequential"] and overall["lower_fixed"] is not None:
         fixed = f"at least {floored(overall['lower_fixed'])}"
         yield f"  Clopper-Pearson: {fixed}, which holds only for a number of {noun}s fixed in advance"

@@ -34,9 +34,12 @@ Positive = Annotated[float, 0]
 def record(kind: type[R], source: object, **given: object) -> R:
     """Return a record of the type `kind`.
 
-    The value of a key is taken from `given`, else from the attribute of `source` with the same name.
+    The value of a key is taken from `given`, else from the attribute of `source` with the same name. Optional
+    keys that neither has are left out.
     """
-    names = [name for name in kind.__annotations__ if name not in given]
+    optional: frozenset[str] = getattr(kind, "__optional_keys__", frozenset())
+    missing = (name for name in kind.__annotations__ if name not in given)
+    names = [name for name in missing if name not in optional or hasattr(source, name)]
     made: Any = {name: getattr(source, name) for name in names} | given
     found: R = made
     return found
@@ -120,6 +123,7 @@ class ShareStatement(TypedDict):
     lower_any_time: float
     lower_fixed: float | None
     lower_deployed: float
+    upper_deployed: float
     whole_units: Count
     whole_units_lower: float
     next_robustness: Num
@@ -143,6 +147,11 @@ class AdaptiveRecord(TypedDict):
     slack: Num
 
 
+class NeededUnits(TypedDict):
+    units: Count
+    robustness: int | None
+
+
 class Assurance(TypedDict):
     answer: Literal["certified", "refuted", "undecided", "measured"]
     share: float | None
@@ -151,6 +160,7 @@ class Assurance(TypedDict):
     sequential: bool
     unit: Literal["world", "drive", "trace"]
     calibration: Count
+    needed: NeededUnits
     overall: ShareStatement
     requirements: list[ShareStatement]
     online: OnlineMargins | None

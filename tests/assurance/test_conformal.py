@@ -1,0 +1,173 @@
+"""Conformal bounds: coverage over recalibrations, without and with the stated shift, and while driving."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import optimize, stats
+
+from stlc.assurance.conformal import (
+    DIVERGENCES,
+    SAME,
+    Shift,
+    adaptive_bound,
+    calibrate_online,
+    drives_for_bound,
+    lower_bound,
+    rank,
+    tolerance_bound,
+)
+from stlc.diagnostics import UsageError
+
+RECALIBRATIONS = 200
+CHANCES = st.floats(0.001, 0.999)
+SHIFTS = st.builds(Shift, st.sampled_from(DIVERGENCES), st.floats(0, 0.5))
+
+
+def divergence(kind: str, q: float, p: float) -> float:
+    """Distance of two distributions of "an event occurs", by its definition."""
+    pairs = ((q, p), (1 - q, 1 - p))
+    match kind:
+        case "tv":
+            return sum(abs(a - b) for a, b in pairs) / 2
+        case "chi2":
+            return sum((a - b) ** 2 / b for a, b in pairs)
+    return sum(a * math.log(a / b) if a else 0.0 for a, b in pairs)
+
+
+@given(SHIFTS, CHANCES)
+def test_the_shifted_chance_is_the_greatest_within_the_distance(shift: Shift, chance: float) -> None:
+    greatest = shift.greatest(chance)
+    assert chance - 1e-12 <= greatest <= 1.0
+    at_one = divergence(shift.kind, 1.0, chance)
+    if at_one <= shift.size:
+        assert greatest == 1.0
+    else:
+        wanted = optimize.brentq(lambda q: divergence(shift.kind, q, chance) - shift.size, chance, 1.0)
+        assert greatest == pytest.approx(wanted, abs=1e-7)
+    assert shift.least(1 - chance) == pytest.approx(1 - greatest, abs=1e-9)
+
+
+@given(SHIFTS, CHANCES, CHANCES)
+def test_the_shifted_chance_is_concave(shift: Shift, first: float, second: float) -> None:
+    """This is why it also bounds the mean over calibrations."""
+    middle = shift.greatest((first + second) / 2)
+    assert middle >= (shift.greatest(first) + shift.greatest(second)) / 2 - 1e-9
+
+
+@given(st.integers(0, 500), st.integers(1, 99))
+def test_the_rank_is_the_usual_one(drives: int, percent: int) -> None:
+    usual = drives + 1 - math.ceil((drives + 1) * (100 - percent) / 100)
+    assert rank(drives, percent / 100) == min(usual, drives)
+
+
+@given(st.integers(1, 300), SHIFTS)
+def test_a_shift_never_raises_the_bound(drives: int, shift: Shift) -> None:
+    values = np.random.default_rng(drives).normal(size=drives)
+    assert lower_bound(values, 0.9, shift) <= lower_bound(values, 0.9)
+
+
+@pytest.mark.parametrize(("text", "shift"), [("0.02", Shift("tv", 0.02)), ("kl=.1", Shift("kl", 0.1))])
+def test_a_shift_is_written(text: str, shift: Shift) -> None:
+    assert Shift.parse(text) == shift
+    assert Shift.parse(str(shift)) == shift
+
+
+@pytest.mark.parametrize("text", ["", "-1", "1.5", "l2=.1", "kl=", "tv=nan", "kl=inf"])
+def test_other_shifts_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="U101"):
+        Shift.parse(text)
+
+
+@pytest.mark.parametrize("shift", [SAME, Shift("tv", 0.02), Shift("kl", 0.01), Shift("chi2", 0.01)])
+def test_the_drives_for_a_bound_are_the_fewest(shift: Shift) -> None:
+    needed = drives_for_bound(0.95, shift)
+    assert needed is not None
+    assert math.isfinite(lower_bound(np.zeros(needed), 0.95, shift))
+    assert lower_bound(np.zeros(needed - 1), 0.95, shift) == -math.inf
+    assert needed == 19 or shift != SAME
+
+
+def test_too_large_a_shift_allows_no_bound() -> None:
+    assert drives_for_bound(0.95, Shift("tv", 0.05)) is None
+    assert lower_bound(np.zeros(10_000), 0.95, Shift("tv", 0.06)) == -math.inf
+
+
+@pytest.mark.parametrize("shift", [SAME, Shift("tv", 0.05)])
+def test_the_bound_covers_the_next_drive_under_the_stated_shift(shift: Shift) -> None:
+    """With the probability of the shift the next drive comes from a worse place: the worst case."""
+    rng = np.random.default_rng(3)
+    covered, naive = [], []
+    for _ in range(RECALIBRATIONS):
+        drives = rng.standard_t(3, 150)
+        bounds = lower_bound(drives, 0.9, shift), lower_bound(drives, 0.9)
+        chances = [1 - float(stats.t.cdf(bound, 3)) for bound in bounds]
+        for found, chance in zip((covered, naive), chances, strict=True):
+            found.append(chance - (min(shift.size, chance)))
+    assert np.mean(covered) >= 0.9
+    assert shift == SAME or np.mean(naive) < 0.9
+
+
+@pytest.mark.parametrize("any_time", [False, True])
+def test_the_share_that_reaches_a_value(any_time: bool) -> None:
+    rng = np.random.default_rng(4)
+    reached = [
+        1 - stats.norm.cdf(tolerance_bound(rng.normal(size=300), 0.9, 0.9, any_time=any_time))
+        for _ in range(RECALIBRATIONS)
+    ]
+    assert np.mean(np.array(reached) >= 0.9) >= 0.9
+
+
+def test_a_share_is_reached_from_the_drives_needed_on() -> None:
+    values = np.arange(299.0)
+    assert tolerance_bound(values, 0.99, 0.95) == 0.0
+    assert tolerance_bound(values[1:], 0.99, 0.95) == -math.inf
+
+
+def paths(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions of two agents at ten steps, which approach the final robustness, and that robustness."""
+    final = rng.normal(size=(count, 2))
+    error = rng.normal(size=(count, 2, 10)) * np.linspace(1.0, 0.1, 10)
+    return final[:, :, None] + error, final
+
+
+def test_the_online_bound_covers_whole_drives() -> None:
+    rng, covered = np.random.default_rng(5), []
+    for _ in range(RECALIBRATIONS):
+        bound = calibrate_online(*paths(rng, 90), confidence=0.9)
+        predicted, final = paths(rng, 40)
+        covered.append(float((predicted - bound.margins <= final[:, :, None]).all((1, 2)).mean()))
+    assert np.mean(covered) >= 0.89  # 200 times 40 drives: a standard error of about .004
+    assert bound.margins[0] > 3 * bound.margins[-1]
+    assert bound.lower(3, 1.0) == pytest.approx(1.0 - bound.margins[3])
+    assert bound.lower(99, 1.0) == bound.lower(9, 1.0)
+
+
+def test_predictions_that_are_no_numbers() -> None:
+    predicted, final = paths(np.random.default_rng(6), 90)
+    predicted[40, 0, 0], predicted[41, 1, 3], final[42, 0] = -np.inf, np.nan, np.inf
+    assert math.isfinite(calibrate_online(predicted, final).radius)
+    final[43:60] = -np.inf
+    assert calibrate_online(predicted, final).radius == math.inf
+    assert calibrate_online(predicted[:6], final[:6]).radius == math.inf
+
+
+@given(st.lists(st.floats(-10, 10), max_size=60), st.sampled_from([0.05, 0.2]))
+def test_adaptive_bounds_hold_for_any_sequence(values: list[float], rate: float) -> None:
+    found = adaptive_bound(values, 0.8, rate)
+    assert found.judged == len(values)
+    if values:
+        assert abs(found.missed / len(values) - 0.2) <= found.slack + 1e-9
+
+
+def test_adaptive_bounds_follow_a_drift() -> None:
+    rng = np.random.default_rng(7)
+    drifting = list(rng.normal(size=1000) - np.linspace(0, 8, 1000))
+    found = adaptive_bound(drifting, 0.9, 0.02)
+    assert found.missed / found.judged == pytest.approx(0.1, abs=0.03)
+    fixed = np.mean([value < lower_bound(drifting[:500], 0.9) for value in drifting[500:]])
+    assert fixed > 0.5
