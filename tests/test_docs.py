@@ -351,6 +351,7 @@ ROOMS = {
     "runtime": "runtime: exported controllers in Python",
     "monitor": "monitor: verdicts, streams, explanations",
     "controller": "controller: policies, training, guard, deployment, evaluation",
+    "assurance": "assurance: statistical bounds and certificates",
     "export": "export: torch programs, ONNX graphs, C headers",
     "view": "view: plots, animations, reports",
     "editor": "editor: the language server",

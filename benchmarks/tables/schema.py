@@ -19,7 +19,7 @@ from benchmarks.formulas import Timing
 from benchmarks.plannings import PlanRow
 from benchmarks.repairs import Mended
 from benchmarks.steps import Speed, StepTiming
-from benchmarks.tables import ablation, falsify, family, latency, paper
+from benchmarks.tables import ablation, certificates, falsify, family, latency, paper
 from stlc.cli.framework.documents import DocumentRecord, Num, schema_of
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
@@ -62,6 +62,7 @@ ROWS: dict[str, dict[str, type]] = {
     "step": {"steps": StepTiming, "speeds": Speed},
     "robustness": {"rows": Timing},
     "gym": {"rows": EpisodeSpeed},
+    "certificates": {"rows": certificates.Row},
 }
 """Name of a table -> key in its result -> record of a row."""
 

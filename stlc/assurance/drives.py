@@ -188,15 +188,15 @@ def campaign(order: Campaign, watch: Watch | None = None) -> Iterator[Progress]:
     claim = replace(order.claim, any_time=not fixed, calibration=None if fixed else first)
     every = order.seeds or tuple(range(SEED, SEED + max(1, order.most // each)))
     parts: list[Sample] = []
-    driven = 0
-    while driven < len(every):
-        count = len(every) if fixed else math.ceil((first if not driven else BATCH) / each)
-        seeds = every[driven : driven + count]
-        parts += _driven(order, seeds, watch)
-        driven += len(seeds)
+    known, batches = 0, 0
+    while known < len(every):
+        count = len(every) if fixed else math.ceil((BATCH if known else first) / each)
+        seeds = every[known : known + count]
+        parts += driven(order, seeds, watch)
+        known, batches = known + len(seeds), batches + 1
         assessment = assess(joined(parts), claim)
-        done = driven == len(every) or _answered(assessment, order.width)
-        yield Progress(assessment, every[:driven], len(parts), done)
+        done = known == len(every) or _answered(assessment, order.width)
+        yield Progress(assessment, every[:known], batches, done)
         if done:
             return
 
@@ -210,8 +210,12 @@ def _units_per_seed(order: Campaign) -> int:
     return order.setting.agents if alone else 1
 
 
-def _driven(order: Campaign, seeds: Sequence[int], watch: Watch | None) -> Iterator[Sample]:
-    """Simulate seeds, at most about `ROWS` agents at once, and yield the judged drives."""
+def driven(order: Campaign, seeds: Sequence[int], watch: Watch | None = None) -> Iterator[Sample]:
+    """Simulate the worlds of `seeds`, at most about `ROWS` agents at once, and yield the judged drives.
+
+    Raises:
+        SystemFileError, RunError, UsageError: see `campaign`.
+    """
     task, limit = order.run.task, order.setting
     limits = Limits(seconds=limit.limit, margin=limit.margin, paper=limit.paper_limit)
     size = max(1, ROWS // limit.agents)

@@ -20,6 +20,8 @@ from typing import (
     is_typeddict,
 )
 
+from stlc.cli.framework.assured import Assurance, Certificate, CertificateCheck
+
 if TYPE_CHECKING:
     from stlc.view.learning import Learning
 
@@ -107,118 +109,6 @@ class CheckedRequirement(TypedDict):
     satisfied_share: Num
     violated_traces: int
     cause: CauseRecord | None
-
-
-class ShareStatement(TypedDict):
-    name: str
-    drives: Count
-    satisfied: Count
-    undecided: Count
-    units: Count
-    share: float
-    lower: float
-    upper: float
-    interval: list[float]
-    method: Literal["Clopper-Pearson", "betting"]
-    lower_any_time: float
-    lower_fixed: float | None
-    lower_deployed: float
-    upper_deployed: float
-    whole_units: Count
-    whole_units_lower: float
-    next_robustness: Num
-    reached_robustness: Num
-    robustness_unit: str
-    observed: list[list[float]]
-    observed_high: list[list[float]]
-
-
-class OnlineMargins(TypedDict):
-    margins: list[Num]
-    confidence: float
-    units: Count
-
-
-class AdaptiveRecord(TypedDict):
-    next_robustness: Num
-    level: float
-    judged: Count
-    missed: Count
-    slack: Num
-
-
-class NeededUnits(TypedDict):
-    units: Count
-    robustness: int | None
-
-
-class Assurance(TypedDict):
-    answer: Literal["certified", "refuted", "undecided", "measured"]
-    share: float | None
-    confidence: float
-    shift: str | None
-    sequential: bool
-    unit: Literal["world", "drive", "trace"]
-    calibration: Count
-    needed: NeededUnits
-    overall: ShareStatement
-    requirements: list[ShareStatement]
-    online: OnlineMargins | None
-    adaptive: AdaptiveRecord | None
-    assumptions: list[str]
-
-
-class CertifiedInputs(TypedDict):
-    spec: str
-    system: str
-    functions: str
-    rules: str | None
-    world: str | None
-    policy: str
-    guard_version: int
-
-
-class CertifiedConditions(TypedDict):
-    guard: Literal["none", "paper", "full"]
-    scenario: str | None
-    overrides: dict[str, str]
-    require: list[str]
-    margin: dict[str, float]
-    time_limit: float | None
-    agents: Count
-    steps: Count
-    replan: Count
-    seeds: list[list[int]]
-
-
-class Certificate(Assurance):
-    certificate: str
-    made: str
-    run: str
-    spec: str
-    system: str
-    width: float | None
-    finished: bool
-    batches: Count
-    inputs: CertifiedInputs
-    conditions: CertifiedConditions
-    versions: dict[str, str]
-    hardware: dict[str, Any]
-
-
-class DifferentEntry(TypedDict):
-    name: str
-    certificate: str
-    present: str
-
-
-class CertificateCheck(TypedDict):
-    file: str
-    run: str
-    same: bool
-    inputs: list[DifferentEntry]
-    numbers: list[str]
-    software: list[DifferentEntry]
 
 
 class CheckedTrace(TypedDict):

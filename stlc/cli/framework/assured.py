@@ -1,0 +1,138 @@
+"""Records of statistical bounds and certificates, as `--json` prints them."""
+
+from typing import Annotated, Any, Literal, TypeAlias, TypedDict
+
+Num: TypeAlias = float | str
+Count = Annotated[int, 0]
+
+
+class ShareStatement(TypedDict):
+    """What drives say about one requirement; see `stlc.assurance.certificate.Statement`."""
+
+    name: str
+    drives: Count
+    satisfied: Count
+    undecided: Count
+    units: Count
+    share: float
+    lower: float
+    upper: float
+    interval: list[float]
+    method: Literal["Clopper-Pearson", "betting"]
+    lower_any_time: float
+    lower_fixed: float | None
+    lower_deployed: float
+    upper_deployed: float
+    whole_units: Count
+    whole_units_lower: float
+    next_robustness: Num
+    reached_robustness: Num
+    robustness_unit: str
+    observed: list[list[float]]
+    observed_high: list[list[float]]
+
+
+class OnlineMargins(TypedDict):
+    """Bound while driving: the robustness of the followed plan less the margin of the step."""
+
+    margins: list[Num]
+    confidence: float
+    units: Count
+
+
+class AdaptiveRecord(TypedDict):
+    """Adaptive bound on the next trace; see `stlc.assurance.conformal.AdaptiveBound`."""
+
+    next_robustness: Num
+    level: float
+    judged: Count
+    missed: Count
+    slack: Num
+
+
+class NeededUnits(TypedDict):
+    """Numbers of units without a failure that certify the share, and that bound the next robustness."""
+
+    units: Count
+    robustness: int | None
+
+
+class Assurance(TypedDict):
+    """Bounds from a sample of drives, with their assumptions in words."""
+
+    answer: Literal["certified", "refuted", "undecided", "measured"]
+    share: float | None
+    confidence: float
+    shift: str | None
+    sequential: bool
+    unit: Literal["world", "drive", "trace"]
+    calibration: Count
+    needed: NeededUnits
+    overall: ShareStatement
+    requirements: list[ShareStatement]
+    online: OnlineMargins | None
+    adaptive: AdaptiveRecord | None
+    assumptions: list[str]
+
+
+class CertifiedInputs(TypedDict):
+    """Hashes and versions of what the drives depend on."""
+
+    spec: str
+    system: str
+    functions: str
+    rules: str | None
+    world: str | None
+    policy: str
+    guard_version: int
+
+
+class CertifiedConditions(TypedDict):
+    """Options of the deployment; seeds are ranges [first, last]."""
+
+    guard: Literal["none", "paper", "full"]
+    scenario: str | None
+    overrides: dict[str, str]
+    require: list[str]
+    margin: dict[str, float]
+    time_limit: float | None
+    agents: Count
+    steps: Count
+    replan: Count
+    seeds: list[list[int]]
+
+
+class Certificate(Assurance):
+    """Content of a certificate file."""
+
+    certificate: str
+    made: str
+    run: str
+    spec: str
+    system: str
+    width: float | None
+    finished: bool
+    batches: Count
+    inputs: CertifiedInputs
+    conditions: CertifiedConditions
+    versions: dict[str, str]
+    hardware: dict[str, Any]
+
+
+class DifferentEntry(TypedDict):
+    """Entry of a certificate that differs now."""
+
+    name: str
+    certificate: str
+    present: str
+
+
+class CertificateCheck(TypedDict):
+    """Comparison of a certificate with a run."""
+
+    file: str
+    run: str
+    same: bool
+    inputs: list[DifferentEntry]
+    numbers: list[str]
+    software: list[DifferentEntry]
