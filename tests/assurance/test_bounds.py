@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,6 +105,13 @@ def test_the_drives_needed_are_the_known_ones(
     assert needed < anytime < 2 * needed
     for count, found in ((anytime, True), (anytime - 1, False)):
         assert certifies(count - failures, count, share, confidence, any_time=True) is found
+
+
+def test_the_page_states_the_drives_needed() -> None:
+    page = (Path(__file__).parents[2] / "docs/assurance.md").read_text(encoding="utf-8")
+    for share in (0.9, 0.95, 0.99, 0.999):
+        fixed, anytime = (drives_needed(share, any_time=each) for each in (False, True))
+        assert f"| {f'{share:g}'.removeprefix('0')} | {fixed:,} | {anytime:,} |" in page
 
 
 @pytest.mark.parametrize("share", [0.6, 0.95])

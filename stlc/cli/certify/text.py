@@ -13,7 +13,7 @@ from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment
-    from stlc.cli.framework.documents import Assurance
+    from stlc.cli.framework.assured import Assurance
 
 CertifyOption = Annotated[
     float | None,

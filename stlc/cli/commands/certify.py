@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stlc.cli.certify.text import bounds_lines, checked_share, floored, raised
+from stlc.cli.framework.assured import Certificate, CertificateCheck, DifferentEntry
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.documents import Certificate, CertificateCheck, DifferentEntry
 from stlc.cli.framework.options import (
     RequireOption,
     RunsOption,

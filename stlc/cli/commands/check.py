@@ -14,7 +14,8 @@ import typer
 from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
 from stlc.cli.check import options as given
 from stlc.cli.check.judge import End, Work
-from stlc.cli.framework.documents import Assurance, CheckResult
+from stlc.cli.framework.assured import Assurance
+from stlc.cli.framework.documents import CheckResult
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
-from stlc.cli.framework.documents import Assurance, ScenarioResult, Simulation
+from stlc.cli.framework.assured import Assurance
+from stlc.cli.framework.documents import ScenarioResult, Simulation
 from stlc.cli.framework.options import (
     FailUnderOption,
     JsonOption,
