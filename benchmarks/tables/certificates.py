@@ -39,8 +39,8 @@ agent each, taken as the population, from which 200 recalibrations draw 100 driv
 part of the recalibrations in which the lower bound is at most the true share (Clopper-Pearson, betting).
 `next drive`: chance that the next drive's robustness reaches its conformal bound; `shifted`: the same if 2 %
 of the next drives come from the scenario `mismatch-20`, with the bound for a total variation of .02 and with
-the plain one. All of them should be at least .95. `needed`: worlds without a failure that certify .99 with
-95 % confidence, for a number fixed in advance and for any stopping time.
+the plain one. All but the last should be at least .95. `needed`: worlds without a failure that certify .99
+with 95 % confidence, for a number fixed in advance and for any stopping time.
 """
 
 
@@ -50,6 +50,7 @@ class Row:
 
     Attributes:
         spec: name of the specification.
+        steps: length of a drive.
         drives: number of recorded drives.
         satisfied: number of these that satisfy everything.
         exact: part of the recalibrations in which the Clopper-Pearson bound holds.
@@ -62,6 +63,7 @@ class Row:
     """
 
     spec: str
+    steps: int
     drives: int
     satisfied: int
     exact: float
@@ -75,7 +77,7 @@ class Row:
 
 COLUMNS: Columns[Row] = {
     "world": "{spec}",
-    "drives": "{drives}",
+    "drives x steps": "{drives} x {steps}",
     "satisfied": "{satisfied}",
     "share: exact": "{exact:.3f}",
     "share: betting": "{betting:.3f}",
@@ -105,6 +107,7 @@ def coverage(result: Result, recalibrations: int, drives: int) -> Row:
     exact_, betting_, next_drive, shifted, unaware = map(float, np.mean(found, axis=0))
     return Row(
         spec=str(result["key"]["spec"]),
+        steps=int(result["key"]["steps"]),
         drives=len(good),
         satisfied=int(good.sum()),
         exact=exact_,

@@ -43,6 +43,8 @@ Noun: TypeAlias = Literal["world", "drive", "trace"]
 Answer: TypeAlias = Literal["certified", "refuted", "undecided", "measured"]
 _AGREE = 1e-9
 """Largest difference of a recomputed bound that counts as rounding."""
+MOST_UNITS, MOST_VALUES = 10_000_000, 10_000
+"""Largest number of units, and of distinct values, in a certificate that is verified."""
 
 
 # ---------------------------------------------------------------------- what was observed
@@ -562,7 +564,9 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
             "upper_deployed": claim.shift.least(found.upper),
         }
         wrong += [
-            f"{place}.{name}" for name, value in expected.items() if abs(float(each[name]) - value) > _AGREE
+            f"{place}.{name}"
+            for name, value in expected.items()
+            if not abs(float(each[name]) - value) <= _AGREE
         ]
     overall = document["overall"]
     lower, upper = float(overall["lower_deployed"]), float(overall["upper_deployed"])
@@ -582,8 +586,8 @@ def _places(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any
 def _tally(pairs: Sequence[Sequence[float]]) -> Tally:
     values, counts = zip(*pairs, strict=True)
     whole = np.array([int(count) for count in counts], dtype=np.int64)
-    if (whole < 0).any() or not whole.sum():
-        raise ValueError("there are no counts")
+    if len(whole) > MOST_VALUES or (whole < 0).any() or not 0 < float(whole.sum(dtype=float)) <= MOST_UNITS:
+        raise ValueError("these are no counts of drives")
     given = np.array([float(value) for value in values])
     if not bool(((given >= 0.0) & (given <= 1.0)).all()):
         raise ValueError("an observation is outside of [0, 1]")

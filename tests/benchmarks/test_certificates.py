@@ -18,7 +18,12 @@ from stlc.cli.framework.app import main
 def test_coverage_is_that_of_the_stored_drives() -> None:
     rng = np.random.default_rng(0)
     rho = rng.normal(size=400)
-    stored = {"key": {"spec": "any"}, "good": (rho > -1.5).astype(int), "rho": rho, "shifted": rho - 4}
+    stored = {
+        "key": {"spec": "any", "steps": 9},
+        "good": (rho > -1.5).astype(int),
+        "rho": rho,
+        "shifted": rho - 4,
+    }
     row = coverage(stored, 200, 100)
     assert (row.drives, row.satisfied) == (400, int((rho > -1.5).sum()))
     assert min(row.exact, row.betting, row.next_drive, row.shifted) >= 0.95
@@ -46,4 +51,4 @@ def test_drives_are_stored_and_not_repeated(
         assert misfits(document, document_schema()) == []
         tables.append(document["result"]["rows"])
     assert tables[0] == tables[1]
-    assert "| cart | 20 |" in Path("page.md").read_text()
+    assert "| cart | 20 x 3 |" in Path("page.md").read_text()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -268,10 +270,11 @@ def test_numbers_that_were_changed_are_found(file: Path, capsys: pytest.CaptureF
     document = json.loads(file.read_text())
     document["overall"]["lower"] += 0.01
     document["answer"] = "certified"
+    document["requirements"][0]["upper"] = "nan"
     document["versions"]["torch"] = "0.1"
     file.write_text(json.dumps(document))
     found = compared(capsys, file, 1)
-    assert found["numbers"] == ["overall.lower", "answer"]
+    assert found["numbers"] == ["overall.lower", "near.upper", "answer"]
     assert [each["name"] for each in found["software"]] == ["torch"]
     assert main(["certify", "--verify", str(file)]) == 1
     out = capsys.readouterr().out
@@ -296,7 +299,9 @@ def test_what_is_no_certificate_is_refused(text: str, capsys: pytest.CaptureFixt
     assert "error[R108]: `odd.json` is no certificate" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("counts", [[], [[0.5, -1]], [[2, 3]], [["a", 1]], [[1, 0]], [[1]], 7])
+@pytest.mark.parametrize(
+    "counts", [[], [[0.5, -1]], [[2, 3]], [["a", 1]], [[1, 0]], [[1]], 7, [[1, 1e300]], [[1, 9**15], [0, 2]]]
+)
 def test_counts_that_are_none_are_refused(
     counts: Any, file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -377,3 +382,12 @@ def test_wrong_claims_on_traces(
 ) -> None:
     assert main(["check", "s.stl", *traces, *words]) == 2
     assert "error[U101]" in capsys.readouterr().err
+
+
+def test_bounds_on_traces_need_no_torch(traces: list[str]) -> None:
+    program = (
+        "import sys; from stlc.cli.framework.app import main\n"
+        "sys.exit(main(sys.argv[1:]) or 'torch' in sys.modules)"
+    )
+    words = ["check", "s.stl", *traces, "--certify", ".95", "-q"]
+    assert subprocess.run([sys.executable, "-c", program, *words], check=False).returncode == 0
