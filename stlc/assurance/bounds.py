@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 BETS = 100
 """Number of constant bets in the mixture of the betting bound."""
 _TINY = 1e-300
-_STEPS = 200
-"""Bisections and terms of continued fractions; both converge earlier."""
+_NARROW = 1e-13
+"""Accuracy of bounds, which are rounded outwards."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def _log_beta(a: float, b: float) -> float:
 def _fraction(x: float, a: float, b: float) -> float:
     """Continued fraction 1 + d1 / (1 + d2 / (1 + …)) of the incomplete beta function."""
     total, numerator, inverse = 1.0, 1.0, 0.0
-    terms = _STEPS + 10 * math.isqrt(int(a + b))
+    terms = 200 + 10 * math.isqrt(int(a + b))  # more than are needed
     for term in range(1, terms):
         half = term // 2
         if term % 2:
@@ -105,10 +105,8 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> Bo
 def _bisected(below: Callable[[float], bool]) -> float:
     """Largest number in [0, 1] at which the decreasing condition `below` holds, rounded down."""
     low, high = 0.0, 1.0
-    for _ in range(_STEPS):
+    while high - low > _NARROW:
         middle = 0.5 * (low + high)
-        if middle in (low, high):
-            break
         low, high = (middle, high) if below(middle) else (low, middle)
     return low
 

@@ -1,0 +1,92 @@
+"""Drives of a campaign: verdicts agree with those of deployments, and units with what worlds say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from stlc.assurance.certificate import Claim
+from stlc.assurance.drives import FIRST, SEED, Campaign, campaign, sample_of
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.evaluation.rules import rules_of
+from stlc.controller.guard.guard import Guard
+from stlc.controller.policies.policy import BestOfKPolicy
+from stlc.controller.problem.task import Task
+from stlc.controller.training.config import TrainConfig, resolve_config
+from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.run import Run
+from stlc.controller.world import ModelWorld, independent_agents
+from stlc.dynamics.model.system import System
+from stlc.files import read_source
+from stlc.grammar.parse.parser import parse
+from stlc.jsontext import plain
+from stlc.registry import METHODS
+
+ROOT = Path(__file__).parents[2]
+SMALL = {"test.steps": "30", "test.agents": "4", "test.world": "null"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """An untrained car."""
+    spec = parse(read_source(ROOT / "specs" / "traffic.stl"))
+    task = Task.of(spec, System.load(ROOT / "examples" / "car.yaml", SMALL))
+    config = TrainConfig()
+    folder = open_folder(task, config, Launch(root=tmp_path_factory.mktemp("runs")))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        resolved = resolve_config(task, config)
+        network = METHODS.get(resolved.method).network(task, resolved)
+    return Run(folder, task, BestOfKPolicy(task, network))
+
+
+def test_drives_are_judged_as_deployments_are(run: Run) -> None:
+    setting = Setting((0, 1, 2), 4, 30, 1)
+    recorder = Recorder(4, pictured=False)
+    simulate(Guard(run.task, run.policy, "none"), ModelWorld, setting, recorder)  # type: ignore[arg-type]
+    recording = recorder.recording()
+    assert recording is not None
+    found = sample_of(run.task, recording)
+    executed = judge_executed(run.task, recording, viable=np.ones(12, dtype=bool))
+    for each in found.requirements:
+        held = executed.rules[each.name].all(0)
+        assert (each.satisfied == held).all()
+        assert (each.violated == ~held).all()
+        assert ((each.robustness >= -TOLERANCE) == held).all()
+    assert not found.overall.satisfied.all()
+    assert found.units.tolist() == list(range(12))
+    by_rules = sample_of(run.task, recording, rules_of(run))
+    assert {each.name for each in by_rules.requirements} != {each.name for each in found.requirements}
+
+
+def test_a_campaign_is_repeatable_and_counts_its_seeds(run: Run) -> None:
+    order = Campaign(run, rules_of(run), "none", Setting((), 4, 2, 1), Claim(0.999), most=FIRST + 20)
+    first, again = list(campaign(order)), next(campaign(order))
+    assert plain(first[0].assessment.summary()) == plain(again.assessment.summary())
+    last = first[-1]
+    assert last.done
+    assert last.seeds == tuple(range(SEED, SEED + last.assessment.overall.units // 4))
+    assert all(not each.done for each in first[:-1])
+    assert last.assessment.claim.calibration == FIRST
+
+
+class Derived(ModelWorld):
+    """A world that might couple its agents."""
+
+
+class Declared(ModelWorld):
+    independent = True
+
+
+class Odd(ModelWorld):
+    independent = "perhaps"
+
+
+def test_only_a_world_itself_says_that_its_agents_are_independent() -> None:
+    found = [independent_agents(each) for each in (ModelWorld, Derived, Declared, Odd)]  # type: ignore[arg-type]
+    assert found == [True, False, True, False]
