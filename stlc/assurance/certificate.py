@@ -507,7 +507,11 @@ def _assumptions(found: Assessment) -> Iterator[str]:
     if noun != "trace":
         yield "worlds of different seeds are independent, as the numbers of a pseudo-random generator are"
     if claim.shift == SAME:
-        what = "the same source and conditions" if noun == "trace" else "the same world, scenario and starts"
+        what = (
+            "the same source and conditions"
+            if noun == "trace"
+            else "the same world, scenario, starts and length"
+        )
         yield f"future drives come from {what} as these"
     else:
         yield f"the distribution of future drives is within {_distance(claim.shift)} of that of these"

@@ -63,7 +63,7 @@ class Shift:
         The distance of the two distributions of "the event occurs" is at most that of Q and P (data
         processing), and the bound is attained. As a function of `chance` it is concave, so it also bounds the
         mean over random events of mean probability `chance` (M. Cauchois, S. Gupta, A. Ali and J. C. Duchi,
-        Robust validation, Journal of the American Statistical Association 119, 2024, Lemma A.1 ff.).
+        Robust validation, Journal of the American Statistical Association 119, 2024).
         """
         p = min(max(chance, 0.0), 1.0)
         if not self.size:
@@ -216,7 +216,8 @@ def calibrate_online(
 
     The scales come from the first third of the drives, the radius from the others, so that the bound is valid
     for any prediction. The greatest scaled loss over the steps of a drive is its score (M. Cleaveland, I.
-    Lee, G. J. Pappas and L. Lindemann, Conformal prediction regions for time series, AAAI 2024).
+    Lee, G. J. Pappas and L. Lindemann, Conformal prediction regions for time series using linear
+    complementarity programming, AAAI 2024, in its simple form with given scales).
 
     Args:
         predicted: robustness predicted at each step, (drives, agents, steps); one bound covers all agents.
