@@ -249,6 +249,7 @@ CODES: dict[str, str] = {
     "S302": "dynamics that give NaN or infinity",
     "S303": "initial states in a file that cannot be used",
     "S304": "a mirror that is not a symmetry",
+    "S401": "a plant that cannot be opened, or that lacks what its file names",
     "W601": "an acceptance rate of initial states below 1 %",
     "W602": "plans of a plant that is unstable",
     "W604": "an unbounded mission that is simulated for longer than it was validated",

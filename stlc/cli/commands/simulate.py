@@ -12,7 +12,7 @@ import typer
 
 from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
 from stlc.cli.framework.assured import Assurance
-from stlc.cli.framework.documents import ScenarioResult, Simulation
+from stlc.cli.framework.documents import ScenarioResult, SimulateResult, Simulation
 from stlc.cli.framework.options import (
     FailUnderOption,
     JsonOption,
@@ -60,6 +60,7 @@ GUARDS: dict[Mode, tuple[Mode, ...]] = {
     "stlc simulate latest --backup --seeds 0..19 --record trace.npz",
     "stlc simulate specs/ship_track.stl --backup --scenario all",
     "stlc simulate --backup --seeds 0 --live --robustness robustness.jsonl",
+    "stlc simulate fall.stl --plant ball.yaml --seeds 0..19",
 )
 def simulate(
     run: RunArgument = "latest",
@@ -133,13 +134,25 @@ def simulate(
         str | None,
         typer.Option(metavar="TIME", help="With --method: processor time per plan; by default 20ms."),
     ] = None,
+    plant: Annotated[
+        Path | None,
+        typer.Option("--plant", metavar="FILE", help="A plant file: RUN is a specification, and judges it."),
+    ] = None,
+    from_: Annotated[
+        str | None,
+        typer.Option("--from", metavar="POINT", help="With --plant: values, such as `h=1 m, e=0.7`."),
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="With --plant: number of processes.")] = 1,
+    stream: Annotated[
+        bool, typer.Option("--stream", help="With --plant: judge while it runs, in constant memory.")
+    ] = False,
     system: SystemOption = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
     pictures: PicturesOption = True,
     window: Annotated[bool, typer.Option("--window", help="Show robots in PyBullet's window, too.")] = False,
     json: JsonOption = False,
-) -> Answer[Simulation]:
+) -> Answer[SimulateResult]:
     """Deploy a trained policy in the world of its system.
 
     RUN is by default the newest run. With --method, RUN is a specification, and a planner controls the system
@@ -148,8 +161,19 @@ def simulate(
     run's folder. A drive is the closed-loop run of one agent with one seed. Drives are judged by the
     specification that the system file names (key `judge` of its section `test`). Means over seeds have 95 %
     intervals (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets their
-    strength in percent, as in mismatch-20. --scenario disturbed runs all of them.
+    strength in percent, as in mismatch-20. --scenario disturbed runs all of them. With --plant, RUN is a
+    specification and FILE a plant file (docs/plants.md): a black box is simulated in processes of its own, at
+    --from or at a random point for each seed, and each trace is judged. The exit code is then 1 if a
+    simulation violates a requirement or gives no trace, and 4 if it is too short for a verdict.
     """
+    if plant is not None:
+        from stlc.cli.simulate.plant import PlantOrder, simulate_plant
+
+        overrides = parse_overrides(set_)
+        given = PlantOrder(run, plant, from_, seeds, record, jobs, stream, overrides, fail_under)
+        _no_policy({"--backup": backup, "--guard": guard, "--scenario": scenario, "--method": method})
+        return simulate_plant(given)
+    _no_plant({"--from": from_, "--stream": stream or None})
     from stlc.cli.simulate.text import closing, screen
     from stlc.cli.simulate.watch import require_writable
     from stlc.controller.deployment.simulator import Setting
@@ -200,6 +224,20 @@ def simulate(
     result: Simulation = made
     missed = fail_under is not None and _satisfied(document, chosen) < fail_under
     return Answer(result, show, int(missed) if certify is None else _certified(document, chosen))
+
+
+def _no_policy(options: Mapping[str, object]) -> None:
+    """Raise UsageError (U101) if an option of trained policies is given with `--plant`."""
+    for name, value in options.items():
+        if value is not None:
+            raise usage(f"`{name}` is for trained policies and planners, and `--plant` has neither")
+
+
+def _no_plant(options: Mapping[str, object]) -> None:
+    """Raise UsageError (U101) if an option of plants is given without `--plant`."""
+    for name, value in options.items():
+        if value is not None:
+            raise usage(f"`{name}` is for plants", "stlc simulate SPEC --plant FILE")
 
 
 def _planner(

@@ -21,6 +21,7 @@ from typing import (
 )
 
 from stlc.cli.framework.assured import Assurance, Certificate, CertificateCheck
+from stlc.cli.framework.plant_documents import PlantSimulation
 
 if TYPE_CHECKING:
     from stlc.view.learning import Learning
@@ -622,6 +623,9 @@ class Simulation(TypedDict):
     judge: NotRequired[JudgeSpec | None]
 
 
+SimulateResult: TypeAlias = Simulation | PlantSimulation
+
+
 class ListedSystem(TypedDict):
     name: str
     path: str
@@ -763,7 +767,7 @@ RESULTS: dict[str, Any] = {
     "plot": PlottedTrace,
     "report": WrittenReport,
     "runs": RunList | RunComparison | RunContent | RemovedRuns,
-    "simulate": Simulation,
+    "simulate": SimulateResult,
     "stlc": NoneType,
     "system": SystemList | SystemFacts,
     "train": TrainedRun | TrainedRuns,
