@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, get_args
@@ -390,8 +390,8 @@ class _Reading:
             node = MappingNode(node.span, (Entry(Scalar(node.span, kind.main), node),), 2)
             if text is None:
                 return name, {}
-        options = asdict(read(kind.record, self.cx, node, f"`{name}`", OF))
-        return name, {each: _plain(value) for each, value in options.items()}
+        keys = read(kind.record, self.cx, node, f"`{name}`", OF)
+        return name, {each.name: _plain(getattr(keys, each.name)) for each in fields(kind.record)}
 
     # ------------------------------------------------------------------------------ sections
 

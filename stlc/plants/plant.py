@@ -120,6 +120,7 @@ class Plant:
         self.variables = tuple(_variables(decl))
         self._processes: list[PlantProcess] = []
         self._idle: list[PlantProcess] = []
+        self._stopped = False
         self._close = weakref.finalize(self, _end, self._processes)
 
     def __enter__(self) -> Plant:
@@ -207,16 +208,17 @@ class Plant:
             raise usage(f"{len(chosen)} seeds are given for {len(points)} points")
         if min(jobs, len(points)) <= 1:
             return [self._run(point, seed) for point, seed in zip(points, chosen, strict=True)]
-        with leaving(lambda _code: _kill(self._processes)):
-            executor = ThreadPoolExecutor(min(jobs, len(points)))
-            try:
-                return list(executor.map(self._run, points, chosen))
-            except BaseException:
-                executor.shutdown(wait=False, cancel_futures=True)
-                self.close()
-                raise
-            finally:
-                executor.shutdown(wait=True)
+        executor = ThreadPoolExecutor(min(jobs, len(points)))
+        try:
+            return list(executor.map(self._run, points, chosen))
+        except BaseException:  # such as Ctrl-C: simulations in progress end now
+            self._stopped = True
+            executor.shutdown(wait=False, cancel_futures=True)
+            self.close()
+            raise
+        finally:
+            executor.shutdown(wait=True)
+            self._stopped = False
 
     def _checked(self, points: Floats) -> Floats:
         found = np.asarray(points, dtype=np.float64)
@@ -251,7 +253,7 @@ class Plant:
         process = self._taken()
         deadline = time.monotonic() + float(self.decl.limits.time)
         try:
-            with leaving(lambda _code: process.kill()):
+            with leaving(lambda _code: process.end()):
                 yield from _Simulation(self, process, point, seed, deadline).parts(samples)
         except FaultyError as error:
             process.end()  # a plant that has failed may fail again without cause
@@ -294,6 +296,9 @@ class Plant:
             self._discard(process)
         process = PlantProcess(self.decl)
         self._processes.append(process)
+        if self._stopped:
+            self._discard(process)
+            raise KeyboardInterrupt
         return process
 
     def _returned(self, process: PlantProcess) -> None:
@@ -403,11 +408,6 @@ def _variables(decl: PlantDecl) -> Iterator[PlantVariable]:
                 yield PlantVariable(name, signal.low, signal.high, signal.unit)
             for name in signal.times:
                 yield PlantVariable(name, 0.0, float(signal.duration), parse_unit("s"))
-
-
-def _kill(processes: Sequence[PlantProcess]) -> None:
-    for process in list(processes):
-        process.kill()
 
 
 def _end(processes: list[PlantProcess]) -> None:

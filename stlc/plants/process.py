@@ -29,6 +29,8 @@ from stlc.units import parse_unit, same_dims
 Floats: TypeAlias = NDArray[np.float64]
 TAIL = 4000
 """Kept bytes of the standard error of a plant, the last ones."""
+OPENING = 60.0
+"""Seconds that a plant has to open, if a simulation may not take longer."""
 _LAST_WORDS = 1.0
 """Seconds to wait for the standard error of a process that has ended."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -94,7 +96,7 @@ class PlantProcess:
     def _open(self) -> None:
         """Open the plant. Raises the errors of the class."""
         decl = self._decl
-        deadline = time.monotonic() + float(decl.limits.time)
+        deadline = time.monotonic() + max(float(decl.limits.time), OPENING)
         try:
             reply = self._exchanged({"layout": decl.layout(self._scratch).as_json()}, None, deadline)
         except FaultyError as error:
@@ -182,14 +184,11 @@ class PlantProcess:
         """Whether the process can take further requests."""
         return self._process.poll() is None and not self._process.stdin.closed  # type: ignore[union-attr]
 
-    def kill(self) -> None:
-        """Kill the process and its children; may be called from any thread."""
-        with suppress(OSError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-
     def end(self) -> None:
-        """Kill the process and its children, and remove its temporary files."""
-        self.kill()
+        """Kill the process and its children, and remove its temporary files; any thread may call it."""
+        if self._process.returncode is None:
+            with suppress(OSError):
+                os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._listener.join(_LAST_WORDS)
         for stream in (self._process.stdin, self._process.stdout):

@@ -19,7 +19,7 @@ def build(folder: Path, model: str, fmi: int) -> Path:
     """Build `folder/model.fmu` for FMI 2 or 3, with both interfaces; return its path."""
     (folder / "stubs.h").write_text(_stubs(fmi))
     library = folder / f"{model}.so"
-    command = [compiler() or "cc", "-shared", "-fPIC", "-O1", f"-DFMI={fmi}", f"-DMODEL={MODELS[model]}"]
+    command = [compiler() or "cc", "-shared", "-fPIC", "-O0", f"-DFMI={fmi}", f"-DMODEL={MODELS[model]}"]
     subprocess.run([*command, f"-I{folder}", "-o", str(library), str(SOURCE), "-lm"], check=True)
     path = folder / f"{model}.fmu"
     with zipfile.ZipFile(path, "w") as archive:
@@ -85,7 +85,9 @@ def _two(model: str) -> str:
             f'<ScalarVariable name="{name}" valueReference="{reference}" causality="{causality}" '
             f'variability="{variability}" {initial[0] if initial else ""}><{kind} {inner}/></ScalarVariable>'
         )
-    outputs = "".join(f'<Unknown index="{order[name]}"/>' for _, name, _, cause, *_ in rows if cause == "output")
+    outputs = "".join(
+        f'<Unknown index="{order[name]}"/>' for _, name, _, cause, *_ in rows if cause == "output"
+    )
     slopes = "".join(f'<Unknown index="{order[name]}"/>' for name in order if name.startswith("der("))
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
@@ -112,7 +114,9 @@ def _three(model: str) -> str:
         )
     if model == "ball":
         lines.append('<Float64 name="z" valueReference="11" causality="local" variability="continuous"/>')
-    outputs = "".join(f'<Output valueReference="{ref}"/>' for _, _, ref, cause, *_ in rows if cause == "output")
+    outputs = "".join(
+        f'<Output valueReference="{ref}"/>' for _, _, ref, cause, *_ in rows if cause == "output"
+    )
     slopes = [ref for name, ref in references.items() if name.startswith("der(")]
     derivatives = "".join(f'<ContinuousStateDerivative valueReference="{ref}"/>' for ref in slopes)
     unknowns = "".join(f'<InitialUnknown valueReference="{ref}"/>' for ref in slopes)

@@ -71,7 +71,8 @@ class _Variables:
         self.inputs = [self._input(port) for port in layout.inputs]
         self.outputs = [self._named(port, "output") for port in layout.outputs]
         used = (*self.initial, *self.param, *self.inputs, *self.outputs)
-        self.units = {each.name: each.unit for each in used if each.unit}
+        known = {each.name: _text(each) for each in description.unitDefinitions}
+        self.units = {each.name: known.get(name, name) for each in used if (name := _unit(each))}
 
     def _named(self, port: Port, section: str) -> Any:
         found, place = self._known.get(port.source), f"{section}.{port.name}"
@@ -105,6 +106,25 @@ class _Variables:
         if variable.type == "Enumeration":
             return "Integer" if self.major == 2 else "Int64"
         return str(variable.type)
+
+
+def _unit(variable: Any) -> str:
+    """Name of the unit of a variable, its own or that of its type; "" if it has none."""
+    declared = None if variable.declaredType is None else variable.declaredType.unit
+    return str(variable.unit or declared or "")
+
+
+def _text(unit: Any) -> str:
+    """Text of a unit: the product of powers of base units that the FMU gives, else its name.
+
+    FMUs may name a unit as they like, such as `m/s2`.
+    """
+    base = unit.baseUnit
+    if base is None or float(base.factor or 1) != 1.0 or float(base.offset or 0) != 0.0:
+        return str(unit.name)
+    powers = {name: int(getattr(base, name) or 0) for name in ("kg", "m", "s", "A", "K", "mol", "cd")}
+    parts = [f"{name}^{power}" for name, power in powers.items() if power]
+    return "*".join(parts) if parts and float(base.rad or 0) == 0.0 else str(unit.name)
 
 
 @final
@@ -184,7 +204,7 @@ class Fmu:
             kind = self._variables.kind(variable)
             number: float | int | bool = float(value)
             if not kind.startswith(("Real", "Float")):
-                number = value >= 0.5 if kind == "Boolean" else round(float(value))
+                number = bool(value >= 0.5) if kind == "Boolean" else round(float(value))
             getattr(self._instance, f"set{kind}")([variable.valueReference], [number])
 
     def _outputs(self) -> list[float]:
