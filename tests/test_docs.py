@@ -22,6 +22,7 @@ from stlc.cli.framework.app import main
 from stlc.diagnostics import CODES
 from stlc.dynamics.declaration.load import SystemKeys
 from stlc.dynamics.schema.record import reference
+from stlc.plants.declaration import PlantKeys
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -350,6 +351,7 @@ ROOMS = {
     "dynamics": "dynamics: system files and models",
     "runtime": "runtime: exported controllers in Python",
     "monitor": "monitor: verdicts, streams, explanations",
+    "plants": "plants: black boxes from elsewhere",
     "controller": "controller: policies, training, guard, deployment, evaluation",
     "assurance": "assurance: statistical bounds and certificates",
     "export": "export: torch programs, ONNX graphs, C headers",
@@ -391,6 +393,11 @@ def first_line(path: Path) -> str:
 def test_every_key_of_a_system_file_is_listed(regenerate):
     text = "\n".join(reference(SystemKeys, "The file"))
     hold(ROOT / "docs/systems.md", "keys", text, regenerate=regenerate)
+
+
+def test_every_key_of_a_plant_file_is_listed(regenerate):
+    text = "\n".join(reference(PlantKeys, "The file"))
+    hold(ROOT / "docs/plants.md", "keys", text, regenerate=regenerate)
 
 
 def test_the_architecture_names_files_that_exist():

@@ -216,6 +216,18 @@ from stlc.view.bullet import require_window
 require_window()
 import pytorch_kinematics
 """,
+    "fmu": """
+from pathlib import Path
+from stlc.diagnostics import SystemFileError
+from stlc.plants.plant import load_plant
+Path("ball.yaml").write_text(
+    "plant: 1\\nname: ball\\nfmu: ball.fmu\\ntime: {dt: 1 s, duration: 1 s}\\noutput: {h: }\\n"
+)
+try:
+    load_plant("ball.yaml").simulate([[]])
+except SystemFileError as error:
+    assert "there is no file" in str(error)
+""",
     "video": """
 from stlc.view.animation import video
 from PIL import Image

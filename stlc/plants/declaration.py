@@ -49,7 +49,7 @@ from stlc.files import read_source
 from stlc.plants.kinds import KINDS, ControllerLayout, Layout, PlantKind, Port
 from stlc.source import Source, Span
 from stlc.trace.trace import RESERVED
-from stlc.units import Unit
+from stlc.units import DIMENSIONLESS, Unit
 
 VERSION = 1
 MOST_STEPS = 10**9
@@ -102,6 +102,9 @@ class OutputKeys:
     source: str | None = key(TEXT, "its name in the plant, if that is another one", name="from")
 
 
+_REAL = Kind(lambda cx, node, label: cx.here.constant(node, label, DIMENSIONLESS), EXPRESSION)
+
+
 @dataclass(frozen=True, slots=True)
 class ControllerKeys:
     """The section `controller` of a plant file: a neural network in the loop with the plant."""
@@ -119,21 +122,15 @@ class ControllerKeys:
     period: Fraction | None = key(
         SECONDS, "time between two evaluations, a multiple of `dt`; unless given, `dt`"
     )
-    scale: float = key(
-        Kind(lambda cx, node, label: _real(cx, node, label), {"type": "number"}),
-        "factor of what it gives",
-        1.0,
-    )
-    offset: float = key(
-        Kind(lambda cx, node, label: _real(cx, node, label), {"type": "number"}), "added afterwards", 0.0
-    )
+    scale: float = key(_REAL, "factor of what it gives", 1.0)
+    offset: float = key(_REAL, "added afterwards", 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class LimitKeys:
     """The section `limit` of a plant file."""
 
-    time: Fraction = key(SECONDS, "of one simulation, on the clock", Fraction(30))
+    time: Fraction = key(SECONDS, "of one simulation, on the clock; 30 s unless given", Fraction(30))
     memory: int = key(integer(64), "address space of a process in megabytes", 4096)
     fresh: bool = key(FLAG, "a new process for every simulation", False)
 
@@ -390,7 +387,7 @@ class _Reading:
             node = MappingNode(node.span, (Entry(Scalar(node.span, kind.main), node),), 2)
             if text is None:
                 return name, {}
-        keys = read(kind.record, self.cx, node, f"`{name}`", OF)
+        keys: Any = read(kind.record, self.cx, node, f"`{name}`", OF)
         return name, {each.name: _plain(getattr(keys, each.name)) for each in fields(kind.record)}
 
     # ------------------------------------------------------------------------------ sections
@@ -574,14 +571,6 @@ def _places(node: MappingNode, before: str) -> Iterator[tuple[str, Span]]:
         yield name, entry.value.span if entry.value.span.text else entry.key.span
         if isinstance(entry.value, MappingNode) and before.count(".") < 2:
             yield from _places(entry.value, f"{name}.")
-
-
-def _real(cx: Context, node: Node, label: str) -> float | None:
-    """Read a finite number of either sign."""
-    value = as_float(node) if isinstance(node, Scalar) else None
-    if value is None:
-        cx.reader.wrong(node, label, "a number")
-    return value
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import usage
 from stlc.registry import did_you_mean
 
-SYSTEM_FILE = "system-file"
+SYSTEM_FILE, PLANT_FILE = "system-file", "plant-file"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
@@ -35,11 +35,12 @@ def schema(
 def names() -> list[str]:
     """Return the names of all schemas, such as `check/1`.
 
-    Most schemas describe the output of a command. `system-file/1` describes system files.
+    Most schemas describe the output of a command. `system-file/1` describes system files, and
+    `plant-file/1` plant files.
     """
     from stlc.cli.framework.documents import LINES, RESULTS
 
-    return sorted(f"{name}/1" for name in (*RESULTS, *LINES, SYSTEM_FILE))
+    return sorted(f"{name}/1" for name in (*RESULTS, *LINES, SYSTEM_FILE, PLANT_FILE))
 
 
 def load_schema(name: str) -> dict[str, Any]:
@@ -60,6 +61,10 @@ def load_schema(name: str) -> dict[str, Any]:
         from stlc.dynamics.declaration.load import system_schema
 
         return {"$schema": _DIALECT, "title": wanted, **system_schema()}
+    if command == PLANT_FILE:
+        from stlc.plants.declaration import plant_schema
+
+        return {"$schema": _DIALECT, "title": wanted, **plant_schema()}
     from stlc.cli.framework.documents import LINES, RESULTS, DocumentRecord, schema_of
 
     if command in LINES:

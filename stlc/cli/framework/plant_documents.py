@@ -1,4 +1,4 @@
-"""Records of `stlc simulate --plant --json`; see `stlc.cli.framework.documents`."""
+"""Records that `stlc simulate` prints for plants; see `stlc.cli.framework.documents`."""
 
 from typing import Literal, TypeAlias, TypedDict
 

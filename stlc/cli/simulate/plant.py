@@ -1,4 +1,4 @@
-"""`stlc simulate --plant`: simulations of a black box, judged by a specification."""
+"""Simulations of a black box, judged by a specification: the option `--plant` of `stlc simulate`."""
 
 from __future__ import annotations
 

@@ -92,6 +92,17 @@ def test_a_system(code, example, tmp_path, monkeypatch, capsys):
     judge(example, code, found)
 
 
+@pytest.mark.parametrize(("code", "example"), examples("plant"))
+def test_a_plant(code, example, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (program,) = PAGES[code].having("file")
+    Path("ball.py").write_text(program.body)
+    Path("ball.yaml").write_text(example.body)
+    Path("above.stl").write_text("signal height: real [m]\nrequire above: always[0 s, 1 s] height >= 0 m\n")
+    _, found = codes_of(capsys, "simulate", "above.stl", "--plant", "ball.yaml", "--seeds", "0")
+    judge(example, code, found)
+
+
 @pytest.mark.parametrize(("code", "example"), examples("csv"))
 def test_a_trace(code, example, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

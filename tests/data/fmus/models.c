@@ -11,7 +11,7 @@
 
 #define SAME 1e-12
 #define MICRO 1e-3
-#define MOST 12
+#define SLOW 0.05
 
 typedef unsigned int Ref;
 enum { OK = 0, WARNING = 1, DISCARD = 2, ERROR = 3 };
@@ -25,7 +25,7 @@ typedef bool Flag;
 typedef struct {
     double time, x[2], input, param[2], lifetime;
     int bounces;
-    Flag frozen, ended, exchange;
+    Flag frozen, resting, ended, exchange;
 } Model;
 
 #if MODEL == 1
@@ -34,17 +34,22 @@ enum { STATES = 2, EVENTS = 1 };
 static void begin(Model *m) { m->x[0] = 1.0; m->param[0] = 9.81; m->param[1] = 0.7; }
 
 static void slope(const Model *m, double *dx) {
-    dx[0] = m->frozen ? 0.0 : m->x[1];
-    dx[1] = m->frozen ? 0.0 : m->input - m->param[0];
+    bool still = m->frozen || m->resting;
+    dx[0] = still ? 0.0 : m->x[1];
+    dx[1] = still ? 0.0 : m->input - m->param[0];
 }
 
-static double indicator(const Model *m) { return m->x[0] == 0.0 && m->x[1] >= 0.0 ? 1.0 : m->x[0]; }
+static double indicator(const Model *m) { return m->resting ? 1.0 : m->x[0]; }
 
 static bool event(Model *m) {
     if (m->x[0] > 0.0 || m->x[1] >= 0.0) return false;
     m->x[0] = SAME;
     m->x[1] = -m->param[1] * m->x[1];
     m->bounces += 1;
+    if (m->x[1] < SLOW) {
+        m->resting = true;
+        m->x[0] = m->x[1] = 0.0;
+    }
     return true;
 }
 #elif MODEL == 2
