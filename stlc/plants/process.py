@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, MissingError, SystemFileError
 from stlc.plants.declaration import OutputDecl, PlantDecl, PlantInput, VariableDecl
-from stlc.plants.kinds import Reason
+from stlc.plants.kinds import SCRATCH, Reason
 from stlc.plants.messages import Message, MessageError, encoded, received
 from stlc.units import parse_unit, same_dims
 
@@ -74,7 +74,7 @@ class PlantProcess:
 
     def __init__(self, decl: PlantDecl) -> None:
         self._decl = decl
-        self._scratch = tempfile.mkdtemp(prefix="stlc-plant-")
+        self._scratch = tempfile.mkdtemp(prefix=SCRATCH)
         try:
             self._process = _started(decl, self._scratch)
         except BaseException:

@@ -8,12 +8,14 @@ prints to the standard error.
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -21,6 +23,7 @@ import numpy as np
 from stlc.plants.controller import NetworkController
 from stlc.plants.kinds import (
     KINDS,
+    SCRATCH,
     AbsentError,
     BlackBox,
     FaultError,
@@ -157,9 +160,17 @@ def _watch_parent() -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(ORPHAN)
+        _remove_scratch()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _remove_scratch() -> None:
+    """Remove the folder for temporary files; it is left if the parent was killed."""
+    scratch = Path(os.environ.get("TMPDIR", ""))
+    if scratch.name.startswith(SCRATCH):
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def main() -> None:
@@ -172,6 +183,7 @@ def main() -> None:
     os.dup2(2, 1)
     with open(inbox, "rb") as requests, open(outbox, "wb") as replies:  # noqa: PTH123
         serve(requests, replies)
+    _remove_scratch()
 
 
 if __name__ == "__main__":

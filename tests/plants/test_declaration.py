@@ -118,7 +118,7 @@ WRONG = [
     ({"controller": "{onnx: n, reads: [], writes: [torque]}"}, "S103", "[]"),
     ({"controller": "{onnx: n, reads: [rate], writes: [torque], period: 15 ms}"}, "S103", "15 ms"),
     ({"controller": "{onnx: n, reads: [rate], writes: [torque]}"}, "S103", "pieces"),
-    ({"controller": "{onnx: n, reads: [rate], writes: [torque], scale: x}"}, "S103", "x"),
+    ({"controller": "{onnx: n, reads: [rate], writes: [torque], scale: x}"}, "E101", "x"),
 ]
 
 

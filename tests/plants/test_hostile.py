@@ -178,7 +178,7 @@ import numpy, sys
 from stlc.plants.plant import load_plant
 plant = load_plant("hostile.yaml")
 plant.simulate(numpy.array([[0.0]]))
-print(plant._processes[0]._process.pid, flush=True)
+print(plant._processes[0]._process.pid, plant._processes[0]._scratch, flush=True)
 sys.stdin.read()
 """
     home = str(Path(__file__).parents[2])
@@ -190,7 +190,10 @@ sys.stdin.read()
         env={**os.environ, "PYTHONPATH": home},
     )
     assert parent.stdout is not None
-    worker = int(parent.stdout.readline())
+    number, scratch = parent.stdout.readline().decode().split()
+    assert Path(scratch).is_dir()
+    worker = int(number)
     parent.send_signal(signal.SIGKILL)
     parent.communicate()
     assert gone(worker)
+    assert not Path(scratch).exists()

@@ -21,6 +21,8 @@ Reason: TypeAlias = Literal[
     "crash", "time limit", "memory", "error", "not finite", "wrong shape", "bad message"
 ]
 """Why a simulation gave no trace."""
+SCRATCH = "stlc-plant-"
+"""Prefix of the names of folders for temporary files, one for each process of a plant."""
 KINDS: PackageRegistry[Any] = PackageRegistry("kind of plant", "stlc.plants.kinds", "KIND", default="python")
 """Kinds of plants (`PlantKind`) by the key of plant files that names a plant of this kind."""
 
