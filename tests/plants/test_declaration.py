@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from fractions import Fraction
 from pathlib import Path
@@ -9,9 +10,11 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers.plants import FILE, changed, pendulum, read
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
-from stlc.diagnostics import SystemFileError
+from stlc.diagnostics import StlcError, SystemFileError
 from stlc.plants.declaration import load_plant_decl, plant_schema
 from stlc.plants.kinds import KINDS, layout_of
 
@@ -135,6 +138,18 @@ def test_all_errors_are_reported_together(tmp_path):
     with pytest.raises(SystemFileError) as caught:
         read(changed(FILE, initial="{angle: {range: [1, 0]}}", limit="{time: no}", plan="1"), tmp_path)
     assert len(caught.value.diagnostics) >= 3
+
+
+PIECES = ["{", "}", "[", "]", ":", ",", "-", "\n", " ", "1e9", "0 s", "~", "range", "from", "'"]
+
+
+@settings(max_examples=150)
+@given(st.integers(0, len(FILE)), st.integers(0, 12), st.sampled_from(PIECES))
+def test_a_damaged_file_is_read_or_refused(start, length, piece):
+    text = FILE[:start] + piece + FILE[start + length :]
+    with contextlib.suppress(StlcError):
+        decl = read(text, HERE)
+        assert layout_of(decl.layout("x").as_json()) == decl.layout("x")
 
 
 @pytest.mark.parametrize("kind", KINDS.names)

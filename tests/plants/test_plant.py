@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,27 @@ def test_a_trace_is_judged_as_a_stream_is(plant):
         for judgement in verdict:
             assert tallies[judgement.name].status == judgement.overall
             assert tallies[judgement.name].robustness == pytest.approx(float(judgement.least[0]), abs=1e-12)
+
+
+def test_a_long_simulation_takes_no_more_memory(tmp_path):
+    (tmp_path / "still.py").write_text("def step(state, inputs, dt):\n    return state\n")
+    peaks = []
+    for seconds in (6, 40):
+        time = f"{{dt: 1 ms, duration: {seconds} s}}"
+        text = changed(
+            FILE, python='"still.py:step"', time=time, input="{torque: {range: [0, 1], pieces: 3}}"
+        )
+        with Plant(read(text, tmp_path)) as plant:
+            online = Monitor(
+                "signal angle: real [rad]\nrequire low: always angle <= 90 deg", dt=0.001
+            ).online()
+            tracemalloc.start()
+            assert plant.watch(plant.random_point(0), online) is None
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        assert online.samples == 1000 * seconds + 1
+        assert online.finish()["low"].status == "satisfied"
+    assert peaks[1] < peaks[0] + 300_000  # the samples alone would be 0.8 MB more
 
 
 def test_points_of_another_size_are_refused(plant):
