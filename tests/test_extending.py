@@ -69,10 +69,10 @@ def failures(tmp_path_factory) -> dict[str, str]:
 
 
 def test_the_page_has_an_example_of_each_extension():
-    assert len(CHECKS) == 12
-    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 11
+    assert len(CHECKS) == 13
+    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 12
     operator = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
-    assert len(operator) == 3  # an operator, a trace format and a function
+    assert len(operator) == 4  # an operator, a trace format, a function and a kind of plant
 
 
 @pytest.mark.parametrize("name", [name for name, _ in CHECKS])
