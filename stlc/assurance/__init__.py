@@ -1,1 +1,1 @@
-"""Evidence about controllers beyond single verdicts: searches for violations, statistical bounds, certificates."""
+"""Evidence about controllers beyond single verdicts: searches for violations, bounds, certificates."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.framework.documents import FalsifiedRequirement, FalsifiedSystem, ReplayedCounterexample
+from stlc.cli.framework.assured import FalsifiedRequirement, FalsifiedSystem, ReplayedCounterexample
 from stlc.cli.framework.options import (
     RequireOption,
     RunsOption,

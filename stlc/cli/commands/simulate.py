@@ -171,22 +171,19 @@ def simulate(
 
         overrides = parse_overrides(set_)
         given = PlantOrder(run, plant, from_, seeds, record, jobs, stream, overrides, fail_under)
-        _no_policy({"--backup": backup, "--guard": guard, "--scenario": scenario, "--method": method})
+        own = {"--backup": backup, "--guard": guard, "--scenario": scenario, "--method": method}
+        _no_policy({**own, "--certify": certify})
         return simulate_plant(given)
     _no_plant({"--from": from_, "--stream": stream or None})
     from stlc.cli.simulate.text import closing, screen
-    from stlc.cli.simulate.watch import require_writable
     from stlc.controller.deployment.simulator import Setting
     from stlc.controller.guard.margins import parse_margins
     from stlc.controller.problem.load import require_controls
     from stlc.controller.training.run import Run
-    from stlc.trace import check_writable
 
     chosen = _guard(backup, guard)
     printed = _printed(json=json, margins=margins)
-    if record is not None:
-        check_writable(record)
-    require_writable(margins)
+    _require_writable(record, margins)
     require_claim(certify, fail_under)
     overrides = parse_overrides(set_)
     run = _run_of(run, _planner(method, option, budget, system), system, overrides, runs)
@@ -224,6 +221,16 @@ def simulate(
     result: Simulation = made
     missed = fail_under is not None and _satisfied(document, chosen) < fail_under
     return Answer(result, show, int(missed) if certify is None else _certified(document, chosen))
+
+
+def _require_writable(record: Path | None, margins: str | None) -> None:
+    """Raise MissingError (R201) if the file of `--record` or of `--robustness` cannot be written."""
+    from stlc.cli.simulate.watch import require_writable
+    from stlc.trace import check_writable
+
+    if record is not None:
+        check_writable(record)
+    require_writable(margins)
 
 
 def _no_policy(options: Mapping[str, object]) -> None:

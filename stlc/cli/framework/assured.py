@@ -1,4 +1,4 @@
-"""Records of statistical bounds and certificates, as `--json` prints them."""
+"""Records of statistical bounds, certificates and counterexamples, as `--json` prints them."""
 
 from typing import Annotated, Any, Literal, TypeAlias, TypedDict
 
@@ -136,3 +136,50 @@ class CertificateCheck(TypedDict):
     inputs: list[DifferentEntry]
     numbers: list[str]
     software: list[DifferentEntry]
+
+
+class Violation(TypedDict):
+    """Simulation that violates a requirement; see `stlc.assurance.falsify.Counterexample`."""
+
+    margin: Num
+    half_step: Num | None
+    strategy: str
+    simulation: int
+
+
+class FalsifiedRequirement(TypedDict):
+    """Search for a violation of one requirement; see `stlc.assurance.falsify.Falsification`."""
+
+    name: str
+    verdict: Literal["violated", "open"]
+    simulations: int
+    least: Num
+    found: Violation | None
+    simpler: Violation | None
+    spurious: list[Violation]
+    coverage: float
+    rejected: int
+    seconds: float
+    strategies: dict[str, int]
+    file: str | None
+    replay: str | None
+
+
+class FalsifiedSystem(TypedDict):
+    """Searches for violations of the requirements of a system or run."""
+
+    target: str
+    simulations: int
+    seed: int
+    coordinates: int
+    requirements: list[FalsifiedRequirement]
+
+
+class ReplayedCounterexample(TypedDict):
+    """Counterexample that was simulated again, and how it differs from its trace."""
+
+    requirement: str
+    margin: Num
+    stored_margin: Num
+    identical: bool
+    different: list[str]

@@ -20,7 +20,13 @@ from typing import (
     is_typeddict,
 )
 
-from stlc.cli.framework.assured import Assurance, Certificate, CertificateCheck
+from stlc.cli.framework.assured import (
+    Assurance,
+    Certificate,
+    CertificateCheck,
+    FalsifiedSystem,
+    ReplayedCounterexample,
+)
 from stlc.cli.framework.plant_documents import PlantSimulation
 
 if TYPE_CHECKING:
@@ -391,45 +397,6 @@ class Plans(TypedDict):
     seconds: PlanSeconds
     evaluations: float
     trace: str
-
-
-class Violation(TypedDict):
-    margin: Num
-    half_step: Num | None
-    strategy: str
-    simulation: int
-
-
-class FalsifiedRequirement(TypedDict):
-    name: str
-    verdict: Literal["violated", "open"]
-    simulations: int
-    least: Num
-    found: Violation | None
-    simpler: Violation | None
-    spurious: list[Violation]
-    coverage: float
-    rejected: int
-    seconds: float
-    strategies: dict[str, int]
-    file: str | None
-    replay: str | None
-
-
-class FalsifiedSystem(TypedDict):
-    target: str
-    simulations: int
-    seed: int
-    coordinates: int
-    requirements: list[FalsifiedRequirement]
-
-
-class ReplayedCounterexample(TypedDict):
-    requirement: str
-    margin: Num
-    stored_margin: Num
-    identical: bool
-    different: list[str]
 
 
 class PlottedTrace(TypedDict):
