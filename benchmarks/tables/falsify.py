@@ -183,11 +183,15 @@ def _row(case: Case, results: Sequence[Mapping[str, Any]]) -> Row:
     missed = [float(each["least"]) for each in results if each["margin"] is None]
     halves = [float(each["half_step"]) for each in good if each["half_step"] is not None]
     return Row(
-        *(case.name, len(results), len(good)),
-        *(fmean(counts), median(counts), max(counts)) if counts else (None, None, None),
-        min(missed) if missed else None,
-        median(float(each["margin"]) for each in good) if good else None,
-        median(halves) if halves else None,
-        sum(int(each["spurious"]) for each in results),
-        case.published,
+        case.name,
+        len(results),
+        len(good),
+        mean=fmean(counts) if counts else None,
+        median=median(counts) if counts else None,
+        most=max(counts, default=None),
+        least=min(missed, default=None),
+        margin=median(float(each["margin"]) for each in good) if good else None,
+        half_step=median(halves) if halves else None,
+        spurious=sum(int(each["spurious"]) for each in results),
+        published=case.published,
     )

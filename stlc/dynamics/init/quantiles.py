@@ -54,7 +54,8 @@ class QuantileRows(Rows):
 
     def normals(self) -> Tensor:
         """Quantiles of the standard normal distribution at the next coordinate, (count,)."""
-        return torch.special.ndtri(self.uniforms().clamp(_INSIDE, 1.0 - _INSIDE))
+        found: Tensor = torch.special.ndtri(self.uniforms().clamp(_INSIDE, 1.0 - _INSIDE))
+        return found
 
     def index(self, count: int) -> Tensor:
         """Indices from 0 to `count` - 1 at the next coordinate, (self.count,)."""
