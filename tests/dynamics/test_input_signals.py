@@ -77,7 +77,11 @@ def test_held_signals_are_constant_within_a_step_and_linear_ones_are_not(make: M
 def test_c_agrees_with_torch_and_gradients_with_differences(make: Make) -> None:
     system = make(SIGNALS)
     task = Task.of(
-        stlc.parse("signal x [m]\nsignal bend [km/h]\nrequire r: always x < 1 m and bend < 8 km/h"), system
+        stlc.parse(
+            "signal x [m]\nsignal bend [km/h]\nsignal load\n"
+            "require r: always (x < 1 m and bend < 8 km/h and load < 1.9)"
+        ),
+        system,
     )
     x0 = task.sample(20, seed=2, dtype=torch.float64)
     assert task.native is not None

@@ -6,7 +6,7 @@ and `LANES` trajectories are computed at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from stlc.compile.backends.c.climb import CLIMB
@@ -16,6 +16,7 @@ from stlc.compile.backends.c.plan import Plan, Storage, plan_of
 from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import leaves
 from stlc.compile.schedule.schedule import End
 
 LANES = 16
@@ -84,10 +85,13 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula], end: End = "strict") ->
     """
     plan = plan_of(formulas, motion.steps + 1, end)
     states, rules, steps = len(motion.states), len(formulas), motion.steps
+    read = {leaf.name for formula in formulas for leaf in leaves(formula) if not isinstance(leaf, ir.Const)}
+    moving = ", ".join(str(int(name in motion.next)) for name in motion.states)
     return "\n".join(
         [
             HEAD,
-            *passes(motion, plan),
+            f"static const int MOVING[] = {{{moving}}};",
+            *passes(motion, plan, read),
             (_DRIVER + CLIMB).format(
                 states=states,
                 controls=len(motion.controls),
@@ -104,8 +108,11 @@ def state_index(motion: Motion) -> dict[str, int]:
     return {name: i for i, name in enumerate(motion.states)}
 
 
-def passes(motion: Motion, plan: Plan) -> list[str]:
-    """Return the lines of the C functions `roll` (computes states) and `check` (computes robustness)."""
+def passes(motion: Motion, plan: Plan, read: Collection[str] | None = None) -> list[str]:
+    """Return the lines of the C functions `roll` (computes states) and `check` (computes robustness).
+
+    States that do not change are copied from the first sample to all others, or only those in `read`.
+    """
     blocks = forward_blocks(plan, state_index(motion))
     return [
         "typedef double lane[LANES];",
@@ -115,6 +122,11 @@ def passes(motion: Motion, plan: Plan) -> list[str]:
         f"  for (int k = 0; k < {motion.steps}; ++k) LANE {{",
         *(f"    {line}" for line in _step(motion)),
         "  }",
+        *(
+            f"  for (int k = 0; k < {motion.steps}; ++k) LANE x[{i}][k + 1][j] = x[{i}][0][j];"
+            for name, i in state_index(motion).items()
+            if name not in motion.next and (read is None or name in read)
+        ),
         "}",
         *in_parts(CHECK, blocks, declared(plan)),
     ]
@@ -173,11 +185,11 @@ CHECK = Frame(
 )
 
 
-def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
+def place_in_step(motion: Motion, *, first: frozenset[str] = frozenset()) -> Callable[[Leaf], str | None]:
     """Return the function that maps a state or control to its C expression in a step.
 
-    The C expression is for sample `k` and trajectory `j`. For anything but a state or control, such as a
-    function call, the returned function gives None.
+    The C expression is for sample `k` and trajectory `j`; for the states in `first`, it is for the first
+    sample. For anything but a state or control, such as a function call, the returned function gives None.
     """
     index = state_index(motion)
 
@@ -185,24 +197,26 @@ def place_in_step(motion: Motion) -> Callable[[Leaf], str | None]:
         if not isinstance(leaf, ir.Signal):
             return None
         if leaf.name in index:
-            return f"x[{index[leaf.name]}][k][j]"
+            return f"x[{index[leaf.name]}][{0 if leaf.name in first else 'k'}][j]"
         return f"u[{motion.controls.index(leaf.name)}][k][j]"
 
     return place
 
 
 def _step(motion: Motion) -> list[str]:
-    """C code of a step of one trajectory: from sample k to sample k + 1."""
+    """C code of a step of one trajectory: from sample k to sample k + 1.
+
+    States that do not change are read at the first sample; they are copied to the others later.
+    """
     index = state_index(motion)
-    writer = NumberWriter(place_in_step(motion))
+    writer = NumberWriter(place_in_step(motion, first=frozenset(index) - motion.next.keys()))
     for name, num in motion.lets:
         writer.bound[name] = writer.number(num)
     after = {name: writer.number(num) for name, num in motion.next.items()}
     moved = [
         f"x[{index[name]}][k + 1][j] = {value}; bad[j] += NAN_IN({value});" for name, value in after.items()
     ]
-    still = [f"x[{i}][k + 1][j] = x[{i}][k][j];" for name, i in index.items() if name not in after]
-    return [*writer.lines, *moved, *still]
+    return [*writer.lines, *moved]
 
 
 _DRIVER = """
@@ -230,7 +244,7 @@ int judge(int64_t batch, int64_t first, int64_t last, const double *x0, const do
       rho[(at + j) * R + i] = bad[j] > 0.0 ? NAN : out[i][j];
     if (columns)
       for (int i = 0; i < N; ++i) for (int k = 0; k <= T; ++k) for (int j = 0; j < here; ++j)
-        columns[((int64_t)i * (T + 1) + k) * batch + at + j] = x[i][k][j];
+        columns[((int64_t)i * (T + 1) + k) * batch + at + j] = x[i][MOVING[i] ? k : 0][j];
   }}
   free(x); free(v); free(room); free(out);
   return 0;
