@@ -6,7 +6,7 @@ import json as json_text
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
@@ -22,6 +22,7 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import PULSE, Answer, emit
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.escape import visible
 from stlc.registry import closest
 
 if TYPE_CHECKING:
@@ -32,8 +33,11 @@ if TYPE_CHECKING:
     from stlc.assurance.drive_simulator import DriveSimulator
     from stlc.assurance.falsify import Counterexample, Falsification
     from stlc.assurance.model_simulator import ModelSimulator
+    from stlc.assurance.plant_simulator import PlantSimulator
     from stlc.controller.guard.candidates import Mode
     from stlc.trace import Trace
+
+    _Simulator: TypeAlias = ModelSimulator | DriveSimulator | PlantSimulator
 
 FORMAT = "stlc-counterexample/1"
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
@@ -50,6 +54,9 @@ def falsify(
         typer.Argument(metavar="SPEC|RUN", help="A specification of a system without controls, or a run."),
     ] = "latest",
     system: SystemOption = None,
+    plant: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A black box instead of a system (docs/plants.md).")
+    ] = None,
     require: RequireOption = None,
     simulations: Annotated[
         int, typer.Option(min=1, metavar="N", help="Simulations per requirement at most.")
@@ -86,7 +93,7 @@ def falsify(
     from stlc.assurance.falsify import SearchBudget
     from stlc.assurance.falsify import falsify as search
 
-    made = _Target(target, system, guard, agents, steps, scenario, seed)
+    made = _Target(target, system, plant, guard, agents, steps, scenario, seed)
     if replay is not None:
         return _replayed(made, replay, parse_overrides(set_), runs)
     limit = None if time is None else parse_seconds(time)
@@ -104,9 +111,10 @@ def falsify(
         "simulations": simulations,
         "seed": seed,
         "coordinates": simulator.space.dim,
+        "failures": _failures(simulator),
         "requirements": found,
     }
-    violated = any(each["verdict"] == "violated" for each in found)
+    violated = any(each["verdict"] == "violated" for each in found) or bool(document["failures"])
     return Answer(document, lambda: emit("\n".join(_lines(document))), int(violated))
 
 
@@ -116,6 +124,7 @@ class _Target:
 
     name: str
     system: str | None
+    plant: Path | None
     guard: str
     agents: int | None
     steps: int | None
@@ -127,12 +136,14 @@ class _Target:
         """Whether the target is a specification, rather than a run."""
         return self.name.endswith((".stl", ".stlc"))
 
-    def simulator(self, overrides: Mapping[str, str], runs: Path) -> ModelSimulator | DriveSimulator:
+    def simulator(self, overrides: Mapping[str, str], runs: Path) -> _Simulator:
         """Load the simulator.
 
         Raises:
             UsageError: U101, an option does not suit the target.
         """
+        if self.plant is not None:
+            return self._black_box(self.plant, overrides)
         if self.model:
             from stlc.assurance.model_simulator import ModelSimulator
 
@@ -156,6 +167,16 @@ class _Target:
         test = run.task.system.decl.test
         size = self.agents or test.agents, self.steps or test.steps
         return DriveSimulator(run, _mode(self.guard), Setting((self.seed,), *size, test.replan))
+
+    def _black_box(self, plant: Path, overrides: Mapping[str, str]) -> PlantSimulator:
+        from stlc.assurance.plant_simulator import PlantSimulator
+
+        if not self.model:
+            raise usage("`--plant` needs a specification", "stlc falsify SPEC --plant FILE")
+        for option in ("system", "agents", "steps", "scenario"):
+            if getattr(self, option) is not None:
+                raise usage(f"`--{option}` and `--plant` contradict each other")
+        return PlantSimulator.load(self.name, plant, overrides)
 
     def settings(self) -> dict[str, Any]:
         """Settings of the simulations that a replay needs."""
@@ -190,11 +211,17 @@ def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:
     return [index for index, name in enumerate(names) if not require or name in require]
 
 
+def _failures(simulator: _Simulator) -> list[str]:
+    """Reasons of the failed simulations of a black box, each once."""
+    found = getattr(simulator, "findings", ())
+    return list(dict.fromkeys(f"{each.reason}: {each.message}" for each in found))
+
+
 # ------------------------------------------------------------------------ counterexamples
 
 
 def _written(
-    target: _Target, simulator: ModelSimulator | DriveSimulator, result: Falsification, folder: Path
+    target: _Target, simulator: _Simulator, result: Falsification, folder: Path
 ) -> FalsifiedRequirement:
     """Write the counterexample of a requirement, if there is one, and return its record."""
     from stlc.escape import file_part
@@ -246,6 +273,8 @@ def _violation(found: Counterexample) -> Any:
 def _command(target: _Target, path: Path) -> str:
     """Command that replays a counterexample."""
     words = ["stlc", "falsify", target.name]
+    if target.plant is not None:
+        words += ["--plant", str(target.plant)]
     if target.system is not None:
         words += ["--system", target.system]
     return shlex.join([*words, "--replay", str(path)])
@@ -260,7 +289,7 @@ def _replayed(
     stored = _stored(path)
     given = stored["settings"]
     again = _Target(
-        *(target.name, target.system, str(given.get("guard", "none"))),
+        *(target.name, target.system, target.plant, str(given.get("guard", "none"))),
         *(_optional(given.get("agents")), _optional(given.get("steps"))),
         None if given.get("scenario") is None else str(given["scenario"]),
         _optional(given.get("seed")) or 0,
@@ -355,7 +384,7 @@ def _lines(document: FalsifiedSystem) -> list[str]:
     lines = []
     for each in document["requirements"]:
         lines.extend(_of_requirement(each))
-    return lines
+    return [*lines, *(f"the plant failed: {visible(each)}" for each in document["failures"])]
 
 
 def _of_requirement(each: FalsifiedRequirement) -> list[str]:

@@ -172,6 +172,7 @@ class FalsifiedSystem(TypedDict):
     simulations: int
     seed: int
     coordinates: int
+    failures: list[str]
     requirements: list[FalsifiedRequirement]
 
 

@@ -1,0 +1,143 @@
+"""Falsification of systems without controls and of black boxes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stlc.assurance.falsify import SearchBudget, falsify
+from stlc.assurance.guidance import ScaledRobustness
+from stlc.assurance.model_simulator import ModelSimulator
+from stlc.assurance.plant_simulator import PlantSimulator
+from stlc.cli.framework.app import main
+from stlc.trace import load_trace
+
+SYSTEM = """
+stlc: 1
+name: oscillator
+time: {dt: 0.05 s, horizon: 200 steps, integrator: rk4}
+inputs: {f: {range: [-1, 1], pieces: 10, duration: 10 s}}
+state: {x: {range: [-9, 9]}, v: {range: [-9, 9]}}
+flow: {x: v, v: "f - x - 0.2 * v"}
+init: {mixture: [{draw: {x: "uniform(-0.1, 0.1)", v: 0}}]}
+"""
+SPEC = """
+system "oscillator.yaml"
+signal x, v, f
+require resonance: always[0 s, 10 s] x < 2.2
+require bounded: always[0 s, 10 s] x < 50
+require early: always[0 s, 2 s] x < 0.9
+require mixed: always[0 s, 5 s] (x < 1.5 or 1000 * v < 500)
+"""
+PLANT = """
+plant: 1
+name: fall
+python: "fall.py:rates"
+time: {dt: 50 ms, duration: 1 s}
+initial: {h: {range: [1, 3]}, w: {value: 0}}
+input: {lift: {range: [0, 4], pieces: 4}}
+output: {h: {}, w: {}}
+"""
+FALL = """
+def rates(t, x, u):
+    if x[0] < -3:
+        raise RuntimeError("below the ground")
+    return [x[1], u[0] - 9.81]
+"""
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("oscillator.yaml").write_text(SYSTEM)
+    Path("oscillator.stl").write_text(SPEC)
+    return tmp_path
+
+
+def test_resonance_is_found_at_half_the_step_too_and_shrunk():
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    (block,) = simulator.space.blocks
+    assert (block.name, len(block.values), simulator.space.dim) == ("f", 10, 11)
+    found = falsify(simulator, 0, budget=SearchBudget(200), seed=3)
+    assert found.found is not None
+    assert found.found.margin < 0.0
+    assert found.found.half_step == pytest.approx(found.found.margin, abs=0.01)
+    assert found.shrunk is not None
+    assert found.shrunk.margin < 0.0
+    assert len(np.unique(found.shrunk.point)) <= len(np.unique(found.found.point))
+    again = falsify(ModelSimulator.load("oscillator.stl", None, {}), 0, budget=SearchBudget(200), seed=3)
+    assert np.array_equal(again.found.point, found.found.point)
+
+
+def test_inputs_after_the_last_sample_that_matters_are_not_searched():
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    assert simulator.seen(simulator.requirements.index("early")) == pytest.approx(0.2)
+    found = falsify(simulator, 2, budget=SearchBudget(30), seed=0)
+    assert found.found is not None
+    assert (found.found.point[2:10] == 0.5).all() or (found.found.point[3:] == 0.5).all()
+
+
+def test_a_search_without_success_reports_what_it_did():
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    found = falsify(simulator, 1, budget=SearchBudget(12), seed=0)
+    assert (found.found, found.simulations) == (None, 12)
+    assert sum(found.strategies.values()) == 12
+    assert 0.0 < found.coverage < 1.0
+    assert 45.0 < found.least < 50.0
+
+
+def test_guidance_has_the_sign_of_the_margin_and_scales_the_larger_predicate():
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    index = simulator.requirements.index("mixed")
+    points = np.random.default_rng(0).random((30, simulator.space.dim))
+    outcomes = [simulator.simulate(point[None]) for point in points]
+    margins = np.array([each.margins[0, index] for each in outcomes])
+    guides = np.array([each.guidance[0, index] for each in outcomes])
+    assert ((margins < 0.0) == (guides < 0.0)).all()
+    assert not np.allclose(margins[15:], guides[15:])
+    assert ScaledRobustness(simulator.task.rules[0].formula).settled  # one predicate needs no scale
+
+
+def test_the_command_writes_what_it_can_replay(capsys):
+    assert main(["falsify", "oscillator.stl", "--require", "early", "--simulations", "30"]) == 1
+    assert "early: violated, robustness -" in capsys.readouterr().out
+    assert main(["check", "counterexamples/early.npz", "--require", "early"]) == 1
+    assert main(["falsify", "oscillator.stl", "--replay", "counterexamples/early.json"]) == 1
+    assert "bit for bit" in capsys.readouterr().out
+    stored = json.loads(Path("counterexamples/early.json").read_text())
+    trace = load_trace("counterexamples/early.npz")
+    assert float((0.9 - trace.data["x"][0, :41]).min()) == pytest.approx(stored["margin"], abs=1e-9)
+    Path("oscillator.yaml").write_text(SYSTEM.replace("0.2 * v", "0.1 * v"))
+    main(["falsify", "oscillator.stl", "--replay", "counterexamples/early.json"])
+    assert "different: x, v" in capsys.readouterr().out
+
+
+@pytest.fixture
+def fall() -> None:
+    Path("fall.yaml").write_text(PLANT)
+    Path("fall.py").write_text(FALL)
+    Path("fall.stl").write_text(
+        "signal h\nrequire up: always[0 s, 0.6 s] h > 0\nrequire deep: always[0 s, 1 s] h > -50\n"
+    )
+
+
+@pytest.mark.usefixtures("fall")
+def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
+    simulator = PlantSimulator.load("fall.stl", Path("fall.yaml"), {})
+    with simulator.plant:
+        assert [block.name for block in simulator.space.blocks] == ["lift"]
+        outcome = simulator.simulate(np.stack([np.ones(5), np.zeros(5)]))
+    assert outcome.admissible.tolist() == [True, False]
+    assert "below the ground" in simulator.findings[0].message
+    assert main(["falsify", "fall.stl", "--plant", "fall.yaml", "--simulations", "20"]) == 1
+    text = capsys.readouterr().out
+    assert "up: violated, robustness -" in text
+    assert "deep: no violation in 20 simulations" in text
+    assert "the plant failed: " in text
+    replay = ["--plant", "fall.yaml", "--replay", "counterexamples/up.json"]
+    assert main(["falsify", "fall.stl", *replay]) == 1
+    assert "bit for bit" in capsys.readouterr().out
+    assert main(["falsify", "latest", "--plant", "fall.yaml"]) == 2
