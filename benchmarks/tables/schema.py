@@ -19,7 +19,7 @@ from benchmarks.formulas import Timing
 from benchmarks.plannings import PlanRow
 from benchmarks.repairs import Mended
 from benchmarks.steps import Speed, StepTiming
-from benchmarks.tables import ablation, certificates, falsify, family, latency, paper
+from benchmarks.tables import ablation, certificates, falsify, family, latency, paper, uncertain
 from stlc.cli.framework.documents import DocumentRecord, Num, schema_of
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
@@ -61,6 +61,7 @@ ROWS: dict[str, dict[str, type]] = {
     "repair": {"rows": Mended},
     "step": {"steps": StepTiming, "speeds": Speed},
     "robustness": {"rows": Timing},
+    "uncertain": {"rows": uncertain.Overhead},
     "gym": {"rows": EpisodeSpeed},
     "certificates": {"rows": certificates.Row},
 }

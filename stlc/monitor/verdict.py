@@ -31,6 +31,7 @@ from stlc.monitor.instants import (
 )
 from stlc.monitor.judgement import Bools, Judgement, Prepared, Status, Verdict, unknown_requirement
 from stlc.monitor.signals import Given, Need, arrange, needs_of, reading_of
+from stlc.monitor.uncertain import Uncertainties, outer, uncertain_record
 from stlc.monitor.values import Ends, Record, by_truth
 from stlc.source import Source
 from stlc.trace import Trace, load_trace
@@ -115,6 +116,7 @@ class Monitor:
         tolerance: float = TOLERANCE,
         require: Sequence[str] = (),
         semantics: str | Semantics = "exact",
+        uncertain: Uncertainties | None = None,
     ) -> Verdict:
         """Evaluate every requirement at the instants that it prescribes (`stlc.monitor.instants`).
 
@@ -129,14 +131,20 @@ class Monitor:
             require: names of the requirements to evaluate; empty: all.
             semantics: semantics of the reported robustness, or its name; verdicts and causes are always
                 exact.
+            uncertain: greatest errors of signals. Robustness and verdicts are then bounds over all samples
+                within these errors; causes are those of the samples as they are.
 
         Raises:
             TraceError: signals are missing (E601), infinite (E604), or do not fit together (E605); with `end`
                 "strict", the trace is too short (E306).
-            UsageError: U101, an unknown requirement or semantics, or a sample number beyond the trace.
+            UsageError: U101, an unknown requirement or semantics, a sample number beyond the trace, or an
+                uncertainty that does not fit (`stlc.monitor.uncertain`).
         """
         reported = semantics_of(semantics)
+        if uncertain and not reported.exact:
+            raise UsageError(Diagnostic("U101", "uncertain signals have bounds in exact semantics only"))
         ready = self._prepare(signals, require, plain=True)
+        judged = _with_errors(ready, uncertain) if uncertain else ready
         samples = ready.signals.samples
         starts = [starts_of(rule, samples, ready.horizon, at) for rule in ready.rules]
         if end == "strict":
@@ -145,13 +153,13 @@ class Monitor:
             if any(findings):
                 raise TraceError(*filter(None, findings))
         judgements = [
-            _judge(rule, ready, its, "truncate" if end == "truncate" else "open", tolerance)
+            _judge(rule, judged, its, "truncate" if end == "truncate" else "open", tolerance)
             for rule, its in zip(ready.rules, starts, strict=True)
         ]
         if not reported.exact:
             ready = ready.under(reported)
             judgements = [_reported(judgement, ready, end) for judgement in judgements]
-        return Verdict(tuple(judgements), ready).within(_scope(ready, tolerance))
+        return Verdict(tuple(judgements), ready).within(_scope(judged, tolerance))
 
     def robustness(
         self,
@@ -328,16 +336,22 @@ def _scope(ready: Prepared, tolerance: float) -> Bools:
     return scope
 
 
+def _with_errors(ready: Prepared, uncertain: Uncertainties) -> Prepared:
+    compiled = ready.compiled
+    rules = (*ready.rules, *compiled.assumptions)
+    return replace(ready, record=uncertain_record(ready.record, uncertain, compiled, rules))
+
+
 def _judge(
     rule: CompiledRequirement, ready: Prepared, starts: range, ends: Ends, tolerance: float
 ) -> Judgement:
-    low, high = rule_bounds(rule, ready.record, starts, ready.horizon, ends)
+    low, high = outer(*rule_bounds(rule, ready.record, starts, ready.horizon, ends))
     if tolerance > 0:
         holds = low >= -tolerance
         fails = high < -tolerance
     else:
         plain = replace(rule, formula=by_truth(rule.formula))
-        least, most = rule_bounds(plain, ready.record, starts, ready.horizon, ends)
+        least, most = outer(*rule_bounds(plain, ready.record, starts, ready.horizon, ends))
         holds, fails = least > 0, most < 0
     return Judgement(rule, starts.start, low, high, holds, fails, ready.signals.shape)
 

@@ -49,6 +49,10 @@ def result_record(result: Checked, end: str) -> documents.CheckedTrace:
         verdict.subject.gaps,
         verdict.subject.time,
         end=end,
+        uncertain={
+            name: record(documents.UncertainSignal, error, unit=error.unit.text)
+            for name, error in result.uncertain.items()
+        },
         traces=verdict.traces,
         samples=result.trace.samples,
         in_scope=verdict.in_scope,
@@ -90,6 +94,7 @@ def trace_record(
             signal: {"samples": gap.samples, "first": time(gap.first), "last": time(gap.last)}
             for signal, gap in gaps.items()
         },
+        "uncertain": {},
         **found,
     }
     return record(documents.CheckedTrace, None, **made)

@@ -19,6 +19,7 @@ from stlc.source import Source
 if TYPE_CHECKING:
     from stlc.cli.check.outcome import Checked
     from stlc.monitor.instants import At
+    from stlc.monitor.uncertain import Uncertainty
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Reading
     from stlc.trace.meta import Carried
@@ -48,6 +49,7 @@ class Question:
         semantics: name of the semantics of the reported robustness, such as "exact".
         dt: seconds between samples of a trace without times.
         max_gap: longest time between two samples, in seconds, over which signals count as known.
+        uncertain: signal -> greatest error of its samples.
     """
 
     spec: Path | None = None
@@ -62,6 +64,7 @@ class Question:
     semantics: str = "exact"
     dt: float | None = None
     max_gap: float | None = None
+    uncertain: Mapping[str, Uncertainty] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +132,11 @@ def judge(name: str, question: Question, runs: Path) -> Checked:
         tolerance=question.tolerance,
         require=question.require,
         semantics=question.semantics,
+        uncertain=question.uncertain,
     )
     remarks = (*_newest_remark(name, path), *([note] if note else ()))
-    return Checked(trace, source, verdict, explain_all(verdict), _options(question), remarks)
+    causes, options = explain_all(verdict), _options(question)
+    return Checked(trace, source, verdict, causes, options, remarks, question.uncertain)
 
 
 def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
@@ -151,6 +156,8 @@ def _options(question: Question) -> tuple[str, ...]:
     times = {"--resample": question.resample, "--dt": question.dt, "--max-gap": question.max_gap}
     for option, seconds in times.items():
         words += [] if seconds is None else [option, f"{seconds:.10g}s"]
+    for signal, error in question.uncertain.items():
+        words += ["--uncertain", f"{signal}={str(error).replace(' ', '')}"]
     return tuple(words)
 
 
@@ -250,6 +257,23 @@ def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int |
         last = "" if samples is None else f" to {t0 + (samples - 1) * dt:g} s"
         raise usage(f"`{name}` has no sample at {text}", f"it runs from {t0:g} s{last} every {dt:g} s")
     return sample
+
+
+def uncertainties(pairs: Mapping[str, str]) -> dict[str, Uncertainty]:
+    """Parse the values of `--uncertain`: signal -> text such as `0.1m` or `2%`.
+
+    Raises:
+        UsageError: U101, a text is not an amount, or its unit is unknown.
+    """
+    from stlc.monitor.uncertain import Uncertainty
+
+    found = {}
+    for name, text in pairs.items():
+        try:
+            found[name] = Uncertainty.parse(text)
+        except ValueError as error:
+            raise usage(f"`--uncertain {name}={text}`: {error}", "write --uncertain x=0.1m") from None
+    return found
 
 
 def time_step(option: str, text: str | None) -> float | None:

@@ -70,6 +70,8 @@ def outcome_of(work: Work) -> Outcome:
     begun = time.perf_counter()
     path = found(work.name, work.runs)
     if work.chunk or _too_large(path):
+        if work.question.uncertain:
+            raise usage(f"`--uncertain` needs the whole trace, and {path} does not fit into memory")
         from stlc.cli.check.online import outcome_in_chunks
 
         return with_sample(outcome_in_chunks(path, work)) if work.certify else outcome_in_chunks(path, work)

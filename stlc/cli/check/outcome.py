@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from stlc.cli.framework.documents import CheckedTrace, InvalidTrace
@@ -16,6 +16,7 @@ from stlc.trace import Trace
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Sample
     from stlc.monitor.judgement import Status
+    from stlc.monitor.uncertain import Uncertainty
 
 WORDS: dict[Status, str] = {
     "satisfied": "satisfied",
@@ -137,6 +138,7 @@ class Checked:
         causes: name of a violated requirement -> cause of the violation.
         options: command-line options of reading and judging.
         remarks: messages for the user.
+        uncertain: signal -> greatest error of its samples.
     """
 
     trace: Trace
@@ -145,6 +147,7 @@ class Checked:
     causes: Mapping[str, Cause]
     options: tuple[str, ...]
     remarks: tuple[str, ...]
+    uncertain: Mapping[str, Uncertainty] = field(default_factory=dict)
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:

@@ -46,7 +46,7 @@ def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> 
     ending, folder = [_summary(verdict)], Path(trace.name).parent
     if (folder / "run.json").is_file():
         ending.append(f"next: {shell(('stlc', 'report', str(folder)))}")
-    gaps = _gap_texts(result).values()
+    gaps = (*_error_texts(result), *_gap_texts(result).values())
     return text_of(title, rows, gaps, reasons, ending, several=verdict.traces > 1)
 
 
@@ -64,7 +64,7 @@ def text_of(
     Args:
         title: first line.
         rows: results of the requirements.
-        gaps: lines about unknown samples, one line per signal.
+        gaps: lines about unknown and uncertain samples, one line per signal.
         reasons: paragraphs on requirements that are not satisfied.
         ending: last lines.
         several: whether the file has several traces.
@@ -132,7 +132,8 @@ def rows_of(result: Checked) -> tuple[VerdictRow, ...]:
         if judged.counted(judged.least).size:
             unit = judged.unit or ("" if cause is None else cause.unit)
             least = low if status == "inconclusive" else float(judged.counted(judged.least).min())
-            robustness = robustness_text(status, low, high, least, unit)
+            shown = "inconclusive" if result.uncertain else status
+            robustness = robustness_text(shown, low, high, least, unit)
         share = "" if judged.holds.size == 1 else percent(judged.share)
         why = _inconclusive(judged, result) if status == "inconclusive" else ""
         why, where = why if cause is None else cause.because, _where(judged, result)
@@ -171,6 +172,10 @@ def _gap_texts(result: Checked) -> dict[str, str]:
     }
 
 
+def _error_texts(result: Checked) -> list[str]:
+    return [f"`{visible(name)}` may be off by {error}" for name, error in result.uncertain.items()]
+
+
 def _inconclusive(judged: Judgement, result: Checked) -> str:
     name = visible(judged.name)
     last = judged.start + judged.instants - 1 + judged.rule.reach
@@ -183,6 +188,8 @@ def _inconclusive(judged: Judgement, result: Checked) -> str:
         return (
             f"{name} is inconclusive: it needs {needed:.6g} s of signal, the trace has {length:.6g} s{more}."
         )
+    if result.uncertain:
+        return f"{name} is inconclusive: the errors of the signals decide it."
     return f"{name} is inconclusive: it has no value where it was judged."
 
 

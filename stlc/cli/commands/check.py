@@ -13,10 +13,10 @@ import typer
 
 from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
 from stlc.cli.check import options as given
-from stlc.cli.check.judge import End, Work
+from stlc.cli.check.judge import End, Work, uncertainties
 from stlc.cli.framework.assured import Assurance
 from stlc.cli.framework.documents import CheckResult
-from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption
+from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption, parse_pairs
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import usage
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     "stlc check specs/traffic.stl drive.csv --require give_way",
     "stlc check specs/traffic.stl drives/*.parquet --jobs 0 --junit checks.xml",
     "stlc check specs/traffic.stl logs/*.csv --certify .95",
+    "stlc check specs/traffic.stl drive.csv --uncertain dx=0.1m --uncertain v=2%",
     "stlc check specs/traffic.stl bag.mcap --resample 0.1s --map dx=lead.gap",
 )
 def check(
@@ -58,6 +59,10 @@ def check(
     tolerance: Annotated[
         float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
     ] = 1e-6,
+    uncertain: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SIGNAL=ERROR", help="Greatest error of each sample, as x=0.1m or v=2%."),
+    ] = None,
     fail_under: FailUnderOption = None,
     certify: CertifyOption = None,
     out: Annotated[
@@ -101,7 +106,14 @@ def check(
     require_claim(certify, fail_under)
     if certify is not None and STDIN in traces:
         raise usage("`--certify` needs several traces, and the standard input is one")
-    question = reading.question(spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics)
+    errors = uncertainties(parse_pairs(uncertain, "--uncertain", "SIGNAL=ERROR", "x=0.1m"))
+    if errors and (STDIN in traces or chunk):
+        raise usage("`--uncertain` needs the whole trace, and this one is judged in pieces")
+    if errors and out is not None:
+        raise usage("`--out` writes the robustness of the samples as they are: leave `--uncertain` out")
+    question = reading.question(
+        spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics, uncertain=errors
+    )
     talk = not (QUIET.get() or json)
     if STDIN in traces:
         from stlc.cli.check.online import outcome_of_stream

@@ -16,7 +16,8 @@ PROGRAM = Program(
     ),
     package="stlc.cli.commands",
     order=(
-        *("train", "simulate", "certify", "check", "explain", "plot", "report", "runs", "export"),
+        *("train", "simulate", "falsify", "certify", "verify"),
+        *("check", "explain", "plot", "report", "runs", "export"),
         *("init", "lint", "fmt", "compile", "system", "lsp", "schema", "doctor", "help"),
     ),
     moved={

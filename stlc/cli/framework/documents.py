@@ -118,6 +118,12 @@ class CheckedRequirement(TypedDict):
     cause: CauseRecord | None
 
 
+class UncertainSignal(TypedDict):
+    absolute: Num
+    relative: Num
+    unit: str
+
+
 class CheckedTrace(TypedDict):
     assurance: NotRequired[Assurance]
     trace: str
@@ -129,6 +135,7 @@ class CheckedTrace(TypedDict):
     traces: int
     samples: int
     unknown: dict[str, UnknownSamples]
+    uncertain: dict[str, UncertainSignal]
     in_scope: int
     verdict: Literal["satisfied", "violated", "inconclusive", "out of scope"]
     robustness: Num | None
@@ -301,6 +308,27 @@ class ExportCheck(TypedDict):
 class ExportLatency(TypedDict):
     median_ms: float
     p99_ms: float
+
+
+class VerifiedMode(TypedDict):
+    name: str
+    probability: Num
+    proved: Num
+    refuted: Num
+    open: Num
+    proved_boxes: int
+    examined_boxes: int
+    witness: dict[str, Num] | None
+    robustness: Num | None
+
+
+class Verified(TypedDict):
+    run: str
+    seconds: Num
+    proved: Num
+    refuted: Num
+    open: Num
+    modes: list[VerifiedMode]
 
 
 class ExportedRun(TypedDict):
@@ -738,6 +766,7 @@ RESULTS: dict[str, Any] = {
     "stlc": NoneType,
     "system": SystemList | SystemFacts,
     "train": TrainedRun | TrainedRuns,
+    "verify": Verified,
 }
 """The result of each command's document, by the name of its schema."""
 LINES: dict[str, Any] = {"robustness-line": RobustnessLine}

@@ -37,7 +37,7 @@ from stlc.version import __version__
 COMMANDS = (
     *("train", "simulate", "plan", "check", "explain", "plot", "report", "runs"),
     *("init", "lint", "fmt", "compile", "system", "lsp", "schema", "doctor", "help"),
-    *("export", "certify"),
+    *("export", "certify", "falsify", "verify"),
 )
 HEAVY = {"torch", "numpy", "matplotlib", "lark", "yaml", "rich"}
 

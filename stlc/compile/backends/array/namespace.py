@@ -1,8 +1,8 @@
 """The array operations that the evaluators need, as an interface to array libraries.
 
-`stlc.compile.backends.array.numpy_ops` and `stlc.compile.backends.torch.ops` implement it. Operands named
-`x`, `a`, `b` are arrays; a float is allowed where a method says so. Operators (`a + b`, `a * 2.0`) are used
-directly.
+`stlc.compile.backends.array.numpy_ops` and `stlc.compile.backends.torch.ops` implement it; for intervals,
+`stlc.compile.backends.array.interval_ops`. Operands named `x`, `a`, `b` are arrays; a float is allowed where
+a method says so. Operators (`a + b`, `a * 2.0`) are used directly.
 """
 
 from __future__ import annotations

@@ -1,0 +1,110 @@
+"""`stlc verify`: proofs that a trained policy satisfies its specification, on boxes of initial states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stlc.cli.framework.documents import Verified, VerifiedMode
+from stlc.cli.framework.options import FailUnderOption, RunArgument, RunsOption, parse_seconds
+from stlc.cli.framework.output import PULSE, Answer, emit, table
+from stlc.cli.framework.program import command
+from stlc.escape import visible
+
+if TYPE_CHECKING:
+    from stlc.controller.verification.verify import ModeResult, Verification
+
+_MOST = 3
+"""Counterexamples that the text shows."""
+
+
+@command("stlc verify latest", "stlc verify traffic --budget 10min --fail-under 0.5")
+def verify(
+    run: RunArgument = "latest",
+    budget: Annotated[str, typer.Option(metavar="TIME", help="Time of the search for proofs.")] = "60s",
+    boxes: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Boxes of each mode to examine at most.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the sampled states.")] = 0,
+    fail_under: FailUnderOption = None,
+    runs: RunsOption = Path("runs"),
+) -> Answer[Verified]:
+    """Prove plans of a trained policy on boxes of states.
+
+    Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion and
+    robustness show that one proposal of the network satisfies the specification from every state in it. It is
+    refuted if the policy violates the specification from a sampled state. More time proves more. Exit code: 0
+    all proved, 1 a counterexample was found, 4 open; with --fail-under, 0 if at least that share is proved.
+    """
+    import torch
+
+    from stlc.controller.training.run import Run
+    from stlc.controller.verification.verify import Verifier
+
+    torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
+    seconds = parse_seconds(budget)
+    opened = Run.open(run, root=runs)
+    verifier = Verifier(opened.task, opened.policy, seed=seed)
+    with PULSE.doing("proving"):
+        found = verifier.run(seconds, boxes=boxes)
+    record = _record(opened.dir.shown, found)
+    return Answer(record, lambda: emit("\n".join(_lines(record))), _exit_code(found, fail_under))
+
+
+def _exit_code(found: Verification, fail_under: float | None) -> int:
+    if fail_under is not None:
+        return 0 if found.proved >= fail_under else 1 if 1.0 - found.refuted < fail_under else 4
+    if any(each.witness is not None for each in found.modes):
+        return 1
+    return 4 if found.open > 0.0 else 0
+
+
+def _record(run: str, found: Verification) -> Verified:
+    return {
+        "run": run,
+        "seconds": found.seconds,
+        "proved": found.proved,
+        "refuted": found.refuted,
+        "open": found.open,
+        "modes": [_mode(each) for each in found.modes],
+    }
+
+
+def _mode(each: ModeResult) -> VerifiedMode:
+    return {
+        "name": each.mode.name,
+        "probability": each.mode.weight,
+        "proved": each.proved,
+        "refuted": each.refuted,
+        "open": each.open,
+        "proved_boxes": len(each.boxes),
+        "examined_boxes": each.examined,
+        "witness": None if each.witness is None else dict(each.witness.state),
+        "robustness": None if each.witness is None else each.witness.robustness,
+    }
+
+
+def _lines(found: Verified) -> Iterator[str]:
+    """Lines of text that show the result of `stlc verify`."""
+    shares = [(mode["proved"], mode["refuted"], mode["open"]) for mode in found["modes"]]
+    rows = [
+        (visible(mode["name"]), _percent(mode["probability"]), *map(_percent, each))
+        for mode, each in zip(found["modes"], shares, strict=True)
+    ]
+    rows.append(("all", *map(_percent, (1.0, found["proved"], found["refuted"], found["open"]))))
+    yield f"{visible(found['run'])}    {float(found['seconds']):.0f} s"
+    yield ""
+    yield table(rows, header=("initial states", "probability", "proved", "refuted", "open"))
+    known = [mode for mode in found["modes"] if mode["witness"] is not None]
+    for mode in sorted(known, key=lambda mode: float(mode["robustness"] or 0.0))[:_MOST]:
+        state = ", ".join(f"{name}={float(value):.6g}" for name, value in (mode["witness"] or {}).items())
+        least = float(mode["robustness"] or 0.0)
+        yield ""
+        yield f"{visible(mode['name'])}: violated from {visible(state)}, robustness {least:+.3g}"
+
+
+def _percent(share: float | str) -> str:
+    return f"{100.0 * float(share):.1f} %"

@@ -1,0 +1,469 @@
+"""Array operations on intervals: bounds on every value, and so on robustness, over a box of signals.
+
+The evaluators run unchanged over this array library. A condition on intervals is true, false or unknown; a
+choice by an unknown condition is the hull of both values. Extrema over windows and `until` are monotone in
+their operands, so each end of an interval is computed by NumPy with the same algorithms as for numbers.
+
+The functions of NumPy are within 4 units in the last place (the bound that its own tests assert for the
+vectorised ones). A value computed inside an interval and the value at its end may be off in opposite
+directions, hence `_ULPS` = 8. Elementary operations and the square root are rounded correctly (IEEE 754).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager
+from functools import partial, reduce
+from typing import Any, cast, final
+
+import numpy as np
+
+from stlc.compile.backends.array.interval import (
+    EPSILON,
+    TINY,
+    Belief,
+    Bools,
+    End,
+    Intervals,
+    Operand,
+    add,
+    corners,
+    div,
+    ends,
+    hull,
+    known,
+    magnitudes,
+    mul,
+    unbounded_where,
+    widened,
+    within,
+)
+from stlc.compile.backends.array.namespace import Ops, Sliding
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.windows import Windows
+from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.schedule.schedule import Pick
+from stlc.compile.semantics.kinds.exact import Exact
+from stlc.diagnostics import Diagnostic, UsageError
+
+_ULPS = 8.0
+"""Rounding error of functions, in units of the last place, both ways."""
+
+_ERROR = (_ULPS + 2.0) * EPSILON
+"""The same relative to the value: a unit in the last place is at most `EPSILON` times the value."""
+
+_SMALLEST = 1e-150
+"""Error of a norm whose squares are below the range of float64."""
+
+_TURN = 2.0 * np.pi
+
+_WINDOWS = Windows(Exact(), NUMPY)
+
+
+@final
+class IntervalOps:
+    """Implementation of `stlc.compile.backends.array.namespace.Ops` for `Intervals`, without gradients."""
+
+    name = "intervals"
+
+    add = staticmethod(add)
+    mul = staticmethod(mul)
+    div = staticmethod(div)
+    abs = staticmethod(magnitudes)
+
+    # ---------------------------------------------------------------------------- arithmetic
+
+    def sub(self, a: Operand, b: Operand) -> Intervals:
+        """`a - b`."""
+        return add(a, -b)
+
+    def square(self, x: Operand) -> Intervals:
+        """`x * x`."""
+        size = magnitudes(x)
+        found = widened(*_mapped(np.square, size), absolute=TINY)
+        return Intervals(np.maximum(found.low, 0.0), found.high)
+
+    def sqrt(self, x: Operand) -> Intervals:
+        """Square root; unknown where `x` may be negative."""
+        return widened(*_mapped(np.sqrt, x))
+
+    def pow(self, a: Operand, b: Operand) -> Intervals:
+        """`a ^ b`; unknown where `a` may be negative and `b` is not one whole number, and at a pole."""
+        if isinstance(b, float) and b.is_integer():
+            return _whole_power(a, b)
+        (a_low, _), (b_low, b_high) = ends(a), ends(b)
+        found = _widened(*corners(np.power, a, b))
+        whole = np.equal(b_low, b_high) & np.equal(np.floor(b_low), b_low) & np.less(a_low, 0.0)
+        if np.any(whole):
+            powers = _whole_power(a, np.where(whole, b_low, 1.0))
+            found = Intervals(
+                np.where(whole, powers.low, found.low), np.where(whole, powers.high, found.high)
+            )
+        return unbounded_where(np.less(a_low, 0.0) & ~whole, found)
+
+    def mod(self, a: Operand, b: Operand) -> Intervals:
+        """Floored modulo: unknown where `b` may be 0; the whole range of the remainder where it jumps."""
+        (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
+        first, last = np.mod(a_low, b_low), np.mod(a_high, b_low)
+        up = np.greater(b_low, 0.0)
+        rising = np.less_equal(first, last)
+        short = (a_high - a_low) <= np.abs(b_low) * (1.0 - 1e-9)
+        smooth = rising & short & np.equal(b_low, b_high)
+        error = np.maximum(np.abs(b_low), np.abs(b_high)) * 4.0 * EPSILON
+        low = np.where(smooth, first - error, np.where(up, 0.0, b_low))
+        high = np.where(smooth, last + error, np.where(up, b_high, 0.0))
+        return unbounded_where(np.less_equal(b_low, 0.0) & np.greater_equal(b_high, 0.0), known(low, high))
+
+    def atan2(self, a: Operand, b: Operand) -> Intervals:
+        """Angle of the point (b, a); all angles where the box of points reaches the cut or the origin."""
+        (y_low, y_high), (x_low, x_high) = ends(a), ends(b)
+        found = _widened(*corners(np.arctan2, a, b))
+        crossing = np.less_equal(y_low, 0.0) & np.greater_equal(y_high, 0.0) & np.less_equal(x_low, 0.0)
+        crossing &= np.not_equal(y_low, y_high) | np.not_equal(x_low, x_high)
+        if not np.any(crossing):
+            return found
+        return Intervals(np.where(crossing, -_PI, found.low), np.where(crossing, _PI, found.high))
+
+    def axpy(self, a: Operand, b: Intervals, factor: float) -> Intervals:
+        """`a + factor * b`."""
+        return add(a, mul(b, factor))
+
+    def addcmul(self, a: Operand, b: Intervals, c: Intervals, factor: float) -> Intervals:
+        """`a + factor * b * c`."""
+        product = mul(b, c)
+        return add(a, product if factor == 1.0 else mul(product, factor))
+
+    def clamp(self, x: Intervals, low: float | None, high: float | None) -> Intervals:
+        """Clamp `x` to [low, high]."""
+        return x.each(lambda end: np.clip(end, low, high))
+
+    def norm(self, *components: Operand) -> Intervals:
+        """Euclidean norm of a vector given by its components."""
+        sizes = [magnitudes(part) for part in components]
+        low = np.sqrt(reduce(np.add, (np.square(size.low) for size in sizes)))
+        error = (len(sizes) + 3.0) * EPSILON
+        if all(size.is_point for size in sizes):
+            high = low
+        else:
+            high = np.sqrt(reduce(np.add, (np.square(size.high) for size in sizes)))
+        found = widened(low, high, error, _SMALLEST)
+        return Intervals(np.maximum(found.low, 0.0), found.high)
+
+    # ----------------------------------------------------------------------------- functions
+
+    def exp(self, x: Operand) -> Intervals:
+        """`e ^ x`."""
+        found = _monotone(np.exp, x)
+        return Intervals(np.maximum(found.low, 0.0), found.high)
+
+    def sin(self, x: Operand) -> Intervals:
+        """Sine: 1 or -1 where an extremum may lie in the interval, else the values at its ends."""
+        return _wave(np.sin, x, 0.25)
+
+    def cos(self, x: Operand) -> Intervals:
+        """Cosine."""
+        return _wave(np.cos, x, 0.0)
+
+    def tan(self, x: Operand) -> Intervals:
+        """Tangent; unknown where a pole may lie in the interval."""
+        low, high = ends(x)
+        return unbounded_where(_reaches(low, high, np.pi, 0.5), _monotone(np.tan, x))
+
+    def acos(self, x: Operand) -> Intervals:
+        """Arc cosine, which falls; unknown outside of [-1, 1]."""
+        high, low = _mapped(np.arccos, x)
+        return _widened(low, high)
+
+    def sigmoid(self, x: Operand) -> Intervals:
+        """`1 / (1 + exp(-x))`."""
+        return within(widened(*_mapped(NUMPY.sigmoid, x), _ERROR, _ERROR), 0.0, 1.0)
+
+    def sign(self, x: Intervals) -> Intervals:
+        """-1, 0 or 1."""
+        return x.each(np.sign)
+
+    def floor(self, x: Intervals) -> Intervals:
+        """Next whole number below."""
+        return x.each(np.floor)
+
+    def ceil(self, x: Intervals) -> Intervals:
+        """Next whole number above."""
+        return x.each(np.ceil)
+
+    def round(self, x: Intervals) -> Intervals:
+        """Nearest whole number."""
+        return x.each(np.rint)
+
+    def minimum(self, a: Operand, b: Operand) -> Intervals:
+        """Elementwise minimum."""
+        return _joined(np.minimum, a, b)
+
+    def maximum(self, a: Operand, b: Operand) -> Intervals:
+        """Elementwise maximum."""
+        return _joined(np.maximum, a, b)
+
+    # --------------------------------------------------------------------------------- truth
+
+    def gt(self, a: Operand, b: Operand) -> Belief:
+        """`a > b`."""
+        (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
+        return Belief(np.greater(a_low, b_high), np.greater(a_high, b_low))
+
+    def ge(self, a: Operand, b: Operand) -> Belief:
+        """`a >= b`."""
+        (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
+        return Belief(np.greater_equal(a_low, b_high), np.greater_equal(a_high, b_low))
+
+    def both(self, a: Belief, b: Belief) -> Belief:
+        """Conjunction."""
+        return Belief(a.sure & b.sure, a.possible & b.possible)
+
+    def either(self, a: Belief, b: Belief) -> Belief:
+        """Disjunction."""
+        return Belief(a.sure | b.sure, a.possible | b.possible)
+
+    def settled(self, weight: Intervals, mask: Belief) -> Intervals:
+        """1 where `mask` is true, 0 where it is false, else [0, 1]; with the shape of `weight`."""
+        shape = weight.shape
+        return self.number(mask, weight).each(lambda end: np.broadcast_to(end, shape))
+
+    def number(self, mask: Belief, like: Intervals) -> Intervals:  # noqa: ARG002
+        """1 where `mask` is true, 0 where it is false, else [0, 1]."""
+        return Intervals(np.asarray(mask.sure, np.float64), np.asarray(mask.possible, np.float64))
+
+    def where(self, mask: Belief, yes: Operand, no: Operand) -> Intervals:
+        """`yes` where `mask` is true, `no` where it is false, else the hull of both."""
+        (a_low, a_high), (b_low, b_high) = ends(yes), ends(no)
+        if np.array_equal(mask.sure, mask.possible):
+            low = _chosen(mask.sure, a_low, b_low)
+            same = a_low is a_high and b_low is b_high
+            return Intervals(low, low if same else _chosen(mask.sure, a_high, b_high))
+        either = hull(yes, no)
+        low = _chosen(mask.possible, either.low, b_low)
+        high = _chosen(mask.possible, either.high, b_high)
+        return Intervals(_chosen(mask.sure, a_low, low), _chosen(mask.sure, a_high, high))
+
+    def lerp(self, no: Operand, yes: Operand, weight: Intervals) -> Intervals:
+        """`no + weight (yes - no)`, for a weight from 0 to 1: a mean of both, so within their hull."""
+        mixed = add(no, mul(weight, add(yes, -no)))
+        bound = hull(no, yes)
+        return Intervals(np.maximum(mixed.low, bound.low), np.minimum(mixed.high, bound.high))
+
+    def infinite(self, mask: Belief, like: Intervals) -> Intervals:  # noqa: ARG002
+        """+inf where `mask` is true, -inf where it is false, else all numbers."""
+        return Intervals(_infinite(mask.sure), _infinite(mask.possible))
+
+    def straight_through(self, rho: Intervals, strict: bool, slope: float) -> Intervals:  # noqa: ARG002
+        """1 where `rho > 0` (if `strict`) or `rho >= 0` (otherwise), 0 where not, else [0, 1]."""
+        return self.number(self.gt(rho, 0.0) if strict else self.ge(rho, 0.0), rho)
+
+    # ---------------------------------------------------------------------------- along time
+
+    def amin(self, x: Intervals) -> Intervals:
+        """Minimum over axis 0, which is kept with length 1."""
+        return x.each(NUMPY.amin)
+
+    def amax(self, x: Intervals) -> Intervals:
+        """Maximum over axis 0, which is kept with length 1."""
+        return x.each(NUMPY.amax)
+
+    def sum(self, x: Intervals) -> Intervals:
+        """Sum over axis 0, which is kept with length 1 (error: Higham 2002, section 4.2)."""
+        low, high = _mapped(NUMPY.sum, x)
+        size = np.abs(x.low).sum(axis=0, keepdims=True) + np.abs(x.high).sum(axis=0, keepdims=True)
+        error = size * (len(x) + 2.0) * EPSILON
+        return known(low - error, high + error)
+
+    def cummin(self, x: Intervals) -> Intervals:
+        """Running minimum along axis 0."""
+        return x.each(NUMPY.cummin)
+
+    def cummax(self, x: Intervals) -> Intervals:
+        """Running maximum along axis 0."""
+        return x.each(NUMPY.cummax)
+
+    def softmax(self, x: Intervals, k: float) -> Intervals:  # noqa: ARG002
+        """Not available.
+
+        Raises:
+            UsageError: U101. Bounds are computed for exact extrema only.
+        """
+        raise UsageError(Diagnostic("U101", "intervals have exact extrema only", help=("--semantics exact",)))
+
+    def softmax2(self, a: Intervals, b: Intervals, k: float) -> Intervals:  # noqa: ARG002
+        """Not available; see `softmax`."""
+        return self.softmax(a, k)
+
+    def join(self, items: Sequence[Intervals], pick: Pick) -> Intervals:
+        """Exact elementwise minimum or maximum of one or more arrays."""
+        low = NUMPY.join([item.low for item in items], pick)
+        if all(item.is_point for item in items):
+            return Intervals(low, low)
+        return Intervals(low, NUMPY.join([item.high for item in items], pick))
+
+    def extrema(self, x: Intervals, pick: Pick, window: Sliding) -> Intervals:
+        """Exact extrema over sliding windows."""
+        return x.each(lambda end: _WINDOWS.extrema(end, pick, count=window.count, width=window.width))
+
+    def until(self, left: Intervals, right: Intervals, pick: Pick, window: Sliding) -> Intervals:
+        """Exact `until` or `release` over sliding windows."""
+        until = partial(_WINDOWS.until, pick=pick, count=window.count, width=window.width)
+        low = until(left.low, right.low)
+        return Intervals(low, low if left.is_point and right.is_point else until(left.high, right.high))
+
+    # ------------------------------------------------------------------- constants and shapes
+
+    def kind(self, like: Intervals) -> Hashable:  # noqa: ARG002
+        """Return None: all arrays are of float64, and constants are Python floats."""
+        return None
+
+    def constant(self, value: float, like: Intervals) -> float:  # noqa: ARG002
+        """Return the float itself."""
+        return value
+
+    def full(self, shape: tuple[int, ...], value: float, like: Intervals) -> Intervals:  # noqa: ARG002
+        """Array of a constant."""
+        return Intervals.point(np.full(shape, value))
+
+    def counted(self, first: int, count: int, like: Intervals) -> Intervals:
+        """Array with the numbers `first`, `first + 1`, …, `first + count - 1` along time."""
+        return Intervals.point(NUMPY.counted(first, count, like.low))
+
+    def empty(self, shape: tuple[int, ...], like: Intervals) -> Intervals:  # noqa: ARG002
+        """Array without defined values."""
+        return Intervals(np.empty(shape), np.empty(shape))
+
+    def cat(self, parts: Sequence[Intervals]) -> Intervals:
+        """Concatenate arrays along axis 0."""
+        return _gathered(np.concatenate, parts)
+
+    def stack(self, parts: Sequence[Intervals]) -> Intervals:
+        """Stack arrays along a new axis 0."""
+        return _gathered(np.stack, parts)
+
+    def flip(self, x: Intervals) -> Intervals:
+        """Reverse `x` along axis 0."""
+        return x[::-1]
+
+    def rows(self, keep: Bools, x: Intervals, value: float) -> Intervals:
+        """Copy of `x` with `value` in the rows where `keep` is False."""
+        return x.each(lambda end: NUMPY.rows(keep, end, value))
+
+    def columns(self, x: Intervals) -> Sequence[Intervals]:
+        """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""
+        lows = NUMPY.columns(x.low)
+        highs = lows if x.is_point else NUMPY.columns(x.high)
+        return [Intervals(low, high) for low, high in zip(lows, highs, strict=True)]
+
+    def quiet(self) -> AbstractContextManager[object]:
+        """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""
+        return NUMPY.quiet()
+
+
+# --------------------------------------------------------------------------------- functions
+
+
+_PI = float(np.pi) * (1.0 + EPSILON)
+"""A number above pi."""
+
+
+def _mapped(function: Callable[[Any], Any], x: Operand) -> tuple[End, End]:
+    """Values of a function of one argument at both ends; the same object twice for a point."""
+    low, high = ends(x)
+    first = function(low)
+    return first, (first if low is high else function(high))
+
+
+def _widened(low: End, high: End) -> Intervals:
+    return widened(low, high, _ERROR, _ULPS * TINY)
+
+
+def _monotone(function: Callable[[Any], Any], x: Operand) -> Intervals:
+    """Function that rises wherever it is defined; unknown where an end is outside of its domain."""
+    return _widened(*_mapped(function, x))
+
+
+def _joined(function: Callable[[Any, Any], Any], a: Operand, b: Operand) -> Intervals:
+    (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
+    low = function(a_low, b_low)
+    return Intervals(low, low if a_low is a_high and b_low is b_high else function(a_high, b_high))
+
+
+def _gathered(function: Callable[[Any], Any], parts: Sequence[Intervals]) -> Intervals:
+    low = function([part.low for part in parts])
+    if all(part.is_point for part in parts):
+        return Intervals(low, low)
+    return Intervals(low, function([part.high for part in parts]))
+
+
+def _chosen(mask: Bools, yes: End, no: End) -> Any:
+    return np.where(mask, yes, no)
+
+
+def _infinite(mask: Bools) -> Any:
+    return np.where(mask, np.inf, -np.inf)
+
+
+def _reaches(low: End, high: End, period: float, offset: float) -> Bools:
+    """Whether an interval may contain `period * (k + offset)` for a whole number k.
+
+    The positions in periods are computed with an error below 4 `EPSILON` of their magnitude, and more than
+    2^52 periods from 0 the answer is always yes.
+    """
+    first, last = low / period - offset, high / period - offset
+    error = 4.0 * EPSILON * (1.0 + np.maximum(np.abs(first), np.abs(last)))
+    return np.asarray(~(np.floor(last + error) < np.ceil(first - error)))
+
+
+def _wave(function: Callable[[Any], Any], x: Operand, offset: float) -> Intervals:
+    """Sine or cosine: its maxima are at `offset` periods, its minima half a period later."""
+    low, high = ends(x)
+    one, other = _mapped(function, x)
+    least, most = (one, one) if one is other else (np.minimum(one, other), np.maximum(one, other))
+    found = _widened(least, most)
+    top = 1.0 + EPSILON
+    highest = _reaches(low, high, _TURN, offset)
+    lowest = _reaches(low, high, _TURN, offset + 0.5)
+    return Intervals(np.where(lowest, -top, found.low), np.where(highest, top, found.high))
+
+
+def _whole_power(a: Operand, exponent: float | Any) -> Intervals:
+    """`a ^ exponent` for whole exponents: even ones are powers of the magnitude, odd ones rise.
+
+    A negative exponent turns a falling power, and has a pole at 0.
+    """
+    even = np.equal(np.mod(exponent, 2.0), 0.0)
+    size = magnitudes(a)
+    a_low, a_high = ends(a)
+    low, high = np.where(even, size.low, a_low), np.where(even, size.high, a_high)
+    one, other = np.power(low, exponent), np.power(high, exponent)
+    found = _widened(np.minimum(one, other), np.maximum(one, other))
+    positive = np.asarray(even | np.greater_equal(a_low, 0.0))
+    found = Intervals(np.where(positive, np.maximum(found.low, 0.0), found.low), found.high)
+    pole = np.less(exponent, 0.0) & np.less_equal(a_low, 0.0) & np.greater_equal(a_high, 0.0)
+    return unbounded_where(np.asarray(pole), found)
+
+
+def _anything(bounds: object, *args: Operand) -> Intervals:
+    """Result of a function that has no method here: the constant range of its table entry, or all numbers."""
+    shape = np.broadcast_shapes(*(np.shape(ends(arg)[0]) for arg in args))
+    low, high = bounds if isinstance(bounds, tuple) else (-np.inf, np.inf)
+    return Intervals(np.full(shape, low - _ERROR * abs(low)), np.full(shape, high + _ERROR * abs(high)))
+
+
+for _name, _function in {
+    "expm1": np.expm1,
+    "log": np.log,
+    "log1p": np.log1p,
+    "asin": np.arcsin,
+    "atan": np.arctan,
+    "tanh": np.tanh,
+    "sinh": np.sinh,
+}.items():
+    setattr(IntervalOps, _name, staticmethod(partial(_monotone, _function)))
+
+for _entry in FUNCTIONS.values():
+    if _entry.numpy and not hasattr(IntervalOps, _entry.name):
+        setattr(IntervalOps, _entry.name, staticmethod(partial(_anything, _entry.bounds)))
+
+INTERVALS: Ops = cast("Ops", IntervalOps())

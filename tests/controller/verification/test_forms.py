@@ -1,0 +1,106 @@
+"""Affine forms contain the values at every point of the box, for given values of the shared symbols."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import formula_strategies as random_formulas
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stlc.compile.backends.array.arith import ArrayProgram
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.controller.verification.forms import FORMS, Forms, ranges, tanh
+
+BATCH, SYMBOLS = 5, 3
+
+
+def drawn(rng: np.random.Generator, width: float) -> Forms:
+    generators = rng.normal(size=(int(rng.integers(0, SYMBOLS + 1)), BATCH)) * width
+    rest = np.abs(rng.normal(size=BATCH)) * width * (rng.random() < 0.5)
+    return Forms(rng.integers(-16, 16, BATCH) / 8.0, generators, rest)
+
+
+def value(form: Forms, symbols: np.ndarray, own: np.ndarray) -> Any:
+    return form.centre + np.tensordot(symbols[: len(form.generators)], form.generators, 1) + own * form.rest
+
+
+def check(num: ir.Num, seed: int, width: float) -> None:
+    rng = np.random.default_rng(seed)
+    env = {name: drawn(rng, width) for name in random_formulas.NAMES}
+    program = ArrayProgram({"out": num})
+    found = program(env, FORMS)["out"]
+    low, high = found.range.low, found.range.high
+    for _ in range(8):
+        symbols = rng.choice([-1.0, 1.0, rng.uniform(-1, 1)], SYMBOLS)
+        point = {name: value(form, symbols, rng.uniform(-1, 1, BATCH)) for name, form in env.items()}
+        exact = program(point, NUMPY)["out"]
+        assert ((low <= exact) & (exact <= high)).all()
+        linear = value(found, symbols, np.zeros(BATCH))
+        with np.errstate(invalid="ignore"):
+            off = np.abs(exact - linear) > found.rest + 1e-9 * (1.0 + np.abs(found.centre) + found.radius)
+        assert not off.any()
+
+
+@settings(max_examples=80, deadline=None)
+@given(random_formulas.numbers, st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.05, 0.5, 3.0]))
+def test_random_numbers_stay_within_their_forms(num: ir.Num, seed: int, width: float) -> None:
+    check(num, seed, width)
+
+
+@pytest.mark.bench
+@settings(max_examples=5000, deadline=None)
+@given(random_formulas.numbers, st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.05, 0.5, 3.0]))
+def test_many_random_numbers(num: ir.Num, seed: int, width: float) -> None:
+    check(num, seed, width)
+
+
+def symbol(low: float, high: float) -> Forms:
+    half = 0.5 * (high - low)
+    return Forms(np.array([low + half]), np.array([[half]]), np.zeros(1))
+
+
+def test_dependent_quantities_cancel() -> None:
+    x = symbol(-1.0, 1.0)
+    assert FORMS.sub(x, x).radius == 0.0
+    assert FORMS.gt(FORMS.add(x, 0.1), x).sure.all()
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 4.0), (1.0, 1.1), (0.0, 1e-9), (-1e-12, 1.0)])
+def test_roots_of_what_is_not_negative(low: float, high: float) -> None:
+    x = symbol(low, high)
+    found = FORMS.sqrt(x)
+    for share in np.linspace(-1, 1, 41):
+        exact = np.sqrt(max(float(value(x, np.array([share]), np.zeros(1))[0]), 0.0))
+        linear = float(value(found, np.array([share]), np.zeros(1))[0])
+        assert abs(exact - linear) <= found.rest[0] + 1e-12
+
+
+def test_roots_of_what_may_be_negative_are_refused() -> None:
+    with pytest.raises(ValueError, match="may be negative"):
+        FORMS.sqrt(symbol(-0.1, 1.0))
+
+
+def test_what_follows_a_relu_has_a_root() -> None:
+    found = FORMS.sqrt(FORMS.maximum(symbol(-1.0, 1.0), 0.0))
+    assert found.range.high[0] >= 1.0
+    with pytest.raises(ValueError, match="may be negative"):
+        FORMS.sqrt(FORMS.add(FORMS.maximum(symbol(-1.0, 1.0), 0.0), -0.5))
+
+
+def test_the_tangent_is_followed() -> None:
+    for low, high in ((-3.0, 2.0), (0.5, 0.6), (-9.0, 9.0), (2.0, 2.0)):
+        x = symbol(low, high)
+        found = tanh(x)
+        for share in np.linspace(-1, 1, 41):
+            exact = np.tanh(value(x, np.array([share]), np.zeros(1)))
+            assert np.abs(exact - value(found, np.array([share]), np.zeros(1))) <= found.rest
+
+
+def test_what_is_not_finite_may_be_anything() -> None:
+    box = FORMS.div(Forms.point(np.ones(1)), symbol(-1.0, 1.0))
+    assert (box.range.low[0], box.range.high[0]) == (-np.inf, np.inf)
+    assert ranges([box, box]).shape == (2, 1)
