@@ -84,7 +84,8 @@ class PlantSimulator:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
         margins = np.stack([self._margins(run) for run in runs])
-        return Simulations(margins, margins, ~np.isnan(margins).any(1))
+        failed: NDArray[np.bool_] = np.isnan(margins).any(axis=1)
+        return Simulations(margins, margins, ~failed)
 
     def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:  # noqa: ARG002
         """None: a black box has the time step of its file."""
