@@ -84,7 +84,7 @@ class PlantSimulator:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
         margins = np.stack([self._margins(run) for run in runs])
-        failed: NDArray[np.bool_] = np.isnan(margins).any(axis=1)
+        failed: NDArray[np.bool_] = np.array([np.isnan(each).any() for each in margins], dtype=np.bool_)
         return Simulations(margins, margins, ~failed)
 
     def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:  # noqa: ARG002
