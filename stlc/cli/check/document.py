@@ -35,6 +35,17 @@ def document(outcomes: Sequence[Outcome]) -> documents.CheckResult:
     return only if len(entries) == 1 else {"verdict": overall(outcomes), "files": entries}
 
 
+def _errors(result: Checked) -> dict[str, Any]:
+    """Entry `uncertain` of a record: the greatest error of each signal with errors; none without errors."""
+    if not result.uncertain:
+        return {}
+    errors = {
+        name: record(documents.UncertainSignal, error, unit=error.unit.text)
+        for name, error in result.uncertain.items()
+    }
+    return {"uncertain": errors}
+
+
 def result_record(result: Checked, end: str) -> documents.CheckedTrace:
     """JSON record of the judged trace `result`, whose samples were all in memory.
 
@@ -49,10 +60,7 @@ def result_record(result: Checked, end: str) -> documents.CheckedTrace:
         verdict.subject.gaps,
         verdict.subject.time,
         end=end,
-        uncertain={
-            name: record(documents.UncertainSignal, error, unit=error.unit.text)
-            for name, error in result.uncertain.items()
-        },
+        **_errors(result),
         traces=verdict.traces,
         samples=result.trace.samples,
         in_scope=verdict.in_scope,
@@ -94,7 +102,6 @@ def trace_record(
             signal: {"samples": gap.samples, "first": time(gap.first), "last": time(gap.last)}
             for signal, gap in gaps.items()
         },
-        "uncertain": {},
         **found,
     }
     return record(documents.CheckedTrace, None, **made)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.documents import Verified, VerifiedMode
+from stlc.cli.framework.assured import Verified, VerifiedMode
 from stlc.cli.framework.options import FailUnderOption, RunArgument, RunsOption, parse_seconds
 from stlc.cli.framework.output import PULSE, Answer, emit, table
 from stlc.cli.framework.program import command

@@ -184,3 +184,36 @@ class ReplayedCounterexample(TypedDict):
     stored_margin: Num
     identical: bool
     different: list[str]
+
+
+class UncertainSignal(TypedDict):
+    """Greatest error of the samples of a signal; see `stlc.monitor.uncertain.Uncertainty`."""
+
+    absolute: Num
+    relative: Num
+    unit: str
+
+
+class VerifiedMode(TypedDict):
+    """Proved, refuted and open shares of one mode of the initial states."""
+
+    name: str
+    probability: Num
+    proved: Num
+    refuted: Num
+    open: Num
+    proved_boxes: int
+    examined_boxes: int
+    witness: dict[str, Num] | None
+    robustness: Num | None
+
+
+class Verified(TypedDict):
+    """Proved, refuted and open shares of the initial states of a run."""
+
+    run: str
+    seconds: Num
+    proved: Num
+    refuted: Num
+    open: Num
+    modes: list[VerifiedMode]

@@ -1,7 +1,7 @@
 """Documents that commands print with `--json`, as typed records from which their JSON Schemas are derived.
 
-Times are in seconds. Positions in files count from 1. A number (`Num`) that is not finite is written as a
-text. Within one major version of a schema, keys are added and never removed.
+Times are in seconds, positions count from 1. A number (`Num`) that is not finite is a text. Within one major
+version of a schema, keys are added and never removed.
 """
 
 from types import NoneType
@@ -26,6 +26,8 @@ from stlc.cli.framework.assured import (
     CertificateCheck,
     FalsifiedSystem,
     ReplayedCounterexample,
+    UncertainSignal,
+    Verified,
 )
 from stlc.cli.framework.plant_documents import PlantSimulation
 
@@ -118,12 +120,6 @@ class CheckedRequirement(TypedDict):
     cause: CauseRecord | None
 
 
-class UncertainSignal(TypedDict):
-    absolute: Num
-    relative: Num
-    unit: str
-
-
 class CheckedTrace(TypedDict):
     assurance: NotRequired[Assurance]
     trace: str
@@ -135,7 +131,7 @@ class CheckedTrace(TypedDict):
     traces: int
     samples: int
     unknown: dict[str, UnknownSamples]
-    uncertain: dict[str, UncertainSignal]
+    uncertain: NotRequired[dict[str, UncertainSignal]]
     in_scope: int
     verdict: Literal["satisfied", "violated", "inconclusive", "out of scope"]
     robustness: Num | None
@@ -308,27 +304,6 @@ class ExportCheck(TypedDict):
 class ExportLatency(TypedDict):
     median_ms: float
     p99_ms: float
-
-
-class VerifiedMode(TypedDict):
-    name: str
-    probability: Num
-    proved: Num
-    refuted: Num
-    open: Num
-    proved_boxes: int
-    examined_boxes: int
-    witness: dict[str, Num] | None
-    robustness: Num | None
-
-
-class Verified(TypedDict):
-    run: str
-    seconds: Num
-    proved: Num
-    refuted: Num
-    open: Num
-    modes: list[VerifiedMode]
 
 
 class ExportedRun(TypedDict):
@@ -772,8 +747,6 @@ RESULTS: dict[str, Any] = {
 LINES: dict[str, Any] = {"robustness-line": RobustnessLine}
 """Documents that are single lines without a frame: those of `simulate --robustness`."""
 
-
-# ------------------------------------------------------------------------------ JSON Schema
 
 _OPEN = (SyntaxTree,)
 """Records that may have further keys."""

@@ -159,6 +159,7 @@ def project(tmp_path_factory):
         Path("systems/yard.py").write_text(WORLD)
         assert main(["train", "specs/cart.stl", "--name", "first", "--no-pictures"]) == 0
         assert main(["simulate", "first", "--seeds", "0..1", "--no-pictures", "--record", "trace.npz"]) == 0
+        assert main(["certify", "first", "--seeds", "0..19", "--share", ".01"]) in (0, 1, 4)
         for name in ("changed", "broken"):
             shutil.copytree("runs/cart/0001-first", f"runs/cart/0002-{name}")
         edited = Path("runs/cart/0002-changed/spec.stl")

@@ -454,6 +454,7 @@ def _anything(bounds: object, *args: Operand) -> Intervals:
 for _name, _function in {
     "expm1": np.expm1,
     "log": np.log,
+    "log10": np.log10,
     "log1p": np.log1p,
     "asin": np.arcsin,
     "atan": np.arctan,
@@ -461,6 +462,18 @@ for _name, _function in {
     "sinh": np.sinh,
 }.items():
     setattr(IntervalOps, _name, staticmethod(partial(_monotone, _function)))
+
+
+def _cosh(x: Operand) -> Intervals:
+    """Function that falls up to 0 and rises from there."""
+    low, high = ends(x)
+    inside = np.less_equal(low, 0.0) & np.greater_equal(high, 0.0)
+    one, other = np.cosh(low), np.cosh(high)
+    found = _widened(np.minimum(one, other), np.maximum(one, other))
+    return Intervals(np.where(inside, 1.0, np.maximum(found.low, 1.0)), found.high)
+
+
+IntervalOps.cosh = staticmethod(_cosh)  # type: ignore[attr-defined]
 
 for _entry in FUNCTIONS.values():
     if _entry.numpy and not hasattr(IntervalOps, _entry.name):
