@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.cli.check.outcome import Checked, Outcome, overall
 from stlc.cli.framework import documents
+from stlc.cli.framework.assured import UncertainSignal
 from stlc.cli.framework.documents import record
 from stlc.escape import xml
 from stlc.monitor.explain.report import Cause
@@ -40,8 +41,7 @@ def _errors(result: Checked) -> dict[str, Any]:
     if not result.uncertain:
         return {}
     errors = {
-        name: record(documents.UncertainSignal, error, unit=error.unit.text)
-        for name, error in result.uncertain.items()
+        name: record(UncertainSignal, error, unit=error.unit.text) for name, error in result.uncertain.items()
     }
     return {"uncertain": errors}
 
