@@ -80,11 +80,13 @@ class PlantProcess:
         except BaseException:
             shutil.rmtree(self._scratch, ignore_errors=True)
             raise
-        self._tail = bytearray()
+        self._tail, self._reading = bytearray(), threading.Lock()
         assert self._process.stdin is not None
         assert self._process.stdout is not None
+        assert self._process.stderr is not None
         self._in, self._out = self._process.stdin.fileno(), self._process.stdout.fileno()
         os.set_blocking(self._in, False)
+        os.set_blocking(self._process.stderr.fileno(), False)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
         try:
@@ -198,16 +200,35 @@ class PlantProcess:
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def _listen(self) -> None:
-        """Keep the last bytes of the standard error."""
+        """Keep the last bytes of the standard error, until it ends."""
+        assert self._process.stderr is not None
+        poll = select.poll()
+        poll.register(self._process.stderr.fileno(), select.POLLIN)
+        while poll.poll():
+            if not self._drain():
+                return
+
+    def _drain(self) -> bool:
+        """Read what stands in the pipe of the standard error. Returns whether more may come."""
         stream = self._process.stderr
         assert stream is not None
-        with stream:
-            while part := os.read(stream.fileno(), 1 << 16):
+        with self._reading:
+            while not stream.closed:
+                try:
+                    part = os.read(stream.fileno(), 1 << 16)
+                except BlockingIOError:
+                    return True
+                if not part:
+                    stream.close()
                 self._tail += part
                 del self._tail[:-TAIL]
+        return False
 
     def _said(self) -> str:
-        return self._tail.decode(errors="replace").strip()
+        """Return the end of the standard error, with all that was printed before the last reply."""
+        self._drain()
+        with self._reading:
+            return self._tail.decode(errors="replace").strip()
 
     def _end_in_words(self) -> str:
         """Describe in one line how the process ended."""
