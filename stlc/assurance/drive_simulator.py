@@ -103,8 +103,8 @@ class DriveSimulator:
     def at_half_step(
         self,
         points: NDArray[np.float64],  # noqa: ARG002
-        requirement: int,  # noqa: ARG002
-    ) -> NDArray[np.float64] | None:
+        focus: Focus,  # noqa: ARG002
+    ) -> Simulations | None:
         """None: a world has the time step for which it was written, and the policy that of its training."""
         return None
 

@@ -84,14 +84,14 @@ class PlantSimulator:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
         margins = np.stack([self._margins(run) for run in runs])
-        failed: NDArray[np.bool_] = np.isnan(margins).any(axis=1)
-        return Simulations.unscaled(margins[:, focus.requirement], np.logical_not(failed))
+        whole = np.array([not np.isnan(each).any() for each in margins], dtype=np.bool_)
+        return Simulations.unscaled(margins[:, focus.requirement], whole)
 
     def at_half_step(
         self,
         points: NDArray[np.float64],  # noqa: ARG002
-        requirement: int,  # noqa: ARG002
-    ) -> NDArray[np.float64] | None:
+        focus: Focus,  # noqa: ARG002
+    ) -> Simulations | None:
         """None: a black box has the time step of its file."""
         return None
 

@@ -95,8 +95,8 @@ class Simulator(Protocol):
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""
 
-    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> NDArray[np.float64] | None:
-        """Margins at half the time step, (count,); None if the step cannot be changed."""
+    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+        """Outcomes at half the time step; None if the step cannot be changed."""
 
 
 class SimulatorSource(Protocol):
@@ -159,9 +159,9 @@ class SharedSimulator:
         parts = [part for part in np.array_split(points, self.workers.count) if len(part)]
         return Simulations.joined(list(self.workers.run(_simulated, [(part, focus) for part in parts])))
 
-    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> NDArray[np.float64] | None:
-        """Margins at half the time step, (count,); None if the step cannot be changed."""
-        return self.local.at_half_step(points, requirement)
+    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+        """Outcomes at half the time step; None if the step cannot be changed."""
+        return self.local.at_half_step(points, focus)
 
 
 class LocalWorkers:
