@@ -271,13 +271,17 @@ def _varying(delay: DelayEntry, column: Column, present: _Held, cx: Context) -> 
     wait = ir.Op("clip", (by, ir.Const(dt), ir.Const(delay.steps * dt)))
     text = f"{present.text}, {written(keys.by)} ago"
     share: ir.Num = ir.Op("div", (ir.Const(dt), wait) if keys.transport else (wait, ir.Const(dt)))
-    rate = _Held(Column(f"{column.name}_share", Unit()), 1, share, f"{written(keys.by)} and the step", share, place)
+    rate = _Held(
+        Column(f"{column.name}_share", Unit()), 1, share, f"{written(keys.by)} and the step", share, place
+    )
     count = delay.steps if keys.transport else 0
     read = (*_ago(present, delay.steps), *_ago(rate, count))
     body = _pipe(delay.steps) if keys.transport else _earlier(delay.steps)
     late, soon = (ir.Extern(f"{column.name}_late", read, index, body) for index in (0, 1))
     slope: ir.Num = multiply(ir.Op("sub", (soon, late)), ir.Const(1.0 / dt))
-    moves = replace(column, name=f"{column.name}_rate", unit=column.unit.interval / SECOND, low=None, high=None)
+    moves = replace(
+        column, name=f"{column.name}_rate", unit=column.unit.interval / SECOND, low=None, high=None
+    )
     cells = (
         present,
         rate,
