@@ -147,7 +147,9 @@ def _declared_delays(node: Node | None, cx: Context) -> tuple[DelayEntry, ...]:
         if keys.transport and not varies:
             cx.reader.report("S102", f"{where} needs its longest delay", entry.key.span, "at_most: 1 s")
             continue
-        steps = keys.at_most if varies else STEPS.read(cx.plain, keys.by, f"`by` of {where}")
+        steps = keys.at_most
+        if steps is None and keys.by is not None:
+            steps = STEPS.read(cx.plain, keys.by, f"`by` of {where}")
         if steps is not None and steps > MAX_DELAY:
             message = f"{where} is {steps} steps late, and {MAX_DELAY} are the most"
             cx.reader.report("S103", message, entry.place("at_most" if varies else "by"))

@@ -1,8 +1,8 @@
 """Symbolic derivatives of numeric expressions, for integrators that need the Jacobian of the flow.
 
-At a kink, such as that of `abs` at 0, the derivative is that of one side. Conditions have none: the derivative
-of `if c then a else b` is that of the chosen branch. A function from outside, whose body is not known, counts
-as a constant.
+At a kink, such as that of `abs` at 0, the derivative is that of one side. Conditions have none: the
+derivative of `if c then a else b` is that of the chosen branch. A function from outside, whose body is not
+known, counts as a constant.
 """
 
 from __future__ import annotations
@@ -34,16 +34,36 @@ def _along(num: ir.Num, slopes: Mapping[str, ir.Num]) -> ir.Num | None:
         case ir.Signal(name):
             return slopes.get(name)
         case ir.Where(cond, yes, no):
-            parts = (_along(yes, slopes), _along(no, slopes))
-            return (
-                None if parts == (None, None) else ir.Where(cond, *(each or ir.Const(0.0) for each in parts))
-            )
+            return _choice(cond, _along(yes, slopes), _along(no, slopes))
+        case ir.Op("min" | "max" as name, args):
+            return _extreme(name, args, slopes)
+        case ir.Op("clip", (x, low, high)):
+            return _along(_call("min", _call("max", x, low), high), slopes)
+        case ir.Op("norminf", args):
+            return _along(_call("max", *(_call("abs", arg) for arg in args)), slopes)
         case ir.Op(name, args):
             return _chain(_partials(name, num, args), args, slopes)
         case ir.Extern(args=args, function=ir.Body()):
             return _chain([_slope_of(num, index) for index in range(len(args))], args, slopes)
         case _:
             return None
+
+
+def _choice(cond: ir.Formula, yes: ir.Num | None, no: ir.Num | None) -> ir.Num | None:
+    """Derivative of a choice, given those of its branches."""
+    if yes is None and no is None:
+        return None
+    return ir.Where(cond, yes or ir.Const(0.0), no or ir.Const(0.0))
+
+
+def _extreme(name: str, args: Sequence[ir.Num], slopes: Mapping[str, ir.Num]) -> ir.Num | None:
+    """Derivative of `min` or `max`: that of the first argument that is extreme."""
+    best, found = args[0], _along(args[0], slopes)
+    for arg in args[1:]:
+        gap = _less(best, arg) if name == "max" else _less(arg, best)
+        found = _choice(ir.Predicate(gap), found, _along(arg, slopes))
+        best = _call(name, best, arg)
+    return found
 
 
 def _chain(
@@ -115,23 +135,6 @@ def _power(result: ir.Num, base: ir.Num, exponent: ir.Num) -> Sequence[ir.Num | 
     return by_base, multiply(result, _call("log", _call("max", base, ir.Const(SMALL))))
 
 
-def _extreme(sign: float) -> Partials:
-    """Partial derivatives of `max` (sign 1) and `min` (sign -1): 1 for the chosen argument, otherwise 0."""
-
-    def partials(result: ir.Num, *args: ir.Num) -> Sequence[ir.Num | None]:
-        gaps = [_less(arg, result) if sign > 0 else _less(result, arg) for arg in args]
-        return [_if_positive(gap, 1.0, 0.0) for gap in gaps]
-
-    return partials
-
-
-def _clip(_result: ir.Num, x: ir.Num, low: ir.Num, high: ir.Num) -> Sequence[ir.Num | None]:
-    below, above = ir.Predicate(_less(low, x), strict=True), ir.Predicate(_less(x, high), strict=True)
-    zero, one = ir.Const(0.0), ir.Const(1.0)
-    inside = ir.Where(below, zero, ir.Where(above, zero, one))
-    return inside, ir.Where(below, one, zero), ir.Where(above, one, zero)
-
-
 def _arc_tangent(_result: ir.Num, y: ir.Num, x: ir.Num) -> Sequence[ir.Num | None]:
     size = _call("max", add(_call("square", x), _call("square", y)), ir.Const(SMALL))
     return _over(x, size), _neg(_over(y, size))
@@ -163,9 +166,6 @@ _PARTIALS: Mapping[str, Partials] = MappingProxyType(
         "square": _one(lambda _, x: multiply(ir.Const(2.0), x)),
         "abs": _one(lambda _, x: _call("sign", x)),
         "relu": _one(lambda _, x: _if_positive(x, 1.0, 0.0)),
-        "min": _extreme(-1.0),
-        "max": _extreme(1.0),
-        "clip": _clip,
         "sqrt": _one(lambda r, _: _over(ir.Const(0.5), _call("max", r, ir.Const(SMALL)))),
         "exp": _one(lambda r, _: r),
         "log": _one(lambda _, x: _over(_ONE, x)),
@@ -182,9 +182,6 @@ _PARTIALS: Mapping[str, Partials] = MappingProxyType(
         "atan2": _arc_tangent,
         "norm": _norm,
         "norm1": lambda _, *xs: [_call("sign", x) for x in xs],
-        "norminf": lambda r, *xs: [
-            multiply(_call("sign", x), _if_positive(_less(_call("abs", x), r), 1.0, 0.0)) for x in xs
-        ],
     }
 )
 """Partial derivatives by name of a function; functions with steps, such as `floor`, have none."""

@@ -1,9 +1,10 @@
 """Rosenbrock method of second order for stiff systems, with two evaluations and one Jacobian per step.
 
-The method is that of Verwer, Spee, Blom and Hundsdorfer (1999), with gamma = 1 - 1/sqrt(2). Stages are linearly
-implicit: they solve linear equations with the matrix I - gamma h J, where J is the Jacobian of the flow. The
-method is L-stable, so that a fast mode does not limit the step, and its order does not depend on J. The
-derivatives and the elimination are symbolic, without pivoting: a step is straight-line code in every back end.
+The method is that of Verwer, Spee, Blom and Hundsdorfer (1999), with gamma = 1 - 1/sqrt(2). Stages are
+linearly implicit: they solve linear equations with the matrix I - gamma h J, where J is the Jacobian of the
+flow. The method is L-stable, so that a fast mode does not limit the step, and its order does not depend on J.
+The derivatives and the elimination are symbolic, without pivoting: a step is straight-line code in every back
+end.
 """
 
 from __future__ import annotations
