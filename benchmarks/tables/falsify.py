@@ -82,6 +82,7 @@ REQUIREMENTS = {
     "steam_condenser": ("SC",),
     "fuel_control": ("AFC27", "AFC29"),
     "fuel_control_power": ("AFC33",),
+    "f16": ("F16",),
 }
 CASES = tuple(
     Case(spec, name, PUBLISHED.get(name, ""), changes)
