@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, redirect_stdout, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Self
+from typing import Any, Self, TextIO, cast
 
 from stlc.controller.parallel.bundle import BundleResult, JobBundle, import_run, run_bundle
 from stlc.controller.parallel.elsewhere import RemoteCall, RemoteValue, answer
@@ -43,6 +46,7 @@ class RayWorkers:
         self._going: dict[Any, int] = {}
         self._calls: dict[int, RemoteCall] = {}
         self._sends = False
+        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         """Connect to the cluster.
@@ -51,12 +55,18 @@ class RayWorkers:
             MissingError: R301, Ray is not installed; R302, there is no such cluster.
         """
         self._ray = _connected(self._address)
+        if sys.stdout is not None:  # closed by the caller
+            self._stack.enter_context(redirect_stdout(cast(TextIO, _WithoutNotices(sys.stdout))))
         return self
 
     def __exit__(self, *_: object) -> None:
         """Disconnect; the cluster ends the calls in progress."""
         self._going.clear()
-        self._ray.shutdown()
+        try:
+            with redirect_stdout(io.StringIO()):  # the last notices
+                self._ray.shutdown()
+        finally:
+            self._stack.close()
 
     @property
     def free(self) -> int:
@@ -192,6 +202,24 @@ class _Sent:
         if isinstance(found, LostCall):
             return JobResult(self.job, LOST, None, found.reason, 0)
         return import_run(self.job, self.bundle, found)
+
+
+class _WithoutNotices:
+    """Standard output without what threads of Ray print.
+
+    Ray prints notices there, of lost workers for example, which would mix with the results of a command.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        if threading.current_thread().name.startswith("ray_"):
+            return len(text)
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def _connected(address: str) -> Any:
