@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.jobs import Executor
-    from stlc.controller.parallel.workers import Workers
+    from stlc.controller.parallel.workers import CallWorkers
 
 
 def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gpus: int = 0) -> Executor:
@@ -27,18 +27,18 @@ def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gp
     return RayExecutor(cluster, cores, gpus)
 
 
-def workers_of(count: int = 1, cluster: str | None = None, *, fresh: bool = False) -> Workers:
+def workers_of(count: int = 1, cluster: str | None = None, *, fresh: bool = False) -> CallWorkers:
     """Return workers that call functions: local processes, or a Ray cluster if an address is given.
 
     Args:
         count: number of local processes.
         cluster: address of the Ray cluster; None: local processes.
-        fresh: whether local processes start with an empty interpreter, see `LocalWorkers`.
+        fresh: whether local processes start with an empty interpreter, see `LocalProcesses`.
     """
     if cluster is None:
-        from stlc.controller.parallel.workers import LocalWorkers
+        from stlc.controller.parallel.workers import LocalProcesses
 
-        return LocalWorkers(count, fresh=fresh)
+        return LocalProcesses(count, fresh=fresh)
     from stlc.controller.parallel.ray_cluster import RayWorkers
 
     return RayWorkers(cluster)

@@ -1,7 +1,7 @@
 """Calls of functions in worker processes; a lost worker costs only the calls that it was making.
 
-A call is a function of a module and an argument that can be pickled. Workers are processes of this machine
-(`LocalWorkers`) or of a Ray cluster (`stlc.controller.parallel.ray_cluster.RayWorkers`).
+A call is a function of a module and an argument that can be pickled. CallWorkers are processes of this machine
+(`LocalProcesses`) or of a Ray cluster (`stlc.controller.parallel.ray_cluster.RayWorkers`).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class CallResult(Generic[R]):
     value: R | LostCall
 
 
-class Workers(Protocol):
+class CallWorkers(Protocol):
     """Interface of worker processes; they exist while the object is entered as a context."""
 
     def __enter__(self) -> Self:
@@ -96,7 +96,7 @@ class Workers(Protocol):
 
 
 def results(
-    workers: Workers,
+    workers: CallWorkers,
     function: Callable[[A], R],
     arguments: Iterable[A],
     *,
@@ -154,11 +154,11 @@ class _LocalWorker:
     key: int | None = None
 
 
-class WorkerError(Exception):
+class CallError(Exception):
     """Cause of an exception that a function raised in a worker; its text is the traceback there."""
 
 
-class LocalWorkers:
+class LocalProcesses:
     """Up to `count` processes of this machine, each with one call at a time; lost ones are replaced.
 
     Args:
@@ -229,7 +229,7 @@ class LocalWorkers:
         except (EOFError, OSError):
             return key, LostCall(self._end_of(worker))
         if raised is not None:
-            raise value from WorkerError(raised)
+            raise value from CallError(raised)
         return key, value
 
     def _end_of(self, worker: _LocalWorker) -> str:
