@@ -30,7 +30,7 @@ _AHEAD = 2
 
 
 class RayWorkers:
-    """CallWorkers of a Ray cluster, as many at a time as it has CPUs for.
+    """Workers of a Ray cluster, as many at a time as it has CPUs for.
 
     Args:
         address: address of the cluster; `auto`: the cluster to which this machine belongs; `local`: this

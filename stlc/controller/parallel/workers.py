@@ -1,6 +1,6 @@
 """Calls of functions in worker processes; a lost worker costs only the calls that it was making.
 
-A call is a function of a module and an argument that can be pickled. CallWorkers are processes of this machine
+A call is a function of a module and an argument that can be pickled. Workers are processes of this machine
 (`LocalProcesses`) or of a Ray cluster (`stlc.controller.parallel.ray_cluster.RayWorkers`).
 """
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -49,7 +51,7 @@ def some() -> None:
     recording("logs/1/high.csv", a=[0.0] * 7 + [3.0] + [0.0] * 5 + [4.0] * 7)
     recording("logs/2/late.csv", b=[0.0, 0.0, 2.0] + [0.5] * 17)
     recording("logs/2/short.csv", a=[0.0] * 4, b=[0.0] * 4)
-    Path("logs/2/broken.csv").write_text("t,a\n0,1\n")
+    Path("logs/2/broken.csv").write_text("t,a\n0,1\n0.1,1\n")
     Path("logs/.hidden").mkdir()
     recording("logs/.hidden/no.csv")
 
@@ -141,6 +143,18 @@ def test_a_file_that_is_called_like_a_pattern() -> None:
     recording("[1].csv", a=[3.0] * 20)
     recording("1.csv")
     assert check("[1].csv", "-q") == 1
+
+
+def test_torch_is_not_imported() -> None:
+    some()
+    code = (
+        "import sys\n"
+        "from stlc.cli.framework.app import main\n"
+        "import stlc.controller.parallel.ray_cluster\n"
+        "assert main(['check', 's.stl', 'logs/1/*.csv', '--jobs', '2', '--table', 't.csv']) == 1\n"
+        "assert 'torch' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
 # ------------------------------------------------------------------- lost processes

@@ -12,9 +12,9 @@ import pytest
 from stlc.controller.parallel import workers_of
 from stlc.controller.parallel.workers import (
     ATTEMPTS,
+    CallError,
     LocalProcesses,
     LostCall,
-    CallError,
     end_in_words,
     results,
 )
