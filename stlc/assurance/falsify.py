@@ -12,12 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from time import perf_counter
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.assurance.guidance import SAMPLES, scales_of
 from stlc.assurance.search_space import Point, SearchSpace
+from stlc.assurance.simulation import Focus, SharedSimulator, Simulations, Simulator, Workers
 from stlc.assurance.strategies import (
     ConstantVertices,
     CovarianceAdaptation,
@@ -43,46 +45,6 @@ DIGITS = (0, 1, 2, 3)
 """Decimal digits, in the unit cube, to which values of a counterexample are rounded, the fewest first."""
 MOST_SHRUNK = 60
 """Coordinates at most that are shrunk one by one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Simulations:
-    """Outcomes of simulations.
-
-    Attributes:
-        margins: exact robustness per requirement, (count, requirements); -inf where states are not finite.
-        guidance: scaled robustness per requirement, (count, requirements), of the same sign.
-        admissible: whether the initial state meets the conditions of `where`, (count,).
-    """
-
-    margins: NDArray[np.float64]
-    guidance: NDArray[np.float64]
-    admissible: NDArray[np.bool_]
-
-
-class Simulator(Protocol):
-    """Simulations of a closed system, as a function of points in the unit cube."""
-
-    @property
-    def space(self) -> SearchSpace:
-        """The search space."""
-
-    @property
-    def batch(self) -> int:
-        """Number of points that are best simulated side by side."""
-
-    @property
-    def requirements(self) -> Sequence[str]:
-        """Names of the requirements, in the order of the margins."""
-
-    def seen(self, requirement: int) -> float:
-        """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
-
-    def simulate(self, points: NDArray[np.float64]) -> Simulations:
-        """Simulate and judge `points`, (count, dim)."""
-
-    def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Margins at half the time step, (count, requirements); None if the step cannot be changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +174,114 @@ class Portfolio:
                 other.observe(proposal.point, value)
 
 
+class Search:
+    """A search for a violation of one requirement, as a dialogue: points are asked for, outcomes are told.
+
+    The first simulations measure the sizes of the predicates. They are judged again with the scales that
+    follow, before the strategies learn from them.
+
+    Attributes:
+        focus: what the next points are judged by.
+        found: the counterexample; None until there is one.
+        tried: number of simulations.
+        least: least robustness of all simulations.
+    """
+
+    def __init__(self, simulator: Simulator, requirement: int, seed: int, *, random: bool = False) -> None:
+        """Begin a search; arguments as of `falsify`."""
+        self._simulator, self._requirement = simulator, requirement
+        self._part = simulator.space.visible(simulator.seen(requirement))
+        self._portfolio = Portfolio(self._part.space, np.random.default_rng(seed), random=random)
+        self.focus = Focus(requirement, sized=True)
+        self.found: Counterexample | None = None
+        self.tried, self.least = 0, math.inf
+        self._open: list[Proposal] = []
+        self._first: list[Proposal] = []
+        self._sizes: list[NDArray[np.float64]] = []
+        self._again = False
+        self._points: list[Point] = []
+        self._spurious: list[Counterexample] = []
+        self._counts: Counter[str] = Counter()
+        self._rejected = self._row = 0
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the last points had no admissible initial state."""
+        return self._row >= REJECTED
+
+    def ask(self, count: int) -> NDArray[np.float64]:
+        """Points to simulate next, (k, dim); k is `count`, unless the first ones are judged again."""
+        if self._again:
+            self._open, self._first = self._first, []
+        else:
+            self._open = [self._portfolio.next() for _ in range(count)]
+        return np.stack([self._part.whole(each.point) for each in self._open])
+
+    def tell(self, points: NDArray[np.float64], outcome: Simulations) -> None:
+        """Take the outcomes of the points that were asked for."""
+        again, self._again = self._again, False
+        told = outcome.guidance.copy()
+        if not again:
+            self._count(points, outcome, told)
+        if outcome.sizes.shape[1] == 0:
+            self.focus = Focus(self._requirement, self.focus.scales)
+            self._teach(outcome.admissible, told)
+            return
+        self._first += self._open
+        self._sizes.append(outcome.sizes)
+        if len(self._first) >= SAMPLES:
+            self.focus = Focus(self._requirement, scales_of(np.concatenate(self._sizes)))
+            self._again = True
+
+    def _teach(self, admissible: NDArray[np.bool_], told: NDArray[np.float64]) -> None:
+        for index, each in enumerate(self._open):
+            self._portfolio.tell(each, float(told[index]) if admissible[index] else math.inf)
+
+    def _count(
+        self, points: NDArray[np.float64], outcome: Simulations, told: NDArray[np.float64]
+    ) -> None:
+        """Count simulations, and examine violations; `told`, (count,), becomes what strategies are told."""
+        for index, each in enumerate(self._open):
+            if not outcome.admissible[index]:
+                self._rejected, self._row = self._rejected + 1, self._row + 1
+                continue
+            self._row = 0
+            self.tried += 1
+            self._points.append(each.point)
+            name, margin = each.strategy.name, float(outcome.margins[index])
+            self._counts[name] += 1
+            self.least = min(self.least, margin)
+            if margin < -TOLERANCE and self.found is None:
+                told[index] = self._examined(points[index], margin, name)
+
+    def _examined(self, point: Point, margin: float, name: str) -> float:
+        """Examine a violation at half the time step, and return the guidance there, which may be positive."""
+        half = self._simulator.at_half_step(point[None], self.focus)
+        at_half = None if half is None else float(half.margins[0])
+        candidate = Counterexample(point, margin, at_half, name, self.tried)
+        if candidate.spurious:
+            self._spurious.append(candidate)
+        else:
+            self.found = candidate
+        return margin if half is None else float(half.guidance[0])
+
+    def result(self, seconds: float = 0.0, *, shrinks: bool = True) -> Falsification:
+        """The result so far, after `seconds`; a counterexample is shrunk if `shrinks`."""
+        simulator, found = self._simulator, self.found
+        return Falsification(
+            simulator.requirements[self._requirement],
+            found,
+            shrunk(simulator, self._requirement, found) if found is not None and shrinks else None,
+            tuple(self._spurious),
+            self.tried if found is None else found.simulation,
+            self.least,
+            coverage(np.array(self._points).reshape(len(self._points), self._part.space.dim)),
+            self._rejected,
+            seconds,
+            dict(self._counts),
+        )
+
+
 def falsify(
     simulator: Simulator,
     requirement: int,
@@ -220,7 +290,6 @@ def falsify(
     seed: int,
     random: bool = False,
     shrinks: bool = True,
-    progress: Callable[[int, float], None] | None = None,
 ) -> Falsification:
     """Search for a violation of one requirement.
 
@@ -231,62 +300,61 @@ def falsify(
         seed: seed of the search; the same seed gives the same simulations.
         random: whether points are drawn from the declared distribution only, as a baseline.
         shrinks: whether a counterexample is shrunk.
-        progress: function that receives the number of simulations and the least robustness so far.
     """
-    began, generator = perf_counter(), np.random.default_rng(seed)
-    whole = simulator.space
-    part = whole.visible(simulator.seen(requirement))
-    portfolio = Portfolio(part.space, generator, random=random)
-    tried: list[Point] = []
-    spurious: list[Counterexample] = []
-    counts: dict[str, int] = {}
-    least, rejected, row, found = math.inf, 0, 0, None
-    while found is None and len(tried) < budget.simulations and row < REJECTED:
+    began = perf_counter()
+    search = Search(simulator, requirement, seed, random=random)
+    while search.found is None and search.tried < budget.simulations and not search.exhausted:
         if budget.seconds is not None and perf_counter() - began > budget.seconds:
             break
-        count = min(simulator.batch, budget.simulations - len(tried))
-        proposals = [portfolio.next() for _ in range(count)]
-        points = np.stack([part.whole(each.point) for each in proposals])
-        outcome = simulator.simulate(points)
-        for index, each in enumerate(proposals):
-            if not outcome.admissible[index]:
-                rejected, row = rejected + 1, row + 1
-                portfolio.tell(each, math.inf)
-                continue
-            row = 0
-            tried.append(each.point)
-            name = each.strategy.name
-            counts[name] = counts.get(name, 0) + 1
-            margin = float(outcome.margins[index, requirement])
-            least = min(least, margin)
-            portfolio.tell(each, float(outcome.guidance[index, requirement]))
-            if margin < -TOLERANCE and found is None:
-                candidate = _candidate(simulator, requirement, points[index], margin, name, len(tried))
-                if candidate.spurious:
-                    spurious.append(candidate)
-                else:
-                    found = candidate
-        if progress is not None:
-            progress(len(tried), least)
-    return Falsification(
-        simulator.requirements[requirement],
-        found,
-        shrunk(simulator, requirement, found) if found is not None and shrinks else None,
-        tuple(spurious),
-        len(tried) if found is None else found.simulation,
-        least,
-        coverage(np.array(tried).reshape(len(tried), part.space.dim)),
-        rejected,
-        perf_counter() - began,
-        counts,
+        points = search.ask(min(simulator.batch, budget.simulations - search.tried))
+        search.tell(points, simulator.simulate(points, search.focus))
+    return search.result(perf_counter() - began, shrinks=shrinks)
+
+
+@dataclass(frozen=True, slots=True)
+class SearchOrder:
+    """Settings of searches that differ only in their requirements; as the arguments of `falsify`."""
+
+    budget: SearchBudget
+    seed: int
+    random: bool = False
+    shrinks: bool = True
+
+
+def falsify_each(
+    simulator: Simulator, requirements: Sequence[int], order: SearchOrder, workers: Workers | None = None
+) -> Iterator[Falsification]:
+    """Search for violations of several requirements, and yield the results in order.
+
+    With workers, each search is carried out by one of them, with the same result; if there is only one
+    requirement, its simulations are shared out, and the search proposes as many points at a time as there are
+    workers.
+    """
+    if workers is not None and len(requirements) > 1:
+        yield from workers.run(_search, [(each, order) for each in requirements])
+        return
+    shared = simulator if workers is None else SharedSimulator(simulator, workers)
+    for each in requirements:
+        yield _search(shared, (each, order))
+
+
+def _search(simulator: Simulator, what: tuple[int, SearchOrder]) -> Falsification:
+    requirement, order = what
+    return falsify(
+        simulator,
+        requirement,
+        budget=order.budget,
+        seed=order.seed,
+        random=order.random,
+        shrinks=order.shrinks,
     )
 
 
 def _candidate(
     simulator: Simulator, requirement: int, point: Point, margin: float, strategy: str, count: int
 ) -> Counterexample:
-    half = simulator.at_half_step(point[None])
-    at_half = None if half is None else float(half[0, requirement])
+    half = simulator.at_half_step(point[None], Focus(requirement))
+    at_half = None if half is None else float(half.margins[0])
     return Counterexample(point, margin, at_half, strategy, count)
 
 
@@ -303,8 +371,8 @@ def shrunk(simulator: Simulator, requirement: int, found: Counterexample) -> Cou
             point = _set(found.point, coordinates, value)
             if np.array_equal(point, found.point):
                 break
-            outcome = simulator.simulate(point[None])
-            margin = float(outcome.margins[0, requirement])
+            outcome = simulator.simulate(point[None], Focus(requirement))
+            margin = float(outcome.margins[0])
             if outcome.admissible[0] and margin < -TOLERANCE:
                 simpler = _candidate(simulator, requirement, point, margin, found.strategy, found.simulation)
                 if not simpler.spurious:
