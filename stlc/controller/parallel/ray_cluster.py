@@ -69,10 +69,14 @@ class RayWorkers:
             self._stack.close()
 
     @property
+    def size(self) -> int:
+        """Number of calls that are made at a time, with the CPUs that the cluster has now."""
+        return max(int(self._ray.cluster_resources().get("CPU", 0.0)) // self._cores, 1)
+
+    @property
     def free(self) -> int:
-        """Number of calls for which there is room: `_AHEAD` per CPU, less those in progress."""
-        cpus = self._ray.cluster_resources().get("CPU", 0.0)
-        return max(int(_AHEAD * cpus / self._cores), 1) - len(self._going)
+        """Number of calls for which there is room: `_AHEAD` times `size`, less those in progress."""
+        return _AHEAD * self.size - len(self._going)
 
     def submit(
         self, key: int, function: Callable[[Any], Any], argument: object, files: CallFiles = NO_FILES

@@ -80,6 +80,10 @@ class CallWorkers(Protocol):
         """End the workers; calls in progress are dropped."""
 
     @property
+    def size(self) -> int:
+        """Number of calls that are made at a time."""
+
+    @property
     def free(self) -> int:
         """Number of calls for which there is room."""
 
@@ -186,6 +190,11 @@ class LocalProcesses:
             worker.pipe.close()
         self._workers.clear()
         self._stack.close()
+
+    @property
+    def size(self) -> int:
+        """Number of processes."""
+        return self._count
 
     @property
     def free(self) -> int:
