@@ -350,8 +350,12 @@ def falsify_each(
             yield _search(shared, (each, order))
         return
     ended = workers.run(_search, [(each, order) for each in requirements])
-    for each, found in zip(requirements, ended, strict=True):
-        yield _search(shared, (each, order)) if isinstance(found, LostCall) else found
+    for each in requirements:
+        found = next(ended)
+        if isinstance(found, LostCall):
+            ended = iter(list(ended))  # the workers must be free
+            found = _search(shared, (each, order))
+        yield found
 
 
 def _search(simulator: Simulator, what: tuple[int, SearchOrder]) -> Falsification:

@@ -6,6 +6,7 @@ but the simulator, so that the outcomes are the same however many workers there 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -106,10 +107,9 @@ _loaded: list[tuple[SimulatorSource, Simulator]] = []
 def _call(order: _Order) -> _Found:
     """Carry out a task in a worker process, which has one core."""
     if not _loaded or _loaded[0][0] != order.source:
-        import torch
-
-        torch.set_num_threads(1)
         _loaded[:] = [(order.source, order.source.load())]
+        if (torch := sys.modules.get("torch")) is not None:
+            torch.set_num_threads(1)
     simulator = _loaded[0][1]
     findings: list[PlantFinding] = getattr(simulator, "findings", [])
     findings.clear()
