@@ -118,3 +118,44 @@ def test_a_file_whose_workers_are_always_killed_is_not_judged(
         code, result = printed(capsys, *words)
     assert len(killed) == 3
     assert (code, result) == (5, {"trace": "long.npz", "verdict": "not judged"})
+
+
+SYSTEM = """
+stlc: 1
+name: oscillator
+time: {dt: 0.001 s, horizon: 10000 steps, integrator: rk4}
+inputs: {f: {range: [-1, 1], pieces: 10, duration: 10 s}}
+state: {x: {range: [-9, 9]}, v: {range: [-9, 9]}}
+flow: {x: v, v: "f - x - 0.2 * v"}
+init: {mixture: [{draw: {x: "uniform(-0.1, 0.1)", v: 0}}]}
+"""
+CLAIMS = """
+system "oscillator.yaml"
+signal x, v, f
+require resonance: always[0 s, 10 s] x < 2.2
+require bounded: always[0 s, 10 s] x < 50
+require mixed: always[0 s, 5 s] (x < 1.5 or 1000 * v < 500)
+"""
+
+
+@pytest.mark.parametrize("requirements", [["bounded"], ["resonance", "bounded", "mixed"]])
+def test_searches_although_workers_are_killed(
+    requirements: list[str],
+    cluster: Any,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("oscillator.yaml").write_text(SYSTEM)
+    Path("oscillator.stl").write_text(CLAIMS)
+    words = ["falsify", "oscillator.stl", "--simulations", "200", "--batch", "4"]
+    words += [word for name in requirements for word in ("--require", name)]
+    code, here = printed(capsys, *words)
+    with killing(2) as killed:
+        there = printed(capsys, *words, "--cluster", cluster.address)
+    assert len(killed) == 2
+    for each in (*here["requirements"], *there[1]["requirements"]):
+        del each["seconds"]
+    assert there == (code, here)
+    assert there[1]["lost"] == 0
