@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from stlc.assurance.guidance import SAMPLES, scales_of
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.simulation import Focus, SharedSimulator, Simulations, Simulator, Workers
+from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
+from stlc.assurance.simulation import Focus, Simulations, Simulator
 from stlc.assurance.strategies import (
     STARTS,
     CoarseSampling,
@@ -34,6 +35,7 @@ from stlc.assurance.strategies import (
     VertexSampling,
 )
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.parallel.workers import LostCall
 
 FALSIFIER_VERSION = 2
 """Version of the search; results of older versions are recomputed."""
@@ -265,9 +267,7 @@ class Search:
         for index, each in enumerate(self._open):
             self._portfolio.tell(each, float(told[index]) if admissible[index] else math.inf)
 
-    def _count(
-        self, points: NDArray[np.float64], outcome: Simulations, told: NDArray[np.float64]
-    ) -> None:
+    def _count(self, points: NDArray[np.float64], outcome: Simulations, told: NDArray[np.float64]) -> None:
         """Count simulations, and examine violations; `told`, (count,), becomes what strategies are told."""
         for index, each in enumerate(self._open):
             if not outcome.admissible[index]:
@@ -341,33 +341,55 @@ def falsify(
 
 @dataclass(frozen=True, slots=True)
 class SearchOrder:
-    """Settings of searches that differ only in their requirements; as the arguments of `falsify`."""
+    """Settings of searches that differ only in their requirements.
+
+    Attributes:
+        budget: limits of each search.
+        seed: seed of each search.
+        random: whether points are drawn from the declared distribution only, as a baseline.
+        shrinks: whether counterexamples are shrunk.
+        batch: number of points that a search proposes at a time; None: as many as there are workers for. The
+            same seed and number give the same simulations, whatever workers there are.
+    """
 
     budget: SearchBudget
     seed: int
     random: bool = False
     shrinks: bool = True
+    batch: int | None = None
 
 
 def falsify_each(
-    simulator: Simulator, requirements: Sequence[int], order: SearchOrder, workers: Workers | None = None
+    simulator: Simulator,
+    requirements: Sequence[int],
+    order: SearchOrder,
+    workers: SimulatorWorkers | None = None,
 ) -> Iterator[Falsification]:
     """Search for violations of several requirements, and yield the results in order.
 
     With workers, each search is carried out by one of them, with the same result; if there is only one
     requirement, its simulations are shared out, and the search proposes as many points at a time as there are
-    workers.
+    workers. A search that is lost with its workers is carried out in that way too, so that it costs only the
+    simulations that end them.
     """
-    if workers is not None and len(requirements) > 1:
-        yield from workers.run(_search, [(each, order) for each in requirements])
+    shared = simulator if workers is None else SharedSimulator(simulator, workers, order.batch)
+    if workers is None or len(requirements) == 1:
+        for each in requirements:
+            yield _search(shared, (each, order))
         return
-    shared = simulator if workers is None else SharedSimulator(simulator, workers)
+    ended = workers.run(_search, [(each, order) for each in requirements])
     for each in requirements:
-        yield _search(shared, (each, order))
+        found = next(ended)
+        if isinstance(found, LostCall):
+            ended = iter(list(ended))  # the workers must be free
+            found = _search(shared, (each, order))
+        yield found
 
 
 def _search(simulator: Simulator, what: tuple[int, SearchOrder]) -> Falsification:
     requirement, order = what
+    if order.batch is not None and not isinstance(simulator, SharedSimulator):
+        simulator = SharedSimulator(simulator, None, order.batch)
     return falsify(
         simulator,
         requirement,

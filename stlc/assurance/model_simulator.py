@@ -152,13 +152,13 @@ class ModelSimulator:
         """Outcomes at half the time step; None for a system in discrete time."""
         if self._finer is None:
             return None
-        states = self.points.states(torch.from_numpy(np.ascontiguousarray(points)))
+        states = self.points.states(torch.tensor(points))
         admissible = self.points.admissible(states).numpy()
         return self._judged(self._moved(self._finer, states), focus, admissible, self._finer_guides)
 
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:
         """Simulated trajectories of `points`, (count, dim), as a trace."""
-        states = self.points.states(torch.from_numpy(np.ascontiguousarray(points)))
+        states = self.points.states(torch.tensor(points))
         return self.trace_from(states, seed)
 
     def trace_from(self, states: Tensor, seed: int | None = None) -> Trace:

@@ -173,6 +173,7 @@ class FalsifiedSystem(TypedDict):
     seed: int
     coordinates: int
     failures: list[str]
+    lost: int
     requirements: list[FalsifiedRequirement]
 
 
