@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.search_space import Point, SearchSpace
 from stlc.stopping import leaving
 
 Argument = TypeVar("Argument")
@@ -101,6 +101,9 @@ class Simulator(Protocol):
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None if the step cannot be changed."""
 
+    def gradient(self, point: Point, requirement: int) -> Point | None:
+        """Gradient of the exact robustness at a point, (dim,); None if there is none."""
+
 
 class SimulatorSource(Protocol):
     """Description of a simulator that can be sent to another process."""
@@ -169,6 +172,10 @@ class SharedSimulator:
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None if the step cannot be changed."""
         return self.local.at_half_step(points, focus)
+
+    def gradient(self, point: Point, requirement: int) -> Point | None:
+        """Gradient of the exact robustness at a point, (dim,); None if there is none."""
+        return self.local.gradient(point, requirement)
 
 
 class LocalWorkers:
