@@ -17,6 +17,8 @@ from stlc.assurance.search_space import Point, SearchSpace
 
 STARTS = 10
 """Points from which the best is the start of a climb."""
+KEPT = 8
+"""Points that a local search keeps, and starts from."""
 PATIENCE = 60
 """Steps without progress after which a climb starts anew."""
 NARROW, WIDE = 0.01, 0.5
@@ -139,24 +141,37 @@ class _Start:
     """The best of the last points that were simulated, from which a local search starts.
 
     Attributes:
-        point: the best point; None if there is none.
-        value: its guidance value.
         seen: number of points.
     """
 
     def __init__(self) -> None:
-        self.point: Point | None = None
-        self.value, self.seen = math.inf, 0
+        self._best: list[tuple[float, int, Point]] = []
+        self.seen = 0
+
+    @property
+    def point(self) -> Point | None:
+        """The best point; None if there is none."""
+        return self._best[0][2] if self._best else None
+
+    @property
+    def value(self) -> float:
+        """Guidance value of the best point."""
+        return self._best[0][0] if self._best else math.inf
 
     def add(self, point: Point, value: float) -> None:
-        """Take a point into account."""
+        """Take a point into account; the earlier one of equally good points is the better one."""
         self.seen += 1
-        if value < self.value:
-            self.point, self.value = point, value
+        if math.isfinite(value):
+            self._best = sorted([*self._best, (value, self.seen, point)])[:KEPT]
+
+    def one_of_the_best(self, generator: np.random.Generator) -> Point:
+        """The best point with probability one half, else the second best with one half, and so on."""
+        index = min(int(generator.geometric(0.5)) - 1, len(self._best) - 1)
+        return self._best[index][2]
 
 
 class HillClimbing(Strategy):
-    """Steps from the best of the points so far: single values, or runs of successive values of an input.
+    """Steps from one of the best points so far: in single values, or in pieces and runs of successive values.
 
     After `PATIENCE` steps without progress it starts anew from the best of `STARTS` later points.
     """
@@ -174,7 +189,7 @@ class HillClimbing(Strategy):
     def propose(self) -> Point:
         if self._start.point is None or self._start.seen < STARTS:
             return self._coarse[int(self.generator.integers(2))].propose()
-        return self._neighbour(self._start.point)
+        return self._neighbour(self._start.one_of_the_best(self.generator))
 
     def tell(self, point: Point, value: float) -> None:
         super().tell(point, value)

@@ -106,7 +106,7 @@ def test_gradients_agree_with_differences_and_count_as_simulations():
 
 
 def test_models_with_jumps_or_whole_numbers_have_no_gradient():
-    Path("oscillator.yaml").write_text(SYSTEM + "jump: [{when: x > 8, set: {x: 0}}]\n")
+    Path("oscillator.yaml").write_text(SYSTEM + "jump: [{guard: x > 8, reset: {x: 0}}]\n")
     simulator = ModelSimulator.load("oscillator.stl", None, {})
     assert simulator.gradient(np.full(simulator.space.dim, 0.5), 0) is None
 
