@@ -99,10 +99,9 @@ def test_gradients_agree_with_differences_and_count_as_simulations():
         pytest.skip("there is no C compiler")
     moved = simulator.simulate(point + 1e-5 * np.eye(len(point)), Focus(0)).margins
     assert np.allclose(slope, (moved - simulator.simulate(point[None], Focus(0)).margins) / 1e-5, atol=1e-4)
-    found = falsify(simulator, 0, budget=SearchBudget(200), seed=3)
-    assert found.found is not None
-    assert found.strategies["gradient"] >= 1
-    assert sum(found.strategies.values()) == found.simulations
+    found = falsify(simulator, 1, budget=SearchBudget(24), seed=3)
+    assert found.strategies["gradient"] >= 2
+    assert sum(found.strategies.values()) == found.simulations >= 24
 
 
 def test_models_with_jumps_or_whole_numbers_have_no_gradient():
