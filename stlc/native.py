@@ -197,7 +197,9 @@ class Adjoint:
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._pull = library.pull
-        self._pull.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 5 + [ctypes.c_double]
+        self._pull.argtypes = (
+            [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 5 + [ctypes.c_double, ctypes.c_void_p]
+        )
 
     def pull(
         self,
@@ -223,18 +225,31 @@ class Adjoint:
         Raises:
             MemoryError: there is not enough memory.
         """
+        return self._pulled(x0, u, outcome, threads)[0]
+
+    def pull_starts(
+        self, x0: NDArray[np.float64], u: NDArray[np.float64], outcome: ObjectiveSlopes
+    ) -> NDArray[np.float64]:
+        """Compute the gradient of an objective with respect to initial states, (B, n); else as `pull`."""
+        return self._pulled(x0, u, outcome, 1)[1]
+
+    def _pulled(
+        self, x0: NDArray[np.float64], u: NDArray[np.float64], outcome: ObjectiveSlopes, threads: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in (x0, u, outcome.by_rho)]
         columns = None if outcome.by_columns is None else np.ascontiguousarray(outcome.by_columns, np.float64)
         where = None if columns is None else columns.ctypes.data
-        batch, out = len(x0), np.empty_like(arrays[1])
+        batch, out, starts = len(x0), np.empty_like(arrays[1]), np.empty_like(arrays[0])
 
         def rows(first: int, last: int) -> int:
             pointers = [a.ctypes.data for a in arrays]
-            done: int = self._pull(batch, first, last, *pointers, where, out.ctypes.data, outcome.slope)
+            done: int = self._pull(
+                batch, first, last, *pointers, where, out.ctypes.data, outcome.slope, starts.ctypes.data
+            )
             return done
 
         _share(rows, batch, 1 if batch < SMALL else threads)
-        return out
+        return out, starts
 
 
 class Advance:

@@ -51,6 +51,15 @@ def test_a_grid_instead() -> None:
     assert len({tuple(row) for row in x0[:, [0, 1, 4]].tolist()}) == 84
 
 
+def test_a_ball_that_bounces_within_a_step() -> None:
+    (text,) = blocks("ball")
+    ball = system(text)
+    x0 = ball.sample(10, seed=0, dtype=torch.float64)
+    x = ball.rollout(x0, torch.zeros(10, ball.horizon, 0, dtype=torch.float64))
+    assert x[:, :, 0].min() > -1e-4
+    assert x[:, 1:, 1].max() > 3.0
+
+
 def test_a_feedback_beneath_the_plans() -> None:
     whole = "\n".join(text for text in blocks("") if not text.startswith("policy:"))
     whole = re.sub(r"^policy:.*$", "", whole, flags=re.MULTILINE)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder
@@ -99,6 +99,10 @@ class DriveSimulator:
         """Least robustness of the agents of each simulation, (count, requirements)."""
         each = [judgement.high.min(0) for judgement in self._verdict(recording)]
         return np.stack([rho.reshape(-1, self.setting.agents).min(1) for rho in each], 1)
+
+    def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
+        """None: a drive has no gradient."""
+        return None
 
     def trace(self, points: NDArray[np.float64]) -> Trace:
         """Drives at `points`, (count, dim), as a trace with one row per agent."""

@@ -22,12 +22,13 @@ from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus, Simulations, Simulator
 from stlc.assurance.strategies import (
-    STARTS,
+    PIECES,
     CoarseSampling,
     CoarseVertices,
     ConstantVertices,
     CovarianceAdaptation,
     DiscreteSampling,
+    GradientVertices,
     HillClimbing,
     PeriodicInputs,
     Strategy,
@@ -45,6 +46,8 @@ CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""
 MOST_PAIRED = 40
 """Coordinates at most whose pairs are counted."""
+OPENING = 20
+"""Points of random pieces with which a search begins, after constant inputs."""
 REJECTED = 1000
 """Successive points without an admissible initial state after which a search ends."""
 DIGITS = (0, 1, 2, 3)
@@ -131,30 +134,42 @@ class Portfolio:
     """
 
     def __init__(
-        self, space: SearchSpace, generator: np.random.Generator, *, random: bool = False, graded: bool = True
+        self,
+        space: SearchSpace,
+        generator: np.random.Generator,
+        gradient: Callable[[Point], Point | None],
+        *,
+        random: bool = False,
+        graded: bool = True,
     ) -> None:
         """Take turns between all strategies, or sample uniformly if `random`.
 
         Args:
             space: the search space.
             generator: source of all random numbers.
+            gradient: function that returns the gradient of the robustness at a point, or None.
             random: whether points are drawn from the declared distribution only.
             graded: whether the robustness varies with the signals, rather than taking a few values.
         """
         self._uniform = UniformSampling(space, generator)
         self._discrete = DiscreteSampling(space, generator)
         self._first: list[Strategy] = []
+        self._samplers: list[Strategy] = []
         self._turns: list[Strategy] = []
         self._random, self._graded = random, graded
         if not random and graded and space.dim:
-            kinds = [CoarseSampling, CoarseVertices, VertexSampling] if space.blocks else [VertexSampling]
-            samplers: list[Strategy] = [kind(space, generator) for kind in kinds]
-            self._first = [samplers[index % len(samplers)] for index in range(STARTS)]
-            self._vertices: Strategy | None = ConstantVertices(space, generator)
-            self._turns = [HillClimbing(space, generator)]
+            vertices, uniform = VertexSampling(space, generator), self._uniform
+            self._samplers = [vertices, uniform]
+            if any(len(block.values) > PIECES for block in space.blocks):
+                coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
+                self._samplers = [*coarse, vertices]
+            climb = GradientVertices(space, generator, gradient)
+            drawn = [self._samplers[index % len(self._samplers)] for index in range(OPENING)]
+            constant = ConstantVertices(space, generator)
+            self._first = [vertices, vertices, constant, vertices, *drawn[:SAMPLES], climb, *drawn[SAMPLES:]]
+            self._turns = [climb, HillClimbing(space, generator)]
             if CovarianceAdaptation.available(space):
                 self._turns.append(CovarianceAdaptation(space, generator))
-            self._turns += samplers
             if space.blocks:
                 self._turns.append(PeriodicInputs(space, generator))
         self._turn = 0
@@ -168,31 +183,34 @@ class Portfolio:
 
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
-        strategy = self._chosen()
-        point = strategy.propose()
-        if point is None and strategy is self._vertices:
-            self._vertices = None
-            return self.next()
-        return (
-            Proposal(self._uniform, self._uniform.propose()) if point is None else Proposal(strategy, point)
-        )
+        while self._first:
+            strategy = self._first[0]
+            point = strategy.propose()
+            if point is None or not isinstance(strategy, (ConstantVertices, GradientVertices)):
+                self._first.pop(0)
+            if point is not None:
+                return Proposal(strategy, point)
+        while True:
+            strategy = self._chosen()
+            point = strategy.propose()
+            if point is not None:
+                return Proposal(strategy, point)
 
     def _chosen(self) -> Strategy:
-        """The strategy whose turn it is."""
+        """The strategy whose turn it is, after the first points."""
         if not self._turns:
             return self._uniform if self._random or self._graded else self._discrete
-        if self._vertices is not None:
-            return self._vertices
-        if self._first:
-            return self._first.pop(0)
         if self.flat:
             return self._discrete
         self._turn += 1
-        if self._turn % 2 == 0:
+        kind = self._turn % 3
+        if kind == 0:
+            self._samplers = [*self._samplers[1:], self._samplers[0]]
+            return self._samplers[0]
+        if kind == 1:
             return min(self._turns, key=lambda each: each.best)
-        first, *others = self._turns
-        self._turns = [*others, first]
-        return first
+        self._turns = [*self._turns[1:], self._turns[0]]
+        return self._turns[0]
 
     def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others."""
@@ -221,7 +239,7 @@ class Search:
         self._simulator, self._requirement = simulator, requirement
         self._part = simulator.space.visible(simulator.seen(requirement))
         generator, graded = np.random.default_rng(seed), simulator.graded(requirement)
-        self._portfolio = Portfolio(self._part.space, generator, random=random, graded=graded)
+        self._portfolio = Portfolio(self._part.space, generator, self._gradient, random=random, graded=graded)
         self.focus = Focus(requirement, sized=True)
         self.found: Counterexample | None = None
         self.tried, self.least = 0, math.inf
@@ -262,6 +280,15 @@ class Search:
         if len(self._first) >= SAMPLES:
             self.focus = Focus(self._requirement, scales_of(np.concatenate(self._sizes)))
             self._again = True
+
+    def _gradient(self, point: Point) -> Point | None:
+        """Gradient of the robustness at a point, which counts as a simulation; None if there is none."""
+        found = self._simulator.gradient(self._part.whole(point), self._requirement)
+        if found is None:
+            return None
+        self.tried += 1
+        self._counts[GradientVertices.name] += 1
+        return found[list(self._part.coordinates)]
 
     def _teach(self, admissible: NDArray[np.bool_], told: NDArray[np.float64]) -> None:
         for index, each in enumerate(self._open):

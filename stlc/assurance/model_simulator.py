@@ -12,16 +12,17 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.assurance.guidance import Columns, ScaledRobustness, graded
-from stlc.assurance.search_space import SearchSpace, SignalBlock
+from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.controller.planning.planner import PlanResult
 from stlc.controller.planning.traces import trace_of
 from stlc.controller.problem.load import load_task
-from stlc.controller.problem.native import NativeJudge
+from stlc.controller.problem.native import NativeGradient, NativeJudge
 from stlc.diagnostics import usage
 from stlc.dynamics.init.quantiles import InitialPoints
+from stlc.native import Adjoint, ObjectiveSlopes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,6 +30,11 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.trace import Trace
+
+SMALL = 1e-4
+"""Differences, in the unit cube, by which initial states are differentiated."""
+SLOPE = 10.0
+"""Slope of the smooth step that stands for conditions in gradients; see `NativeGradient`."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +161,32 @@ class ModelSimulator:
         states = self.points.states(torch.tensor(points))
         admissible = self.points.admissible(states).numpy()
         return self._judged(self._moved(self._finer, states), focus, admissible, self._finer_guides)
+
+    def gradient(self, point: Point, requirement: int) -> Point | None:
+        """Gradient of the exact robustness at a point, (dim,), by the native kernel.
+
+        None without that kernel, and for dynamics with jumps or whole-number states, whose switching instants
+        the gradient would not see.
+        """
+        if self._adjoint is None:
+            return None
+        moved = np.where(point > 0.5, -SMALL, SMALL)  # differences of the initial states, inwards
+        states = self.points.states(torch.from_numpy(np.concatenate((point[None], point + np.diag(moved)))))
+        slopes = (states[1:] - states[:1]).numpy() / moved[:, None]
+        chosen = np.zeros((1, len(self.task.rules)))
+        chosen[0, requirement] = 1.0
+        start, plans = states[:1].numpy(), self._plans(self.task, 1).numpy()
+        by_states = self._adjoint.pull_starts(start, plans, ObjectiveSlopes(chosen, None, SLOPE))
+        found: Point = slopes @ by_states[0]
+        return found
+
+    @cached_property
+    def _adjoint(self) -> Adjoint | None:
+        decl, system = self.task.system.decl, self.task.system
+        whole = any(column.kind != "real" for column in decl.signature.columns)
+        judge = None if whole or decl.jumps else _kernel(self.task)
+        found = NativeGradient.of(system, self.task.rules, judge)
+        return None if found is None else found.adjoint
 
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:
         """Simulated trajectories of `points`, (count, dim), as a trace."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.search_space import SearchSpace, SignalBlock
+from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.files import find_spec, read_source
@@ -97,6 +97,10 @@ class PlantSimulator:
         focus: Focus,  # noqa: ARG002
     ) -> Simulations | None:
         """None: a black box has the time step of its file."""
+        return None
+
+    def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
+        """None: a black box has no gradient."""
         return None
 
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 Point = NDArray[np.float64]
 """Point of the unit cube, (dim,)."""
-MOST_VERTICES = 64
-"""Maximum number of constant vertices that are simulated."""
+MOST_VERTICES, MOST_CORNERS = 64, 16
+"""Maximum number of constant vertices that are simulated, and of all vertices of a small cube."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +107,22 @@ class SearchSpace:
             return
         if 2 ** len(handles) > MOST_VERTICES:
             handles = (tuple(each for handle in handles for each in handle),)
-        for ends in product((1.0, 0.0), repeat=len(handles)):
+        ends_of_all = product((1.0, 0.0), repeat=len(handles))
+        for ends in sorted(ends_of_all, key=lambda ends: len(set(ends)) == 1):  # opposite ends first
             point = self.middle()
             for handle, end in zip(handles, ends, strict=True):
                 point[list(handle)] = end
             yield point
+
+    def corners(self) -> Iterator[Point]:
+        """All vertices of the cube, those with most switches of inputs first; none if there are too many."""
+        if 2**self.dim > MOST_CORNERS or not self.blocks:
+            return
+        corners = np.array(list(product((1.0, 0.0), repeat=self.dim)))
+        switches = np.zeros(len(corners))
+        for block in self.blocks:
+            switches += np.abs(np.diff(corners[:, list(block.values)], axis=1)).sum(1)
+        yield from corners[np.argsort(-switches, kind="stable")]
 
     def held(self, generator: np.random.Generator, most: int = 5) -> NDArray[np.int64]:
         """Labels (dim,): coordinates with one label hold one value, in 1 to `most` pieces per input.

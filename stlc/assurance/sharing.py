@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.simulation import Focus, Simulations, Simulator, SimulatorSource
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall, results
 
@@ -182,6 +182,10 @@ class SharedSimulator:
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None if the step cannot be changed."""
         return self.local.at_half_step(points, focus)
+
+    def gradient(self, point: Point, requirement: int) -> Point | None:
+        """Gradient of the exact robustness at a point, (dim,); None if there is none."""
+        return self.local.gradient(point, requirement)
 
 
 def _missing(count: int, sizes: NDArray[np.float64]) -> Simulations:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.search_space import Point, SearchSpace
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +93,9 @@ class Simulator(Protocol):
 
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None if the step cannot be changed."""
+
+    def gradient(self, point: Point, requirement: int) -> Point | None:
+        """Gradient of the exact robustness at a point, (dim,); None if there is none."""
 
 
 class SimulatorSource(Protocol):

@@ -6,7 +6,8 @@ import importlib.util
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from stlc.assurance.search_space import Point, SearchSpace
 
 STARTS = 10
 """Points from which the best is the start of a climb."""
+KEPT = 8
+"""Points that a local search keeps, and starts from."""
 PATIENCE = 60
 """Steps without progress after which a climb starts anew."""
 NARROW, WIDE = 0.01, 0.5
@@ -59,13 +62,15 @@ class Strategy(ABC):
 
 
 class ConstantVertices(Strategy):
-    """Inputs that are constant at the ends of their ranges, one after the other."""
+    """Inputs that are constant at the ends of their ranges, one after the other; then few other vertices."""
 
     name = "constant vertices"
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
-        self._left: Iterator[Point] = space.constant_vertices()
+        constant = list(space.constant_vertices())
+        others = (each for each in space.corners() if not any(np.array_equal(each, old) for old in constant))
+        self._left: Iterator[Point] = chain(constant, others)
 
     def propose(self) -> Point | None:
         return next(self._left, None)
@@ -136,24 +141,37 @@ class _Start:
     """The best of the last points that were simulated, from which a local search starts.
 
     Attributes:
-        point: the best point; None if there is none.
-        value: its guidance value.
         seen: number of points.
     """
 
     def __init__(self) -> None:
-        self.point: Point | None = None
-        self.value, self.seen = math.inf, 0
+        self._best: list[tuple[float, int, Point]] = []
+        self.seen = 0
+
+    @property
+    def point(self) -> Point | None:
+        """The best point; None if there is none."""
+        return self._best[0][2] if self._best else None
+
+    @property
+    def value(self) -> float:
+        """Guidance value of the best point."""
+        return self._best[0][0] if self._best else math.inf
 
     def add(self, point: Point, value: float) -> None:
-        """Take a point into account."""
+        """Take a point into account; the earlier one of equally good points is the better one."""
         self.seen += 1
-        if value < self.value:
-            self.point, self.value = point, value
+        if math.isfinite(value):
+            self._best = sorted([*self._best, (value, self.seen, point)])[:KEPT]
+
+    def one_of_the_best(self, generator: np.random.Generator) -> Point:
+        """The best point with probability one half, else the second best with one half, and so on."""
+        index = min(int(generator.geometric(0.5)) - 1, len(self._best) - 1)
+        return self._best[index][2]
 
 
 class HillClimbing(Strategy):
-    """Steps from the best of the points so far: single values, or runs of successive values of an input.
+    """Steps from one of the best points so far: in single values, or in pieces and runs of successive values.
 
     After `PATIENCE` steps without progress it starts anew from the best of `STARTS` later points.
     """
@@ -171,7 +189,7 @@ class HillClimbing(Strategy):
     def propose(self) -> Point:
         if self._start.point is None or self._start.seen < STARTS:
             return self._coarse[int(self.generator.integers(2))].propose()
-        return self._neighbour(self._start.point)
+        return self._neighbour(self._start.one_of_the_best(self.generator))
 
     def tell(self, point: Point, value: float) -> None:
         super().tell(point, value)
@@ -187,24 +205,75 @@ class HillClimbing(Strategy):
         """Copy of a point with a few coordinates, or with a run of successive values of an input, changed."""
         generator, changed = self.generator, point.copy()
         width = math.exp(generator.uniform(math.log(NARROW), math.log(WIDE)))
-        for picked in self._picked():
+        for picked in self._picked(point):
             if generator.random() < 0.35:
                 changed[picked] = generator.choice((0.0, 1.0, generator.random()))
             else:
                 changed[picked] = np.clip(changed[picked] + width * generator.standard_normal(), 0.0, 1.0)
         return changed
 
-    def _picked(self) -> Iterator[list[int]]:
-        """Groups of coordinates to change: one and a half on average."""
+    def _picked(self, point: Point) -> Iterator[list[int]]:
+        """Groups of coordinates to change together, one and a half on average.
+
+        Half of the time the group is a piece: neighbours with one value. Otherwise it is a run of successive
+        values, or a single one.
+        """
         generator = self.generator
         for _ in range(1 + (generator.random() < 0.5)):
             pick = int(generator.integers(self.space.dim))
             block = next((each for each in self.space.blocks if pick in each.values), None)
-            if block is None or generator.random() < 0.5:
+            kind = generator.random()
+            if block is None or kind < 0.25:
                 yield [pick]
+            elif kind < 0.75:
+                yield _piece(point, block.values, block.values.index(pick))
             else:
                 first, last = np.sort(generator.integers(0, len(block.values), 2))
                 yield list(block.values[first : last + 1])
+
+
+def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
+    """Coordinates of the neighbours in `values` that share the value at `index`."""
+    first = last = index
+    while first > 0 and point[values[first - 1]] == point[values[index]]:
+        first -= 1
+    while last + 1 < len(values) and point[values[last + 1]] == point[values[index]]:
+        last += 1
+    return list(values[first : last + 1])
+
+
+class GradientVertices(Strategy):
+    """Vertices of the cube to which the gradient at the best point so far leads, while that makes progress.
+
+    They minimise the linearised robustness over the whole cube, as the steps of Frank and Wolfe (1956) do.
+    """
+
+    name = "gradient"
+
+    def __init__(
+        self, space: SearchSpace, generator: np.random.Generator, gradient: Callable[[Point], Point | None]
+    ) -> None:
+        """Search with a function that returns the gradient of the robustness at a point, or None."""
+        super().__init__(space, generator)
+        self._gradient, self._start = gradient, _Start()
+        self._last: Point | None = None
+
+    def propose(self) -> Point | None:
+        start = self._start.point
+        if start is None or start is self._last:
+            return None
+        self._last, slope = start, self._gradient(start)
+        if slope is None:
+            return None
+        target = np.where(slope < 0.0, 1.0, np.where(slope > 0.0, 0.0, start))
+        return None if np.array_equal(target, start) else target
+
+    def tell(self, point: Point, value: float) -> None:
+        super().tell(point, value)
+        self._start.add(point, value)
+
+    def observe(self, point: Point, value: float) -> None:
+        self._start.add(point, value)
 
 
 class PeriodicInputs(Strategy):
@@ -271,7 +340,7 @@ class PeriodicInputs(Strategy):
 
 
 def _van_der_corput(index: int) -> float:
-    """Element of the van der Corput sequence in base 2: 1/2, 1/4, 3/4, 1/8, and so on."""
+    """Element of the van der Corput sequence in base 2: 1/2, 1/4, 3/4, 1/8 and so on."""
     return int(f"{index:b}"[::-1], 2) / (1 << index.bit_length())
 
 

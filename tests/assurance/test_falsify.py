@@ -93,6 +93,55 @@ def test_a_search_without_success_reports_what_it_did():
     assert 45.0 < found.least < 50.0
 
 
+def test_gradients_agree_with_differences_and_count_as_simulations():
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    point = np.random.default_rng(2).random(simulator.space.dim)
+    slope = simulator.gradient(point, 0)
+    if slope is None:
+        pytest.skip("there is no C compiler")
+    moved = simulator.simulate(point + 1e-5 * np.eye(len(point)), Focus(0)).margins
+    assert np.allclose(slope, (moved - simulator.simulate(point[None], Focus(0)).margins) / 1e-5, atol=1e-4)
+    found = falsify(simulator, 1, budget=SearchBudget(24), seed=3)
+    assert found.strategies["gradient"] >= 2
+    assert sum(found.strategies.values()) == found.simulations >= 24
+
+
+def test_models_with_jumps_or_whole_numbers_have_no_gradient():
+    Path("oscillator.yaml").write_text(SYSTEM + "jump: [{guard: x > 8, reset: {x: 0}}]\n")
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    assert simulator.gradient(np.full(simulator.space.dim, 0.5), 0) is None
+
+
+SWITCHED = """
+stlc: 1
+name: switched
+time: {dt: 0.1 s, horizon: 40 steps, integrator: euler}
+inputs: {f: {range: [0, 1], pieces: 4, duration: 4 s}}
+state: {x: {range: [-9, 9]}}
+held: {level: {int: true, range: [0, 3], value: round(3 * f)}, z: {value: x}}
+flow: {x: -15 * x}
+init: {mixture: [{draw: {x: 1}}]}
+"""
+
+
+def test_a_violation_that_half_the_step_does_not_have_is_spurious():
+    Path("switched.yaml").write_text(SWITCHED)
+    Path("switched.stl").write_text(
+        'system "switched.yaml"\nsignal x, z\nsignal level : int\nrequire up: always[0 s, 3 s] x > -0.1\n'
+        "require steps: always[0 s, 3 s] (level != 2 or eventually[0.1 s, 1 s] level == 0)\n"
+    )
+    simulator = ModelSimulator.load("switched.stl", None, {})
+    found = falsify(simulator, 0, budget=SearchBudget(8), seed=0)
+    assert found.found is None
+    assert len(found.spurious) >= 5
+    assert found.spurious[0].margin == pytest.approx(-0.4)
+    assert found.spurious[0].half_step == pytest.approx(0.1)  # values of `held` keep their period
+    assert (simulator.graded(0), simulator.graded(1)) == (True, False)
+    discrete = falsify(simulator, 1, budget=SearchBudget(60), seed=0, shrinks=False)
+    assert discrete.found is not None
+    assert set(discrete.strategies) == {"discrete"}
+
+
 def test_guidance_has_the_sign_of_the_margin_and_scales_the_larger_predicate():
     simulator = ModelSimulator.load("oscillator.stl", None, {})
     index = simulator.requirements.index("mixed")

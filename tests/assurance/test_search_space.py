@@ -8,7 +8,11 @@ from hypothesis import strategies as st
 from stlc.assurance.falsify import coverage
 from stlc.assurance.search_space import SearchSpace, SignalBlock
 from stlc.assurance.strategies import (
+    CoarseSampling,
+    CoarseVertices,
     CovarianceAdaptation,
+    DiscreteSampling,
+    GradientVertices,
     HillClimbing,
     PeriodicInputs,
     VertexSampling,
@@ -29,6 +33,11 @@ def test_constant_vertices_hold_every_input_at_an_end():
     assert len(points) == 8  # two inputs and one other number
     assert all(set(point[:3]) in ({0.0}, {1.0}) and set(point[3:6]) in ({0.0}, {1.0}) for point in points)
     assert len({tuple(point) for point in points}) == 8
+
+
+def test_opposite_ends_come_first():
+    two = SearchSpace(2, (SignalBlock("throttle", (0,)), SignalBlock("brake", (1,))))
+    assert [tuple(point) for point in two.constant_vertices()] == [(1, 0), (0, 1), (1, 1), (0, 0)]
 
 
 def test_many_other_numbers_stay_at_their_medians():
@@ -54,7 +63,12 @@ def test_held_values_change_at_most_four_times(seed):
         assert not set(own) & set(np.delete(labels, list(block.values)))
 
 
-@given(st.integers(0, 200), st.sampled_from([VertexSampling, HillClimbing, PeriodicInputs]))
+@given(
+    st.integers(0, 200),
+    st.sampled_from(
+        [CoarseSampling, CoarseVertices, DiscreteSampling, VertexSampling, HillClimbing, PeriodicInputs]
+    ),
+)
 def test_strategies_stay_in_the_cube(seed, kind):
     generator = np.random.default_rng(seed)
     strategy = kind(TWO, generator)
@@ -80,6 +94,86 @@ def test_searches_approach_the_minimum(kind):
         strategy.tell(point, value)
     uniform = np.random.default_rng(3).random((300, 4))
     assert best < 0.5 * ((uniform - 0.3) ** 2).sum(1).min()
+
+
+LONG = SearchSpace(60, (SignalBlock("u", tuple(range(60)), fractions=tuple(np.arange(60) / 60)),))
+
+
+def test_coarse_inputs_have_few_pieces_and_vertices_many_ends():
+    coarse, ends = (kind(LONG, np.random.default_rng(0)) for kind in (CoarseSampling, CoarseVertices))
+    for _ in range(50):
+        assert len(set(coarse.propose())) <= 5
+        assert len(set(ends.propose())) <= 5
+    shares = [
+        np.isin(
+            np.stack([kind(LONG, np.random.default_rng(1)).propose() for _ in range(40)]), (0.0, 1.0)
+        ).mean()
+        for kind in (DiscreteSampling, VertexSampling)
+    ]
+    assert shares == pytest.approx([0.2, 2 / 3], abs=0.1)
+
+
+def test_a_climb_begins_at_the_best_points_that_others_have_found_and_moves_whole_pieces():
+    strategy = HillClimbing(LONG, np.random.default_rng(5))
+    good = np.repeat([0.2, 0.6, 0.4], 20)
+    for value in range(20):
+        strategy.observe(good if value % 2 else LONG.middle(), -1.0 if value % 2 else 1.0)
+    moved = [np.flatnonzero(strategy.propose() != good) for _ in range(60)]
+    assert float(np.mean([len(each) for each in moved])) < 20
+    assert sum(len(each) == 20 for each in moved) > 10
+
+
+def test_a_climb_without_progress_starts_anew():
+    strategy = HillClimbing(LONG, np.random.default_rng(5))
+    for _ in range(10):
+        strategy.observe(LONG.middle(), 0.0)
+    for _ in range(61):
+        strategy.tell(strategy.propose(), 1.0)
+    assert len(set(strategy.propose())) <= 5  # a coarse input, far from the point of before
+    assert not (strategy.propose() == 0.5).any()
+
+
+def test_gradients_lead_to_vertices_while_that_makes_progress():
+    def value(point):
+        return float((point * np.linspace(-1, 1, 60)).sum() + 0.1 * (point**2).sum())
+
+    def gradient(point):
+        return np.linspace(-1, 1, 60) + 0.2 * point
+
+    strategy = GradientVertices(LONG, np.random.default_rng(0), gradient)
+    assert strategy.propose() is None  # nowhere to start
+    strategy.observe(LONG.middle(), value(LONG.middle()))
+    first = strategy.propose()
+    assert set(first) == {0.0, 1.0}
+    assert strategy.propose() is None  # until its value is known
+    strategy.tell(first, value(first))
+    second = strategy.propose()
+    if second is not None:
+        strategy.tell(second, value(second))
+    assert strategy.best == pytest.approx(min(value(point) for point in (first, second) if point is not None))
+    assert strategy.propose() is None
+    nothing = GradientVertices(LONG, np.random.default_rng(0), lambda _: None)
+    nothing.observe(LONG.middle(), 0.0)
+    assert nothing.propose() is None
+
+
+def test_half_periods_are_swept_before_the_best_is_refined():
+    strategy = PeriodicInputs(LONG, np.random.default_rng(1))
+    halves = []
+    for _ in range(12):
+        point = strategy.propose()
+        runs = np.diff(np.flatnonzero(np.diff(point)))
+        halves.append(float(runs.mean()) if runs.size else 60.0)
+        strategy.tell(point, abs(halves[-1] - 9.0))
+    assert len({round(each, 1) for each in halves}) >= 6
+    best = min(abs(each - 9.0) for each in halves)
+    for _ in range(40):
+        point = strategy.propose()
+        runs = np.diff(np.flatnonzero(np.diff(point)))
+        value = abs(float(runs.mean()) - 9.0) if runs.size else 60.0
+        best = min(best, value)
+        strategy.tell(point, value)
+    assert best < 0.5
 
 
 def test_covariance_adaptation_takes_points_out_of_order():

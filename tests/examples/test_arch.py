@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +32,13 @@ def rk4(rate: Rate, x: Doubles, h: float) -> Doubles:
 
 
 def simulated(
-    name: str, horizon: str, rows: int = 6
+    name: str, horizon: str, rows: int = 6, **changes: str
 ) -> tuple[System, dict[str, Doubles], dict[str, Doubles]]:
     """A system, random rollouts of it (rows, steps + 1), and the reference values of its input signals.
 
     The rollouts are computed in C, and some of their steps also in torch.
     """
-    system = System.load(ROOT / f"examples/arch/{name}.yaml", {"time.horizon": horizon})
+    system = System.load(ROOT / f"examples/arch/{name}.yaml", {"time.horizon": horizon, **changes})
     task = Task.of(stlc.parse("require all: true"), system)
     assert task.native is not None
     x = task.rollout(
@@ -78,28 +79,43 @@ def constant(system: System, name: str) -> Doubles:
     return np.array(parts) if parts else np.array(known[name][0])
 
 
+def switched(mode: list[int], y: Doubles) -> list[int]:
+    """Modes of the followers (chasing 0, keeping 1, braking 2) after one switch of each that is due."""
+    found = []
+    for each, gap in zip(mode, np.diff(y), strict=True):
+        kept = 0 if gap >= 15 else 2 if gap <= 5 else 1
+        found.append([int(gap <= 10), kept, 0 if gap >= 20 else 2][each])
+    return found
+
+
 def test_chasing_cars() -> None:
-    system, columns, signals = simulated("chasing_cars", "6 s")
-    y, v = np.tile(np.arange(0.0, 50.0, 10.0), (6, 1)), np.zeros((6, 5))
-    mode = np.zeros((6, 4))  # chasing 0, keeping 1, braking 2
-    for k in range(system.horizon):
-        gap = np.diff(y, axis=1)
-        kept = np.where(gap >= 15, 0, np.where(gap <= 5, 2, 1))
-        mode = np.choose(mode.astype(int), [np.where(gap <= 10, 1, 0), kept, np.where(gap >= 20, 0, 2)])
-        throttle, brake = (signals[name][:, k, None] for name in ("throttle", "brake"))
+    """Each switch is bracketed by bisection with steps of the integrator, not on a polynomial."""
+    system, columns, signals = simulated("chasing_cars", "12 s", 1)
+    names, switches = [f"{letter}{i}" for letter in "yv" for i in range(1, 6)], 0
+    for row in range(1):
+        x, mode = np.concatenate((np.arange(0.0, 50.0, 10.0), np.zeros(5))), [0, 0, 0, 0]
+        for k in range(system.horizon):
+            throttle, brake = (signals[name][row, k] for name in ("throttle", "brake"))
 
-        def rate(
-            x: Doubles, mode: Doubles = mode, throttle: Doubles = throttle, brake: Doubles = brake
-        ) -> Doubles:
-            v = x[:, 5:]
-            up = np.where(mode == 1, v[:, 1:], -v[:, 1:])
-            pull = np.choose(mode.astype(int), [1.0, 0.0, -v[:, 1:]])
-            return np.concatenate((v[:, :1], up, -throttle - brake * v[:, :1], pull), 1)
+            def rate(x: Doubles, throttle: float = throttle, brake: float = brake) -> Doubles:
+                v = x[5:]
+                up = np.where(np.array(mode) == 1, v[1:], -v[1:])  # noqa: B023 - it is called at once
+                pull = np.choose(mode, [np.ones(4), np.zeros(4), -v[1:]])  # noqa: B023
+                return np.concatenate((v[:1], up, [-throttle - brake * v[0]], pull))
 
-        x = rk4(rate, np.concatenate((y, v), 1), system.dt)
-        y, v = x[:, :5], x[:, 5:]
-    np.testing.assert_allclose(np.stack([columns[f"y{i}"][:, -1] for i in range(1, 6)], 1), y, atol=1e-9)
-    assert len({tuple(row) for row in mode.tolist()}) > 1
+            left = system.dt
+            while left > 1e-12:
+                while switched(mode, x[:5]) != mode:
+                    mode, switches = switched(mode, x[:5]), switches + 1
+                low, high = 0.0, left
+                if switched(mode, rk4(rate, x, left)[:5]) != mode:
+                    while high - low > 1e-12:
+                        middle = (low + high) / 2
+                        due = switched(mode, rk4(rate, x, middle)[:5]) != mode
+                        low, high = (low, middle) if due else (middle, high)
+                x, left = rk4(rate, x, high), left - high
+        np.testing.assert_allclose([columns[name][row, -1] for name in names], x, atol=2e-5)
+    assert switches >= 8
 
 
 def test_levitated_magnet() -> None:
@@ -200,16 +216,126 @@ def test_transmission() -> None:
     assert gear.max() > 1
 
 
+class Engine:
+    """Fuel control with a backward Euler step of the pressure by bisection, and a recorded exhaust."""
+
+    def __init__(self, system: System, rpm: Doubles) -> None:
+        self.rpm, self.w = rpm, rpm * np.pi / 30
+        self.table = tables(system)
+
+    def cylinder(self, p: Doubles) -> Doubles:
+        w = self.w
+        return 0.9 * (-0.366 + 0.08979 * p * w - 0.0337 * w * p**2 + 0.0001 * p * w**2)
+
+    @staticmethod
+    def air(theta: Doubles, p: Doubles) -> Doubles:
+        area = 2.821 - 0.05231 * theta + 0.10299 * theta**2 - 0.00063 * theta**3
+        ratio = np.minimum(p, 1 / p)
+        choke = np.where(ratio < 0.5, 1.0, 2 * np.sqrt(ratio - ratio**2))
+        return area * choke * np.sign(1 - p)
+
+    def pressure(self, p: Doubles, theta: Doubles, h: float) -> Doubles:
+        low, high = np.full_like(p, 0.05), np.ones_like(p)
+        for _ in range(30):
+            middle = (low + high) / 2
+            above = middle - p > h * 0.41328 * (self.air(theta, middle) - self.cylinder(middle))
+            low, high = np.where(above, low, middle), np.where(above, middle, high)
+        return (low + high) / 2
+
+    def run(self, throttle: Doubles, seconds: float, h: float = 0.001) -> tuple[Doubles, Doubles]:
+        """Measured air-fuel ratio and mu, every 10 ms; throttle as (rows, samples)."""
+        rows, q = len(self.rpm), np.full(len(self.rpm), 0.982)
+        opened, p, film = np.zeros(rows), np.full(rows, 0.982), np.full(rows, 0.0112)
+        smooth, measured, total = np.full(rows, 14.7), np.full(rows, 14.7), np.zeros(rows)
+        power, way = np.zeros(rows, bool), np.zeros(rows)
+        ways = [np.full(rows, -9.0), np.full(rows, -1e-6)]
+        ratios, found = [np.full(rows, 14.7)] * 2, []
+        for k in range(round(seconds / 0.01) + 1):
+            theta = np.clip(opened + 8.8, 0, 90)
+            fuel, wanted = np.full(rows, 0.1726), np.full(rows, 14.7)
+            if k:
+                power = (theta >= 70) | (power & (theta >= 50))
+                wanted = np.where((k >= 1000) & power, 12.5, 14.7)
+                guess = self.cylinder(q) / 0.9
+                q = q + 0.01 * 0.41328 * (self.air(theta, p) - guess)
+                closed, error = (k >= 1000) & ~power, measured - wanted
+                total = total + closed * 0.0014 * error
+                trim = np.where(closed, np.maximum(0, 1 + 0.04 * error + total), 1)
+                fuel = np.clip(guess / wanted * trim, 0.13, 1.66)
+            found.append((measured, measured / wanted - 1 if k >= 100 else np.zeros(rows)))
+            for _ in range(round(0.01 / h)):
+                charge = np.pi * self.cylinder(p) / self.w
+                kept, drying = (self.table[name](self.rpm, charge) for name in ("kept", "drying"))
+                ways.append(way)
+                ratios.append(self.cylinder(p) / (kept * fuel + film / drying))
+                way = way + h / self.table["transport"](self.rpm, charge)
+                past, known = np.array(ways[-600:]), np.array(ratios[-600:])
+                late = np.array([np.interp(way[i] - 1, past[:, i], known[:, i]) for i in range(rows)])
+                smooth, measured = (
+                    smooth + 10 * h * (late - smooth),
+                    measured + (1 - np.exp(-50 * h)) * (smooth - measured),
+                )
+                film = film + h * ((1 - kept) * fuel - film / drying)
+                opened = opened + (1 - np.exp(-10 * h)) * (throttle[:, k] - opened)
+                p = self.pressure(p, np.clip(opened + 8.8, 0, 90), h)
+        return np.transpose(np.array(found), (1, 2, 0))[0], np.transpose(np.array(found), (1, 2, 0))[1]
+
+
+def test_fuel_control() -> None:
+    system, columns, signals = simulated("fuel_control", "1.6 s", 3)
+    measured, mu = Engine(system, signals["speed"][:, 0]).run(signals["throttle"], 1.6, 0.002)
+    # the first exhaust arrives suddenly, and up to one step apart; from 14.7 it rises to 37
+    np.testing.assert_allclose(columns["ratio"], measured, atol=0.5)
+    np.testing.assert_allclose(columns["ratio"][:, 70:], measured[:, 70:], atol=0.05)
+    np.testing.assert_allclose(columns["mu"][:, 101:], mu[:, 101:], atol=0.004)
+
+
+@pytest.mark.slow
+def test_fuel_control_with_its_loop_closed() -> None:
+    system, columns, signals = simulated("fuel_control", "15 s", 3, **{"inputs.throttle.duration": "15 s"})
+    _, mu = Engine(system, signals["speed"][:, 0]).run(signals["throttle"], 15.0)
+    np.testing.assert_allclose(columns["mu"][:, 1010:], mu[:, 1010:], atol=3e-4)
+    assert np.abs(mu[:, 1010:]).max() > 0.0015
+
+
+AEROBENCH = {
+    0: (570.428, 0.0112245, 0.216377, -1.2352, -0.783518, -0.305537, 114.484, -122.741, 1808.75, 9.03738),
+    1: (568.647, 0.0123565, 0.155471, -1.08707, -1.17802, -0.218863, 89.3154, -227.607, 1840.48, 9.03738),
+}
+"""Row -> some states after 1 s, by AeroBenchVVPython (github.com/stanleybak/AeroBenchVVPython, afa9f0a)."""
+
+
+def test_f16() -> None:
+    """Two trajectories, and the least altitudes in ft, are those of AeroBenchVVPython with its own RK45."""
+    task = load_task(ROOT / "specs/arch/f16.stl")
+    names, const = task.system.names, partial(constant, task.system)
+    x0 = task.sample(4, seed=0, dtype=torch.float64)
+    shares = {"roll": [1.0, 0.0, 0.95, 1.0], "pitch": [0.0, 1.0, 0.0, 0.01], "yaw": [0.5, 0.0, 0.5, 0.5]}
+    for (limits, share), name in zip(shares.items(), ("phi", "theta", "psi"), strict=True):
+        low, high = const(limits)
+        x0[:, names.index(name)] = torch.from_numpy(low + (high - low) * np.array(share))
+    found = task.judge(x0, torch.zeros(4, task.horizon, 0, dtype=torch.float64))
+    shown = ("V", "A", "phi", "theta", "psi", "p", "north", "east", "altitude", "power")
+    for row, wanted in AEROBENCH.items():
+        state = [found.columns[name][90, row].item() for name in shown]
+        assert state == pytest.approx(wanted, rel=2e-3, abs=2e-3)
+    least = found.columns["altitude"].min(0).values.numpy()
+    np.testing.assert_allclose(least, [-0.0632, 448.6654, -0.2756, 3.3149], atol=0.02)
+    np.testing.assert_allclose(found.requirements[:, 0], least * 0.3048, rtol=1e-6)
+
+
 def judged(
-    spec: str, inputs: list[tuple[float, ...]]
+    spec: str, inputs: list[tuple[float | tuple[float, ...], ...]]
 ) -> tuple[dict[str, list[float]], dict[str, torch.Tensor]]:
-    """Robustness by requirement, and states, under constant input signals."""
+    """Robustness by requirement, and states, under input signals: a constant, or a value for each piece."""
     task = load_task(ROOT / f"specs/arch/{spec}.stl")
     names = task.system.names
     x0 = task.sample(len(inputs), seed=0, dtype=torch.float64)
     for decl, values in zip(task.system.decl.inputs, zip(*inputs, strict=True), strict=True):
-        for name in (decl.name, *decl.values):
-            x0[:, names.index(name)] = torch.tensor(values, dtype=torch.float64)
+        pieces = np.stack([np.broadcast_to(value, decl.points) for value in values])
+        for name, column in zip(decl.values, pieces.T, strict=True):
+            x0[:, names.index(name)] = torch.tensor(column, dtype=torch.float64)
+        x0[:, names.index(decl.name)] = torch.tensor(pieces[:, 0], dtype=torch.float64)
     found = task.judge(x0, torch.zeros(len(inputs), task.horizon, 0, dtype=torch.float64))
     return {rule.name: found.requirements[:, i].tolist() for i, rule in enumerate(task.rules)}, dict(
         found.columns
@@ -232,5 +358,12 @@ def test_constant_inputs_that_falsify() -> None:
     assert drive["AT1"][0] == pytest.approx(-0.213, abs=5e-4)
     assert drive["AT2"][1] == pytest.approx(-10.6, abs=0.05)
     assert columns["rpm"][:1000, 2].max().item() == pytest.approx(3024, abs=1)
+    rapid = [tuple([0.0, 61.1][k % 2] for k in range(10)), tuple([61.2, 81.2][k % 2] for k in range(10))]
+    fuel, columns = judged("fuel_control", [(rapid[0], 1100)])
+    assert columns["mu"][1100:].abs().max().item() == pytest.approx(0.0093, abs=2e-4)
+    assert fuel["AFC27"][0] == pytest.approx(-0.00057, abs=2e-4)
+    power, columns = judged("fuel_control_power", [(rapid[1], speed) for speed in (900, 1000, 1100)])
+    assert columns["mu"][1100:].abs().max().item() < 0.0057
+    assert min(power["AFC33"]) > 0.001
     overshoot, _ = judged("neural_maglev_narrow", [(ref,) for ref in np.linspace(1.95, 2.05, 40)])
     assert min(overshoot["NNx"]) == pytest.approx(0.0397, abs=2e-4)

@@ -100,12 +100,12 @@ def falsify(
 
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
     the random numbers of the world in which its policy drives. Inputs that are constant at the ends of their
-    ranges come first. Then random vertices, hill climbing, CMA-ES (if the package `cma` is installed) and
-    periodic inputs take turns. A violation counts only if it remains at half the time step. It is written as
-    a trace, in a simpler form where one violates the requirement too, with a file for --replay. If nothing is
-    found, that is no proof. The same --seed and --batch give the same simulations, whatever processes there
-    are. Exit code: 1 if a requirement is violated; else 5 if simulations were lost with their processes,
-    three times each; else 0.
+    ranges come first, and inputs of few pieces. Then random points, hill climbing, CMA-ES (if the package
+    `cma` is installed), gradients and periodic inputs take turns. A violation counts only if it remains at
+    half the time step. It is written as a trace, in a simpler form where one violates the requirement too,
+    with a file for --replay. If nothing is found, that is no proof. The same --seed and --batch give the same
+    simulations, whatever processes there are. Exit code: 1 if a requirement is violated; else 5 if
+    simulations were lost with their processes, three times each; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 

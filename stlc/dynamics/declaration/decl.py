@@ -128,6 +128,7 @@ class SystemDecl:
         text = repr([getattr(self, name) for name in LEARNT])
         if self.updates or self.tables:
             text += repr((self.updates, self.init.computed, self.tables))
+        text += "".join(f"located {jump.name}" for jump in self.jumps if jump.located)
         text = re.sub(r"\b[A-Z]\w+(?=\()", lambda found: _HASHED_AS.get(found[0], found[0]), text)
         return hashlib.sha256(text.encode()).hexdigest()
 

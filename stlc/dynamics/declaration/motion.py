@@ -196,6 +196,7 @@ class JumpDecl:
     """A jump: a condition (`guard`) and new values of states (`resets`).
 
     If the guard holds at the start of a step, the resets, not the flow, give the next values of their states.
+    If the jump is `located`, they take place within the step, when the guard begins to hold.
     """
 
     name: str = key(NAME, "for messages", "", label=OF)
@@ -204,6 +205,7 @@ class JumpDecl:
     sharpness: float | None = key(number(1e-9), "of the blend with the flow in training (w of Eq. 6)")
     text: str = field(default="", compare=False)
     once: bool = key(FLAG, "at most once in a trajectory", False, shown=False)
+    located: bool = key(FLAG, "at the instant at which the guard begins to hold", False, shown=False)
 
 
 def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
@@ -215,6 +217,8 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
             continue
         guard = item.get("guard") if isinstance(item, Mapping) else None
         jump = JumpDecl(**{"name": f"jump {index + 1}", "text": written(guard), **values})
+        if jump.located:
+            _check_located(item, cx)
         if jump.once:
             latch = latch_name(jump.name)
             open_ = ir.Predicate(ir.Op("sub", (ir.Const(0.5), ir.Signal(latch))))
@@ -222,6 +226,19 @@ def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
             jump = replace(jump, guard=ir.BoolOp("and", (jump.guard, open_)), resets=resets)
         found.append(jump)
     return tuple(found)
+
+
+def _check_located(jump: Node, cx: Context) -> None:
+    """Report E015 where a jump cannot be located within a step."""
+    why = ""
+    if cx.discrete:
+        why = "a discrete system has no instants within a step"
+    elif cx.names.controls:
+        why = "training has no derivative of the instants of jumps"
+    if why:
+        place = jump.get("located") if isinstance(jump, Mapping) else None
+        message = f"`located` is for systems in continuous time without controls: {why}"
+        cx.reader.report("E015", message, (place or jump).span, "leave it out, and shorten the step")
 
 
 def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from stlc.compile.ir import nodes as ir
@@ -11,6 +11,7 @@ from stlc.dynamics.declaration.motion import JumpDecl
 from stlc.dynamics.model.algebra import Assignments, add, multiply, names_in, substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.integrators._tableau import State
+from stlc.dynamics.model.located import LocatedJumps
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,8 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     If `soft`, a jump with guard g is the differentiable blend `I_w(g) reset + (1 - I_w(g)) flow`, where
     I_w(g) is a smooth indicator of g between 0 and 1. Otherwise a jump is an exact choice. Guards and resets
     read the state at the start of the step. Limits (`clamp`) are applied after each substep. If two jumps set
-    the same state, the later one wins.
+    the same state, the later one wins. Jumps that are located within the step are exact choices, through
+    which no derivative of their instants passes.
     """
     writer = Assignments()
     start: State = {name: ir.Signal(name) for name in decl.signature.names}
@@ -40,7 +42,8 @@ def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     state = _flow(decl, writer, start, given)
     moved = {assign.name for assign in decl.flow}
     for jump in decl.jumps:
-        state = _jump(_given(jump, given), state, soft=soft)
+        if not jump.located:
+            state = _jump(_given(jump, given), state, soft=soft)
         moved |= {assign.name for assign in jump.resets}
     reset = {assign.name for jump in decl.jumps for assign in jump.resets}
     state = {name: _clamped(decl, name, num) if name in reset else num for name, num in state.items()}
@@ -93,12 +96,25 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
         table = {**named(at), **given}
         return {assign.name: substitute(assign.value, table) for assign in decl.flow}
 
+    def happened(at: State, due: Sequence[ir.Formula]) -> State:
+        before = at
+        for jump, cond in zip(located, due, strict=True):
+            resets = tuple(replace(each, value=substitute(each.value, before)) for each in jump.resets)
+            at = _jump(replace(jump, guard=cond, resets=resets), at, soft=False)
+        return at
+
     integrate = INTEGRATORS.get(decl.integrator)
     length = float(decl.dt) / decl.substeps
+    located = [jump for jump in decl.jumps if jump.located]
     for substep in range(decl.substeps):
         if substep:
             state = named(state)
-        moved = {**state, **rate(state)} if decl.discrete else integrate(rate, state, length, named)
+        if decl.discrete:
+            moved: State = {**state, **rate(state)}
+        elif located:
+            moved = LocatedJumps(located, writer, happened).advanced(integrate, rate, state, length)
+        else:
+            moved = integrate(rate, state, length, named)
         state = {name: _clamped(decl, name, num) for name, num in moved.items()}
     return state
 

@@ -117,9 +117,10 @@ UNCHECK = Frame(
 _PULL = """
 /* Gradient of sum(g_rho * rho) + sum(g_columns * columns) by u: x0 (batch, {states}), u and gu
    (batch, {steps}, {controls}), g_rho (batch, {rules}), g_columns ({states}, {steps} + 1, batch) or NULL.
-   Rows from `first` up to `last`; 0 where the dynamics give NaN. 1: no memory. */
+   and by x0 into g_x0 (batch, {states}) unless that is NULL. Rows from `first` up to `last`; 0 where the
+   dynamics give NaN. 1: no memory. */
 int pull(int64_t batch, int64_t first, int64_t last, const double *x0, const double *u, const double *g_rho,
-         const double *g_columns, double *g_u, double slope) {{
+         const double *g_columns, double *g_u, double slope, double *g_x0) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules}, ROOM = {room} }};
   lanes *x = malloc(sizeof(lanes) * N), *gx = malloc(sizeof(lanes) * N);
   inputs *v = malloc(sizeof(double) * (M * T + 1) * LANES);
@@ -147,6 +148,8 @@ int pull(int64_t batch, int64_t first, int64_t last, const double *x0, const dou
       for (int i = 0; i < N; ++i) for (int k = 0; k <= T; ++k) for (int j = 0; j < here; ++j)
         gx[i][k][j] += g_columns[((int64_t)i * (T + 1) + k) * batch + at + j];
     unroll(x, (const inputs *)v, gx, gv, slope);
+    if (g_x0) for (int j = 0; j < here; ++j) for (int i = 0; i < N; ++i)
+      g_x0[(at + j) * N + i] = bad[j] > 0.0 ? 0.0 : gx[i][0][j];
     for (int j = 0; j < here; ++j) for (int k = 0; k < T; ++k) for (int i = 0; i < M; ++i)
       g_u[((at + j) * T + k) * M + i] = bad[j] > 0.0 ? 0.0 : gv[i][k][j];
   }}

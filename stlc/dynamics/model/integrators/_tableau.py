@@ -39,7 +39,7 @@ class Tableau:
     weights: tuple[float, ...]
     divisor: float = 1.0
 
-    def __call__(self, rate: Rate, state: State, length: float, named: Rate) -> State:  # noqa: ARG002
+    def __call__(self, rate: Rate, state: State, length: float, named: Rate | None = None) -> State:  # noqa: ARG002
         """Return the state after a step of `length` seconds; `rate` computes the derivatives."""
         slopes: list[State] = []
         for row in self.stages:
