@@ -78,6 +78,10 @@ class DriveSimulator:
         """1: a drive has no input signals."""
         return 1.0
 
+    def graded(self, requirement: int) -> bool:  # noqa: ARG002
+        """True: robustness of drives varies with their states."""
+        return True
+
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate `points`, (count, dim), and judge the drives."""
         margins = self.margins(self.drive(points))[:, focus.requirement]

@@ -22,8 +22,12 @@ from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus, Simulations, Simulator
 from stlc.assurance.strategies import (
+    STARTS,
+    CoarseSampling,
+    CoarseVertices,
     ConstantVertices,
     CovarianceAdaptation,
+    DiscreteSampling,
     HillClimbing,
     PeriodicInputs,
     Strategy,
@@ -33,7 +37,7 @@ from stlc.assurance.strategies import (
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
-FALSIFIER_VERSION = 1
+FALSIFIER_VERSION = 2
 """Version of the search; results of older versions are recomputed."""
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
@@ -119,24 +123,38 @@ class Proposal:
 
 
 class Portfolio:
-    """The strategies of a search, in turn: constant vertices first, then the others.
+    """The strategies of a search, in turn: constant vertices first, then points for the others to start from.
 
-    Every other turn goes to the strategy that has found the least robust point.
-
-    While the robustness is flat, that is, hardly ever changes, nothing can be learnt from it: then points are
-    uniform.
+    After that every other turn goes to the strategy that has found the least robust point. If the robustness
+    takes few values, as that of conditions on gears does, nothing can be learnt from it: then points are
+    drawn at random.
     """
 
-    def __init__(self, space: SearchSpace, generator: np.random.Generator, *, random: bool = False) -> None:
-        """Take turns between all strategies, or sample uniformly if `random`."""
+    def __init__(
+        self, space: SearchSpace, generator: np.random.Generator, *, random: bool = False, graded: bool = True
+    ) -> None:
+        """Take turns between all strategies, or sample uniformly if `random`.
+
+        Args:
+            space: the search space.
+            generator: source of all random numbers.
+            random: whether points are drawn from the declared distribution only.
+            graded: whether the robustness varies with the signals, rather than taking a few values.
+        """
         self._uniform = UniformSampling(space, generator)
-        self._first: Strategy | None = None
+        self._discrete = DiscreteSampling(space, generator)
+        self._first: list[Strategy] = []
         self._turns: list[Strategy] = []
-        if not random and space.dim:
-            self._first = ConstantVertices(space, generator)
-            self._turns = [VertexSampling(space, generator), HillClimbing(space, generator)]
+        self._random, self._graded = random, graded
+        if not random and graded and space.dim:
+            kinds = [CoarseSampling, CoarseVertices, VertexSampling] if space.blocks else [VertexSampling]
+            samplers: list[Strategy] = [kind(space, generator) for kind in kinds]
+            self._first = [samplers[index % len(samplers)] for index in range(STARTS)]
+            self._vertices: Strategy | None = ConstantVertices(space, generator)
+            self._turns = [HillClimbing(space, generator)]
             if CovarianceAdaptation.available(space):
                 self._turns.append(CovarianceAdaptation(space, generator))
+            self._turns += samplers
             if space.blocks:
                 self._turns.append(PeriodicInputs(space, generator))
         self._turn = 0
@@ -150,22 +168,31 @@ class Portfolio:
 
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
-        if not self._turns or self.flat:
-            return Proposal(self._uniform, self._uniform.propose())
-        if self._first is not None:
-            point = self._first.propose()
-            if point is not None:
-                return Proposal(self._first, point)
-            self._first = None
-        leads = self._turn % 2 == 1
-        self._turn += 1
-        strategy = min(self._turns, key=lambda each: each.best) if leads else self._turns[0]
-        if not leads:
-            self._turns = [*self._turns[1:], strategy]
+        strategy = self._chosen()
         point = strategy.propose()
+        if point is None and strategy is self._vertices:
+            self._vertices = None
+            return self.next()
         return (
             Proposal(self._uniform, self._uniform.propose()) if point is None else Proposal(strategy, point)
         )
+
+    def _chosen(self) -> Strategy:
+        """The strategy whose turn it is."""
+        if not self._turns:
+            return self._uniform if self._random or self._graded else self._discrete
+        if self._vertices is not None:
+            return self._vertices
+        if self._first:
+            return self._first.pop(0)
+        if self.flat:
+            return self._discrete
+        self._turn += 1
+        if self._turn % 2 == 0:
+            return min(self._turns, key=lambda each: each.best)
+        first, *others = self._turns
+        self._turns = [*others, first]
+        return first
 
     def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others."""
@@ -193,7 +220,8 @@ class Search:
         """Begin a search; arguments as of `falsify`."""
         self._simulator, self._requirement = simulator, requirement
         self._part = simulator.space.visible(simulator.seen(requirement))
-        self._portfolio = Portfolio(self._part.space, np.random.default_rng(seed), random=random)
+        generator, graded = np.random.default_rng(seed), simulator.graded(requirement)
+        self._portfolio = Portfolio(self._part.space, generator, random=random, graded=graded)
         self.focus = Focus(requirement, sized=True)
         self.found: Counterexample | None = None
         self.tried, self.least = 0, math.inf

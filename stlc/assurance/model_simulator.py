@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.assurance.guidance import Columns, ScaledRobustness
+from stlc.assurance.guidance import Columns, ScaledRobustness, graded
 from stlc.assurance.search_space import SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.compile.backends.array.graph import evaluate
@@ -109,6 +109,10 @@ class ModelSimulator:
             return 1.0
         longest = max(float(each.duration) for each in inputs)
         return min(self.task.rules[requirement].reach * self.task.system.dt / longest, 1.0)
+
+    def graded(self, requirement: int) -> bool:
+        """Whether the robustness varies with real signals, rather than with whole numbers."""
+        return graded(self.task.rules[requirement].formula, self.task.system.decl.signature)
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""

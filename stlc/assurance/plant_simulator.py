@@ -80,6 +80,10 @@ class PlantSimulator:
         """1: the whole simulation may matter."""
         return 1.0
 
+    def graded(self, requirement: int) -> bool:  # noqa: ARG002
+        """True: the outputs of a plant are real numbers."""
+        return True
+
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)

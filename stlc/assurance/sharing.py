@@ -158,6 +158,10 @@ class SharedSimulator:
         """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
         return self.local.seen(requirement)
 
+    def graded(self, requirement: int) -> bool:
+        """Whether the robustness varies with real signals, rather than with whole numbers."""
+        return self.local.graded(requirement)
+
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim), in equal parts."""
         parts = [points[first : first + self._part] for first in range(0, len(points), self._part)]
