@@ -271,7 +271,7 @@ class PeriodicInputs(Strategy):
 
 
 def _van_der_corput(index: int) -> float:
-    """Element of the van der Corput sequence in base 2: 1/2, 1/4, 3/4, 1/8, …"""
+    """Element of the van der Corput sequence in base 2: 1/2, 1/4, 3/4, 1/8, and so on."""
     return int(f"{index:b}"[::-1], 2) / (1 << index.bit_length())
 
 
