@@ -256,7 +256,11 @@ def _connected(address: str) -> Any:
                 "R302",
                 f"there is no cluster at `{address}`",
                 note=tuple(reason),
-                help=("`ray start --head` begins one", "`--cluster local` is one of this machine alone"),
+                help=(
+                    "`ray start --head` begins one",
+                    "`--cluster local` is one of this machine alone",
+                    "if the cluster asks for a token, set RAY_AUTH_MODE=token",
+                ),
             )
         ) from error
     return ray
