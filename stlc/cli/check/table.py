@@ -69,7 +69,7 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
 def _rows(outcome: Outcome) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a file, in the order of `COLUMNS`; one row if it could not be judged."""
     if outcome.errors:
-        error = "; ".join(f"{each.code}: {' '.join([each.message, *each.note])}" for each in outcome.errors)
+        error = "; ".join(f"{each.code}: {'; '.join([each.message, *each.note])}" for each in outcome.errors)
         yield (outcome.name, None, outcome.entry["verdict"], None, None, None, None, error)
     samples = outcome.entry.get("samples")
     for row in outcome.rows:

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, redirect_stdout, suppress
 from dataclasses import dataclass
@@ -28,6 +29,9 @@ _PATIENCE = 60.0
 _AHEAD = 2
 """Submitted calls per CPU of the cluster, so that no worker waits for the next one."""
 
+_RECOUNT = 1.0
+"""Seconds after which the CPUs of the cluster are counted again."""
+
 
 class RayWorkers:
     """Workers of a Ray cluster, as many at a time as it has CPUs for.
@@ -46,6 +50,7 @@ class RayWorkers:
         self._going: dict[Any, int] = {}
         self._calls: dict[int, RemoteCall] = {}
         self._sends = False
+        self._size, self._counted = 1, -_RECOUNT
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -71,7 +76,11 @@ class RayWorkers:
     @property
     def size(self) -> int:
         """Number of calls that are made at a time, with the CPUs that the cluster has now."""
-        return max(int(self._ray.cluster_resources().get("CPU", 0.0)) // self._cores, 1)
+        now = time.monotonic()
+        if now > self._counted + _RECOUNT:
+            cpus = int(self._ray.cluster_resources().get("CPU", 0.0))
+            self._counted, self._size = now, max(cpus // self._cores, 1)
+        return self._size
 
     @property
     def free(self) -> int:
@@ -247,7 +256,11 @@ def _connected(address: str) -> Any:
                 "R302",
                 f"there is no cluster at `{address}`",
                 note=tuple(reason),
-                help=("`ray start --head` begins one", "`--cluster local` is one of this machine alone"),
+                help=(
+                    "`ray start --head` begins one",
+                    "`--cluster local` is one of this machine alone",
+                    "if the cluster asks for a token, set RAY_AUTH_MODE=token",
+                ),
             )
         ) from error
     return ray

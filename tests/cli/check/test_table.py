@@ -198,7 +198,7 @@ def test_a_lost_process_costs_only_its_file(
     assert document["result"]["files"] == whole["files"]
     assert [finding["code"] for finding in document["diagnostics"]] == ["R406"]
     row = next(row for row in rows_of("t.csv") if row["verdict"] == "not judged")
-    assert row["error"].endswith("its worker was lost 3 times its process ended with exit code 9")
+    assert row["error"].endswith("its worker was lost 3 times; its process ended with exit code 9")
     assert 'type="R406"' in Path("j.xml").read_text()
     Path("tried").rename("tried before")
     Path("tried").mkdir()

@@ -108,6 +108,25 @@ def test_files_are_judged_although_workers_are_killed(
 
 
 @pytest.mark.usefixtures("recordings")
+def test_a_node_that_goes_down_costs_nothing(cluster: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    here = printed(capsys, "check", "s.stl", "logs/**/*.npz")
+    third = cluster.add_node(num_cpus=1)
+
+    def go_down() -> None:
+        while len(workers()) < 3 and not over.wait(0.05):
+            pass
+        cluster.remove_node(third, allow_graceful=False)
+
+    over = threading.Event()
+    thread = threading.Thread(target=go_down)
+    thread.start()
+    there = printed(capsys, "check", "s.stl", "logs/**/*.npz", "--cluster", cluster.address)
+    over.set()
+    thread.join()
+    assert there == here
+
+
+@pytest.mark.usefixtures("recordings")
 def test_a_file_whose_workers_are_always_killed_is_not_judged(
     cluster: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
