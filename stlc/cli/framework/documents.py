@@ -22,8 +22,7 @@ from typing import (
 
 from stlc.cli.framework.assured import (
     Assurance,
-    Certificate,
-    CertificateCheck,
+    CertifyResult,
     FalsifiedSystem,
     ReplayedCounterexample,
     UncertainSignal,
@@ -723,7 +722,7 @@ CompileResult: TypeAlias = CompiledSpec | ParsedFile | ParsedFiles
 ExplainResult: TypeAlias = CodeList | ManualPage | SpecInWords | Explanation | Guarantee
 
 RESULTS: dict[str, Any] = {
-    "certify": Certificate | CertificateCheck,
+    "certify": CertifyResult,
     "check": CheckResult,
     "compile": CompileResult,
     "doctor": InstallationReport,

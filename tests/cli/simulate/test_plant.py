@@ -11,7 +11,7 @@ from helpers.documents import misfits
 
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
-from stlc.cli.simulate import plant as module
+from stlc.plants import judge as module
 from stlc.trace import load_trace
 
 CODE = """
