@@ -160,7 +160,7 @@ def row_of(case: Case, seeds: Sequence[int], store: ResultStore) -> Row:
 def _search(case: Case, simulator: ModelSimulator, seed: int) -> Mapping[str, Any]:
     say(f"falsifying {case.name}, seed {seed}")
     found = search(
-        simulator.renewed(),
+        simulator,
         simulator.requirements.index(case.requirement),
         budget=SearchBudget(SIMULATIONS),
         seed=seed,

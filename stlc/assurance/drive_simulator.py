@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.falsify import Simulations
 from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.simulation import Focus, Simulations
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder
 from stlc.controller.deployment.simulator import simulate as run_worlds
@@ -78,10 +78,10 @@ class DriveSimulator:
         """1: a drive has no input signals."""
         return 1.0
 
-    def simulate(self, points: NDArray[np.float64]) -> Simulations:
+    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate `points`, (count, dim), and judge the drives."""
-        margins = self.margins(self.drive(points))
-        return Simulations(margins, margins, np.ones(len(points), dtype=bool))
+        margins = self.margins(self.drive(points))[:, focus.requirement]
+        return Simulations.unscaled(margins, np.ones(len(points), dtype=bool))
 
     def drive(self, points: NDArray[np.float64]) -> DeploymentRecording:
         """Simulate `points`, (count, dim), side by side, and return the recorded drives."""
@@ -100,7 +100,11 @@ class DriveSimulator:
         """Drives at `points`, (count, dim), as a trace with one row per agent."""
         return trace_of(self.run, self.drive(points), self._at(points), self._rules)
 
-    def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:  # noqa: ARG002
+    def at_half_step(
+        self,
+        points: NDArray[np.float64],  # noqa: ARG002
+        requirement: int,  # noqa: ARG002
+    ) -> NDArray[np.float64] | None:
         """None: a world has the time step for which it was written, and the policy that of its training."""
         return None
 

@@ -12,12 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from time import perf_counter
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.assurance.guidance import SAMPLES, scales_of
 from stlc.assurance.search_space import Point, SearchSpace
+from stlc.assurance.simulation import Focus, SharedSimulator, Simulations, Simulator, Workers
 from stlc.assurance.strategies import (
     ConstantVertices,
     CovarianceAdaptation,
@@ -43,46 +45,6 @@ DIGITS = (0, 1, 2, 3)
 """Decimal digits, in the unit cube, to which values of a counterexample are rounded, the fewest first."""
 MOST_SHRUNK = 60
 """Coordinates at most that are shrunk one by one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Simulations:
-    """Outcomes of simulations.
-
-    Attributes:
-        margins: exact robustness per requirement, (count, requirements); -inf where states are not finite.
-        guidance: scaled robustness per requirement, (count, requirements), of the same sign.
-        admissible: whether the initial state meets the conditions of `where`, (count,).
-    """
-
-    margins: NDArray[np.float64]
-    guidance: NDArray[np.float64]
-    admissible: NDArray[np.bool_]
-
-
-class Simulator(Protocol):
-    """Simulations of a closed system, as a function of points in the unit cube."""
-
-    @property
-    def space(self) -> SearchSpace:
-        """The search space."""
-
-    @property
-    def batch(self) -> int:
-        """Number of points that are best simulated side by side."""
-
-    @property
-    def requirements(self) -> Sequence[str]:
-        """Names of the requirements, in the order of the margins."""
-
-    def seen(self, requirement: int) -> float:
-        """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
-
-    def simulate(self, points: NDArray[np.float64]) -> Simulations:
-        """Simulate and judge `points`, (count, dim)."""
-
-    def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Margins at half the time step, (count, requirements); None if the step cannot be changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,6 +199,7 @@ def falsify(
     whole = simulator.space
     part = whole.visible(simulator.seen(requirement))
     portfolio = Portfolio(part.space, generator, random=random)
+    judged = _Judged(simulator, requirement, portfolio)
     tried: list[Point] = []
     spurious: list[Counterexample] = []
     counts: dict[str, int] = {}
@@ -247,19 +210,17 @@ def falsify(
         count = min(simulator.batch, budget.simulations - len(tried))
         proposals = [portfolio.next() for _ in range(count)]
         points = np.stack([part.whole(each.point) for each in proposals])
-        outcome = simulator.simulate(points)
+        outcome = judged(proposals, points)
         for index, each in enumerate(proposals):
             if not outcome.admissible[index]:
                 rejected, row = rejected + 1, row + 1
-                portfolio.tell(each, math.inf)
                 continue
             row = 0
             tried.append(each.point)
             name = each.strategy.name
             counts[name] = counts.get(name, 0) + 1
-            margin = float(outcome.margins[index, requirement])
+            margin = float(outcome.margins[index])
             least = min(least, margin)
-            portfolio.tell(each, float(outcome.guidance[index, requirement]))
             if margin < -TOLERANCE and found is None:
                 candidate = _candidate(simulator, requirement, points[index], margin, name, len(tried))
                 if candidate.spurious:
@@ -282,11 +243,83 @@ def falsify(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class SearchOrder:
+    """Settings of searches that differ only in their requirements; as the arguments of `falsify`."""
+
+    budget: SearchBudget
+    seed: int
+    random: bool = False
+    shrinks: bool = True
+
+
+def falsify_each(
+    simulator: Simulator, requirements: Sequence[int], order: SearchOrder, workers: Workers | None = None
+) -> Iterator[Falsification]:
+    """Search for violations of several requirements, and yield the results in order.
+
+    With workers, each search is carried out by one of them, with the same result; if there is only one
+    requirement, its simulations are shared out, and the search proposes as many points at a time as there are
+    workers.
+    """
+    if workers is not None and len(requirements) > 1:
+        yield from workers.run(_search, [(each, order) for each in requirements])
+        return
+    shared = simulator if workers is None else SharedSimulator(simulator, workers)
+    for each in requirements:
+        yield _search(shared, (each, order))
+
+
+def _search(simulator: Simulator, what: tuple[int, SearchOrder]) -> Falsification:
+    requirement, order = what
+    return falsify(
+        simulator,
+        requirement,
+        budget=order.budget,
+        seed=order.seed,
+        random=order.random,
+        shrinks=order.shrinks,
+    )
+
+
+class _Judged:
+    """Simulations of a search, whose guidance is told to its strategies.
+
+    Until the sizes of the predicates are known, nothing is told. Then the first simulations are judged again.
+    """
+
+    def __init__(self, simulator: Simulator, requirement: int, portfolio: Portfolio) -> None:
+        self._simulator, self._portfolio = simulator, portfolio
+        self._focus, self._settled = Focus(requirement, sized=True), False
+        self._first: list[tuple[Proposal, Point]] = []
+        self._sizes: list[NDArray[np.float64]] = []
+
+    def __call__(self, proposals: Sequence[Proposal], points: NDArray[np.float64]) -> Simulations:
+        """Simulate the points of proposals, (count, dim)."""
+        outcome = self._simulator.simulate(points, self._focus)
+        if self._settled or outcome.sizes.shape[1] == 0:
+            self._tell(proposals, outcome)
+            return outcome
+        self._first += zip(proposals, points, strict=True)
+        self._sizes.append(outcome.sizes)
+        if len(self._first) >= SAMPLES:
+            scales = scales_of(np.concatenate(self._sizes))
+            self._focus, self._settled = Focus(self._focus.requirement, scales), True
+            first = np.stack([point for _, point in self._first])
+            self._tell([each for each, _ in self._first], self._simulator.simulate(first, self._focus))
+        return outcome
+
+    def _tell(self, proposals: Sequence[Proposal], outcome: Simulations) -> None:
+        for index, each in enumerate(proposals):
+            value = float(outcome.guidance[index]) if outcome.admissible[index] else math.inf
+            self._portfolio.tell(each, value)
+
+
 def _candidate(
     simulator: Simulator, requirement: int, point: Point, margin: float, strategy: str, count: int
 ) -> Counterexample:
-    half = simulator.at_half_step(point[None])
-    at_half = None if half is None else float(half[0, requirement])
+    half = simulator.at_half_step(point[None], requirement)
+    at_half = None if half is None else float(half[0])
     return Counterexample(point, margin, at_half, strategy, count)
 
 
@@ -303,8 +336,8 @@ def shrunk(simulator: Simulator, requirement: int, found: Counterexample) -> Cou
             point = _set(found.point, coordinates, value)
             if np.array_equal(point, found.point):
                 break
-            outcome = simulator.simulate(point[None])
-            margin = float(outcome.margins[0, requirement])
+            outcome = simulator.simulate(point[None], Focus(requirement))
+            margin = float(outcome.margins[0])
             if outcome.admissible[0] and margin < -TOLERANCE:
                 simpler = _candidate(simulator, requirement, point, margin, found.strategy, found.simulation)
                 if not simpler.spurious:

@@ -9,6 +9,7 @@ The sign of the robustness does not change, and verdicts always use the exact ro
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,53 +29,67 @@ ALIKE = 3.0
 
 
 class ScaledRobustness:
-    """Robustness of one formula, with predicates scaled by their sizes in the first simulations."""
+    """Robustness of one formula, with predicates divided by their sizes.
+
+    Attributes:
+        predicates: numbers whose sizes are measured; empty if there is nothing to compare.
+    """
 
     def __init__(self, formula: ir.Formula) -> None:
         self._formula = formula
-        self._predicates = [
-            node for node in nodes(formula) if isinstance(node, ir.Predicate) and not node.guard
-        ]
-        self._sizes: dict[ir.Num, list[float]] = {each.num: [] for each in self._predicates}
-        self._scaled: ir.Formula | None = formula if len(self._sizes) < 2 or _freezes(formula) else None
+        found = {
+            node.num: node for node in nodes(formula) if isinstance(node, ir.Predicate) and not node.guard
+        }
+        alone = len(found) < 2 or _freezes(formula)
+        self.predicates: tuple[ir.Predicate, ...] = () if alone else tuple(found.values())
 
-    @property
-    def settled(self) -> bool:
-        """Whether the scales are final."""
-        return self._scaled is not None
+    def sizes(self, columns: Columns) -> NDArray[np.float64]:
+        """Sizes of the margins of the predicates in simulations, (batch, predicates): 90 % quantiles."""
+        first = next(iter(columns.values()))
+        found = np.zeros((first.shape[1], len(self.predicates)))
+        for index, predicate in enumerate(self.predicates):
+            before, after = _offsets(predicate)
+            count = max(len(first) - before - after, 1)
+            values = evaluate([predicate], columns, ops=NUMPY, start=before, count=count)[0]
+            found[:, index] = np.quantile(np.abs(values), 0.9, axis=0) if np.ndim(values) else 0.0
+        return found
 
-    def measure(self, columns: Columns) -> None:
-        """Measure the sizes of predicates in more simulations; after `SAMPLES` of them scales are final."""
-        if self.settled:
-            return
-        length = len(next(iter(columns.values())))
-        for predicate in self._predicates:
-            reach = _offsets(predicate)
-            values = evaluate(
-                [predicate], columns, ops=NUMPY, start=reach[0], count=max(length - reach[0] - reach[1], 1)
-            )[0]
-            size = np.quantile(np.abs(values), 0.9, axis=0) if np.ndim(values) else np.zeros(1)
-            self._sizes[predicate.num].extend(np.atleast_1d(size).tolist())
-        if min(map(len, self._sizes.values())) >= SAMPLES:
-            self._scaled = self._with_scales()
+    def __call__(self, columns: Columns, scales: tuple[float, ...] | None) -> NDArray[np.float64]:
+        """Guidance values of simulations, (batch,): negative exactly where the formula is violated.
 
-    def __call__(self, columns: Columns) -> NDArray[np.float64]:
-        """Guidance values of simulations, (batch,): negative exactly where the formula is violated."""
-        formula = self._formula if self._scaled is None else self._scaled
+        Args:
+            columns: signals of the simulations.
+            scales: factor of each predicate; None: all 1.
+        """
         count = next(iter(columns.values())).shape[1]
-        found: NDArray[np.float64] = evaluate([formula], columns, ops=NUMPY)[0][0]
+        found: NDArray[np.float64] = evaluate(
+            [_scaled(self._formula, self.predicates, scales)], columns, ops=NUMPY
+        )[0][0]
         return np.broadcast_to(found, (count,))
 
-    def _with_scales(self) -> ir.Formula:
-        sizes = {num: float(np.median(each)) for num, each in self._sizes.items()}
-        used = [size for size in sizes.values() if np.isfinite(size) and size > 0.0]
-        if not used or max(used) <= ALIKE * min(used):
-            return self._formula
-        factors = {
-            num: 1.0 / size if np.isfinite(size) and size > 0.0 else 1.0 / max(used)
-            for num, size in sizes.items()
-        }
-        return _multiplied(self._formula, factors)
+
+def scales_of(sizes: NDArray[np.float64]) -> tuple[float, ...] | None:
+    """Factors that make predicates alike, from their sizes in simulations (count, predicates).
+
+    None if they are alike already.
+    """
+    if not sizes.size:
+        return None
+    typical = np.median(sizes, axis=0)
+    usable = np.isfinite(typical) & (typical > 0.0)
+    if not usable.any() or typical[usable].max() <= ALIKE * typical[usable].min():
+        return None
+    typical = np.where(usable, typical, typical[usable].max())
+    return tuple((1.0 / typical).tolist())
+
+
+@lru_cache(maxsize=64)
+def _scaled(
+    formula: ir.Formula, predicates: tuple[ir.Predicate, ...], scales: tuple[float, ...] | None
+) -> ir.Formula:
+    if scales is None:
+        return formula
+    return _multiplied(formula, {each.num: scale for each, scale in zip(predicates, scales, strict=True)})
 
 
 def _multiplied(formula: ir.Formula, factors: Mapping[ir.Num, float]) -> ir.Formula:

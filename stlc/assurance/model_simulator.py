@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.assurance.falsify import Simulations
 from stlc.assurance.guidance import Columns, ScaledRobustness
 from stlc.assurance.search_space import SearchSpace, SignalBlock
+from stlc.assurance.simulation import Focus, Simulations
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.controller.planning.planner import PlanResult
@@ -65,12 +65,6 @@ class ModelSimulator:
         }
         return cls(task, None if decl.discrete else lambda: load_task(spec, system, halved))
 
-    def renewed(self) -> ModelSimulator:
-        """Return the same simulator before its first simulation: its guidance is scaled anew."""
-        made = ModelSimulator(self.task, self.finer, self.batch)
-        made.__dict__.update(points=self.points, space=self.space, _finer=self._finer)
-        return made
-
     @cached_property
     def points(self) -> InitialPoints:
         """Map from the unit cube to initial states."""
@@ -114,27 +108,26 @@ class ModelSimulator:
         longest = max(float(each.duration) for each in inputs)
         return min(self.task.rules[requirement].reach * self.task.system.dt / longest, 1.0)
 
-    def simulate(self, points: NDArray[np.float64]) -> Simulations:
+    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""
         states = self.points.states(torch.from_numpy(np.ascontiguousarray(points)))
         admissible = self.points.admissible(states).numpy()
-        columns = self._moved(self.task, states)
-        guidance = []
-        for guide in self._guides:
-            guide.measure(columns)
-            guidance.append(guide(columns))
-        margins = _margins(self.task, columns)
+        columns, guide = self._moved(self.task, states), self._guides[focus.requirement]
+        margins = guide(columns, None)
         broken = ~np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
-        margins = np.where(broken[:, None] | np.isnan(margins), -np.inf, margins)
-        guided = np.where(np.isneginf(margins), -np.inf, np.stack(guidance, 1))
-        return Simulations(margins, guided, admissible)
+        margins = np.where(broken | np.isnan(margins), -np.inf, margins)
+        guidance = margins
+        if focus.scales is not None:
+            guidance = np.where(np.isneginf(margins), -np.inf, guide(columns, focus.scales))
+        sizes = guide.sizes(columns) if focus.sized else np.zeros((len(points), 0))
+        return Simulations(margins, guidance, admissible, sizes)
 
-    def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Margins at half the time step, (count, requirements); None for a system in discrete time."""
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> NDArray[np.float64] | None:
+        """Margins at half the time step, (count,); None for a system in discrete time."""
         if self._finer is None:
             return None
         states = self.points.states(torch.from_numpy(np.ascontiguousarray(points)))
-        return _margins(self._finer, self._moved(self._finer, states))
+        return _margins(self._finer, self._moved(self._finer, states), [requirement])[:, 0]
 
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:
         """Simulated trajectories of `points`, (count, dim), as a trace."""
@@ -143,7 +136,8 @@ class ModelSimulator:
 
     def trace_from(self, states: Tensor, seed: int | None = None) -> Trace:
         """Simulated trajectories from initial states (count, n), as a trace."""
-        rho = _margins(self.task, self._moved(self.task, states)).min(1, initial=np.inf)
+        rho = _margins(self.task, self._moved(self.task, states), range(len(self.task.rules)))
+        rho = rho.min(1, initial=np.inf)
         nothing = torch.zeros(len(states))
         plans = self._plans(self.task, len(states))
         result = PlanResult(states, plans, torch.from_numpy(rho), nothing.bool(), nothing, nothing.long())
@@ -179,8 +173,12 @@ def _kernel(task: Task) -> NativeJudge | None:
     return NativeJudge.of(task.system, ())
 
 
-def _margins(task: Task, columns: Columns) -> NDArray[np.float64]:
-    """Exact robustness of the requirements of a task, (count, requirements)."""
-    each = evaluate([rule.formula for rule in task.rules], columns, ops=NUMPY)
+def _margins(task: Task, columns: Columns, requirements: Sequence[int]) -> NDArray[np.float64]:
+    """Exact robustness of some requirements of a task, (count, requirements)."""
+    formulas = [task.rules[index].formula for index in requirements]
+    each = evaluate(formulas, columns, ops=NUMPY) if formulas else []
     count = next(iter(columns.values())).shape[1]
-    return np.stack([np.broadcast_to(margin[0], (count,)) for margin in each], 1)
+    found = np.zeros((count, len(formulas)))
+    for index, margin in enumerate(each):
+        found[:, index] = margin[0]
+    return found

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.falsify import Simulations
 from stlc.assurance.search_space import SearchSpace, SignalBlock
+from stlc.assurance.simulation import Focus, Simulations
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.files import find_spec, read_source
 from stlc.grammar.parse.parser import parse
@@ -80,14 +80,18 @@ class PlantSimulator:
         """1: the whole simulation may matter."""
         return 1.0
 
-    def simulate(self, points: NDArray[np.float64]) -> Simulations:
+    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
         margins = np.stack([self._margins(run) for run in runs])
-        failed: NDArray[np.bool_] = np.array([np.isnan(each).any() for each in margins], dtype=np.bool_)
-        return Simulations(margins, margins, ~failed)
+        failed: NDArray[np.bool_] = np.isnan(margins).any(axis=1)
+        return Simulations.unscaled(margins[:, focus.requirement], np.logical_not(failed))
 
-    def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:  # noqa: ARG002
+    def at_half_step(
+        self,
+        points: NDArray[np.float64],  # noqa: ARG002
+        requirement: int,  # noqa: ARG002
+    ) -> NDArray[np.float64] | None:
         """None: a black box has the time step of its file."""
         return None
 

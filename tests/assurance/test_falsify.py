@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stlc.assurance.falsify import SearchBudget, falsify
-from stlc.assurance.guidance import ScaledRobustness
+from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify, falsify_each
+from stlc.assurance.guidance import ScaledRobustness, scales_of
 from stlc.assurance.model_simulator import ModelSimulator
 from stlc.assurance.plant_simulator import PlantSimulator
+from stlc.assurance.simulation import Focus, LocalWorkers, SharedSimulator
 from stlc.cli.framework.app import main
 from stlc.trace import load_trace
 
@@ -93,12 +95,18 @@ def test_guidance_has_the_sign_of_the_margin_and_scales_the_larger_predicate():
     simulator = ModelSimulator.load("oscillator.stl", None, {})
     index = simulator.requirements.index("mixed")
     points = np.random.default_rng(0).random((30, simulator.space.dim))
-    outcomes = [simulator.simulate(point[None]) for point in points]
-    margins = np.array([each.margins[0, index] for each in outcomes])
-    guides = np.array([each.guidance[0, index] for each in outcomes])
-    assert ((margins < 0.0) == (guides < 0.0)).all()
-    assert not np.allclose(margins[15:], guides[15:])
-    assert ScaledRobustness(simulator.task.rules[0].formula).settled  # one predicate needs no scale
+    first = simulator.simulate(points, Focus(index, sized=True))
+    assert first.sizes.shape == (30, 2)
+    scales = scales_of(first.sizes)
+    assert scales is not None
+    assert np.allclose(np.median(first.sizes, axis=0) * scales, 1.0)
+    second = simulator.simulate(points, Focus(index, scales))
+    assert np.array_equal(first.margins, second.margins)
+    assert ((second.margins < 0.0) == (second.guidance < 0.0)).all()
+    assert not np.allclose(second.margins, second.guidance)
+    alone = ScaledRobustness(simulator.task.rules[0].formula)
+    assert alone.predicates == ()  # one predicate needs no scale
+    assert scales_of(np.array([[1.0, 2.0], [2.0, 1.0]])) is None
 
 
 def test_the_command_writes_what_it_can_replay(capsys):
@@ -129,7 +137,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     simulator = PlantSimulator.load("fall.stl", Path("fall.yaml"), {})
     with simulator.plant:
         assert [block.name for block in simulator.space.blocks] == ["lift"]
-        outcome = simulator.simulate(np.stack([np.ones(5), np.zeros(5)]))
+        outcome = simulator.simulate(np.stack([np.ones(5), np.zeros(5)]), Focus(0))
     assert outcome.admissible.tolist() == [True, False]
     assert "below the ground" in simulator.findings[0].message
     assert main(["falsify", "fall.stl", "--plant", "fall.yaml", "--simulations", "20"]) == 1
@@ -141,3 +149,47 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     assert main(["falsify", "fall.stl", *replay]) == 1
     assert "bit for bit" in capsys.readouterr().out
     assert main(["falsify", "latest", "--plant", "fall.yaml"]) == 2
+
+
+@dataclass(frozen=True)
+class Oscillator:
+    """The oscillator, for processes that load it."""
+
+    folder: Path
+
+    def load(self) -> ModelSimulator:
+        return ModelSimulator.load(str(self.folder / "oscillator.stl"), None, {})
+
+
+def test_workers_search_several_requirements_with_the_results_of_one_process(home: Path):
+    source = Oscillator(home)
+    simulator, order = source.load(), SearchOrder(SearchBudget(30), seed=1, shrinks=False)
+    points = np.random.default_rng(0).random((5, simulator.space.dim))
+    with LocalWorkers(source, 2) as workers:
+        apart = list(falsify_each(simulator, (0, 1), order, workers))
+        (one,) = falsify_each(simulator, (1,), order, workers)
+        shared = SharedSimulator(simulator, workers)
+        assert shared.batch == 2
+        together = shared.simulate(points, Focus(3, sized=True))
+    alone = list(falsify_each(simulator, (0, 1), order))
+    for left, right in zip(apart, alone, strict=True):
+        assert (left.requirement, left.simulations, left.least) == (
+            right.requirement,
+            right.simulations,
+            right.least,
+        )
+    assert one.simulations == 30
+    expected = simulator.simulate(points, Focus(3, sized=True))
+    assert np.array_equal(together.margins, expected.margins)
+    assert np.array_equal(together.sizes, expected.sizes)
+
+
+@pytest.mark.slow
+def test_jobs_of_the_command_change_nothing_for_several_requirements(capsys):
+    main(["falsify", "oscillator.stl", "--simulations", "12", "--json"])
+    alone = json.loads(capsys.readouterr().out)["result"]["requirements"]
+    main(["falsify", "oscillator.stl", "--simulations", "12", "--jobs", "2", "--json"])
+    shared = json.loads(capsys.readouterr().out)["result"]["requirements"]
+    for each in (*alone, *shared):
+        del each["seconds"]
+    assert alone == shared

@@ -10,6 +10,7 @@ import pytest
 from helpers.documents import misfits
 
 from stlc.assurance.drive_simulator import DriveSimulator
+from stlc.assurance.simulation import Focus
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
@@ -86,8 +87,8 @@ def test_points_decide_the_drives():
     run = Run.open("latest")
     simulator = DriveSimulator(run, "none", Setting((0,), 2, 20, 1))
     points = np.random.default_rng(0).random((3, simulator.space.dim))
-    together = simulator.simulate(points).margins
-    alone = np.concatenate([simulator.simulate(each[None]).margins for each in points])
+    together = simulator.simulate(points, Focus(0)).margins
+    alone = np.concatenate([simulator.simulate(each[None], Focus(0)).margins for each in points])
     assert np.allclose(together, alone, atol=1e-6)
     low = np.zeros((1, simulator.space.dim))
     assert simulator.drive(low).states[0, 0, 0] == pytest.approx(-0.5)

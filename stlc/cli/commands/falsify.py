@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_text
 import shlex
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from stlc.assurance.falsify import Counterexample, Falsification
     from stlc.assurance.model_simulator import ModelSimulator
     from stlc.assurance.plant_simulator import PlantSimulator
+    from stlc.assurance.simulation import Workers
     from stlc.controller.guard.candidates import Mode
     from stlc.trace import Trace
 
@@ -65,6 +67,7 @@ def falsify(
         str | None, typer.Option("--time", metavar="TIME", help="Time per requirement at most.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that simulate.")] = 1,
     random: Annotated[
         bool, typer.Option("--random", help="Draw from the declared distributions only, as a baseline.")
     ] = False,
@@ -90,22 +93,24 @@ def falsify(
     a trace, in a simpler form where one violates the requirement too, with a file for --replay. If nothing is
     found, that is no proof. Exit code: 1 if a requirement is violated, else 0.
     """
-    from stlc.assurance.falsify import SearchBudget
-    from stlc.assurance.falsify import falsify as search
+    from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 
     made = _Target(target, system, plant, guard, agents, steps, scenario, seed)
+    overrides = parse_overrides(set_)
     if replay is not None:
-        return _replayed(made, replay, parse_overrides(set_), runs)
+        return _replayed(made, replay, overrides, runs)
     limit = None if time is None else parse_seconds(time)
-    simulator = made.simulator(parse_overrides(set_), runs)
+    source = _Source(made, overrides, runs, jobs)
+    simulator = source.load()
+    wanted = _wanted(simulator.requirements, require)
+    order = SearchOrder(SearchBudget(simulations, limit), seed, random)
     found: list[FalsifiedRequirement] = []
-    for index in _wanted(simulator.requirements, require):
-        name = simulator.requirements[index]
-        with PULSE.doing(f"searching for a violation of {name}"):
-            result = search(
-                simulator, index, budget=SearchBudget(simulations, limit), seed=seed, random=random
-            )
-        found.append(_written(made, simulator, result, output))
+    with source.workers() as workers:
+        results = falsify_each(simulator, wanted, order, workers)
+        for index in wanted:
+            with PULSE.doing(f"searching for a violation of {simulator.requirements[index]}"):
+                result = next(results)
+            found.append(_written(made, simulator, result, output))
     document: FalsifiedSystem = {
         "target": target,
         "simulations": simulations,
@@ -136,14 +141,14 @@ class _Target:
         """Whether the target is a specification, rather than a run."""
         return self.name.endswith((".stl", ".stlc"))
 
-    def simulator(self, overrides: Mapping[str, str], runs: Path) -> _Simulator:
-        """Load the simulator.
+    def simulator(self, overrides: Mapping[str, str], runs: Path, jobs: int = 1) -> _Simulator:
+        """Load the simulator; a black box simulates in `jobs` processes.
 
         Raises:
             UsageError: U101, an option does not suit the target.
         """
         if self.plant is not None:
-            return self._black_box(self.plant, overrides)
+            return self._black_box(self.plant, overrides, jobs)
         if self.model:
             from stlc.assurance.model_simulator import ModelSimulator
 
@@ -168,7 +173,7 @@ class _Target:
         size = self.agents or test.agents, self.steps or test.steps
         return DriveSimulator(run, _mode(self.guard), Setting((self.seed,), *size, test.replan))
 
-    def _black_box(self, plant: Path, overrides: Mapping[str, str]) -> PlantSimulator:
+    def _black_box(self, plant: Path, overrides: Mapping[str, str], jobs: int) -> PlantSimulator:
         from stlc.assurance.plant_simulator import PlantSimulator
 
         if not self.model:
@@ -176,7 +181,7 @@ class _Target:
         for option in ("system", "agents", "steps", "scenario"):
             if getattr(self, option) is not None:
                 raise usage(f"`--{option}` and `--plant` contradict each other")
-        return PlantSimulator.load(self.name, plant, overrides)
+        return PlantSimulator.load(self.name, plant, overrides, jobs)
 
     def settings(self) -> dict[str, Any]:
         """Settings of the simulations that a replay needs."""
@@ -187,6 +192,34 @@ class _Target:
             "scenario": self.scenario,
             "seed": self.seed,
         }
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Simulator of a target, for this process and others.
+
+    Attributes:
+        target: the target.
+        overrides: values of `--set`.
+        runs: folder of runs.
+        jobs: number of processes.
+    """
+
+    target: _Target
+    overrides: Mapping[str, str]
+    runs: Path
+    jobs: int
+
+    def load(self) -> _Simulator:
+        """Load the simulator."""
+        return self.target.simulator(self.overrides, self.runs, self.jobs)
+
+    def workers(self) -> AbstractContextManager[Workers | None]:
+        """Processes that simulate; None if this one does, or a black box, which has its own."""
+        from stlc.assurance.simulation import LocalWorkers
+
+        alone = self.jobs == 1 or self.target.plant is not None
+        return nullcontext() if alone else LocalWorkers(self, self.jobs)
 
 
 def _mode(name: str) -> Mode:
@@ -284,6 +317,7 @@ def _replayed(
     target: _Target, path: Path, overrides: Mapping[str, str], runs: Path
 ) -> Answer[FalsifiedSystem | ReplayedCounterexample]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
+    from stlc.assurance.simulation import Focus
     from stlc.trace import load_trace
 
     stored = _stored(path)
@@ -297,7 +331,7 @@ def _replayed(
     simulator = again.simulator(overrides, runs)
     index = _wanted(simulator.requirements, [stored["requirement"]])[0]
     point = _point(stored, simulator.space.dim, path)
-    margin = float(simulator.simulate(point[None]).margins[0, index])
+    margin = float(simulator.simulate(point[None], Focus(index)).margins[0])
     different = _different(
         load_trace(path.parent / Path(str(stored["trace"])).name), simulator.trace(point[None])
     )
