@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,47 +11,87 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.search_space import SearchSpace, SignalBlock
+from stlc.assurance.guidance import ScaledRobustness
+from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
-from stlc.diagnostics import Diagnostic, RunError
-from stlc.files import find_spec, read_source
-from stlc.grammar.parse.parser import parse
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import nodes
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.monitor.instants import rule_bounds, starts_of
+from stlc.monitor.signals import arrange, needs_of
+from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
-from stlc.plants.plant import Plant, PlantFinding, load_plant
-from stlc.trace import Trace
+from stlc.plants.judge import PlantJudge
+from stlc.plants.plant import Plant, PlantFinding, PlantRun
 
 if TYPE_CHECKING:
-    from stlc.plants.plant import PlantRun
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.dynamics.declaration.inputs import InputDecl
+    from stlc.trace import Trace
+
+_AHEAD = {"hold": 0, "linear": 1, "pchip": 2}
+"""Pieces by which a value of an input signal affects the signal before its own time, by interpolation."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailedSimulation:
+    """A point at which a plant gave no trace.
+
+    Attributes:
+        point: the point of the unit cube, (dim,).
+        finding: the failure.
+    """
+
+    point: Point
+    finding: PlantFinding
+
+
+@dataclass(frozen=True, slots=True)
+class _JudgedTrace:
+    """One trace under one requirement: robustness, guidance, scope, and sizes of the predicates."""
+
+    margin: float
+    guidance: float
+    inside: bool
+    sizes: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class PlantSimulator:
     """Simulator of a plant file.
 
-    A simulation that fails has no margin: it counts as inadmissible, and is kept among the findings.
+    A simulation that fails gives no trace, so that it violates no requirement: its robustness is +inf, and it
+    is kept among the failures. A simulation in which the assumptions of the specification do not hold is not
+    admissible.
 
     Attributes:
-        plant: the black box, which the caller closes.
-        monitor: the specification of its signals.
+        judge: the black box, which the caller closes, and the specification of its signals.
         jobs: number of processes that simulate side by side.
-        findings: failed simulations until now.
+        failures: failed simulations until now.
     """
 
-    plant: Plant
-    monitor: Monitor
+    judge: PlantJudge
     jobs: int = 1
-    findings: list[PlantFinding] = field(default_factory=list)
+    failures: list[FailedSimulation] = field(default_factory=list)
 
     @classmethod
     def load(cls, spec: str, plant: Path, overrides: Mapping[str, str], jobs: int = 1) -> PlantSimulator:
         """Load a plant file and the specification of its signals.
 
         Raises:
-            UsageError, SpecError, SystemFileError: a file is missing or invalid.
+            UsageError, SpecError, SystemFileError, TraceError: see `PlantJudge.load`.
         """
-        found = load_plant(plant)
-        text = parse(read_source(find_spec(Path(spec))))
-        return cls(found, Monitor(text, dt=found.decl.dt, overrides=overrides), jobs)
+        return cls(PlantJudge.load(spec, plant, overrides), jobs)
+
+    @property
+    def plant(self) -> Plant:
+        """The black box."""
+        return self.judge.plant
+
+    @property
+    def monitor(self) -> Monitor:
+        """The specification of its signals."""
+        return self.judge.monitor
 
     @property
     def batch(self) -> int:
@@ -76,40 +116,117 @@ class PlantSimulator:
         """Names of the requirements."""
         return self.monitor.requirements
 
-    def seen(self, requirement: int) -> float:  # noqa: ARG002
-        """1: the whole simulation may matter."""
-        return 1.0
+    @cached_property
+    def _guides(self) -> tuple[ScaledRobustness, ...]:
+        return tuple(ScaledRobustness(rule.formula) for rule in self._rules)
+
+    @property
+    def _rules(self) -> Sequence[CompiledRequirement]:
+        return self.monitor.compiled.requirements
+
+    def seen(self, requirement: int) -> float:
+        """Share of the duration, at most 1, after which values of inputs no longer affect a requirement.
+
+        An input may affect outputs at the same time, so the last sample that the requirement reads counts. An
+        interpolated signal depends on values that lie ahead.
+        """
+        decl = self.plant.decl
+        read_by = (self._rules[requirement], *self.monitor.compiled.assumptions)
+        if not decl.free or any(_reads_everything(rule) for rule in read_by):
+            return 1.0
+        read = (max(rule.reach for rule in read_by) + 1) * float(decl.dt) / float(decl.duration)
+        return min(read + max(_ahead(signal) for signal in decl.free), 1.0)
+
+    # ------------------------------------------------------------------------ simulation
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
-        margins = np.stack([self._margins(run) for run in runs])
-        failed: NDArray[np.bool_] = np.isnan(margins).any(axis=1)
-        return Simulations.unscaled(margins[:, focus.requirement], np.logical_not(failed))
+        found = [self._judged(point, run, focus) for point, run in zip(points, runs, strict=True)]
+        return Simulations(
+            np.array([each.margin for each in found]),
+            np.array([each.guidance for each in found]),
+            np.array([each.inside for each in found], dtype=np.bool_),
+            np.stack([each.sizes for each in found]),
+        )
 
-    def at_half_step(
-        self,
-        points: NDArray[np.float64],  # noqa: ARG002
-        requirement: int,  # noqa: ARG002
-    ) -> NDArray[np.float64] | None:
-        """None: a black box has the time step of its file."""
-        return None
-
-    def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002
-        """Simulate one point, (1, dim), and return its trace.
-
-        Raises:
-            RunError: R402, the simulation fails, as it did not before.
-        """
-        (run,) = self.plant.simulate(self.plant.points_of(points))
+    def _judged(self, point: Point, run: PlantRun, focus: Focus) -> _JudgedTrace:
+        guide = self._guides[focus.requirement]
+        sizes = np.zeros(len(guide.predicates) if focus.sized else 0)
         if isinstance(run.outcome, PlantFinding):
-            raise RunError(Diagnostic("R402", f"`{self.plant.decl.name}` failed: {run.outcome.message}"))
+            self.failures.append(FailedSimulation(point, run.outcome))
+            return _JudgedTrace(np.inf, np.inf, inside=True, sizes=sizes)
+        rule = self._rules[focus.requirement]
+        verdict = self.monitor.check(run.outcome, require=(rule.name,))
+        margin = float(verdict.requirements[0].high.min())
+        inside = verdict.statuses[0] != "out of scope"
+        if not guide.predicates:
+            return _JudgedTrace(margin, margin, inside, sizes)
+        signals = arrange(run.outcome, needs_of(self.monitor.compiled, [rule]), plain=True)
+        if focus.sized:
+            (sizes,) = guide.sizes(signals.env)
+        if focus.scales is None:
+            return _JudgedTrace(margin, margin, inside, sizes)
+        scaled = guide.scaled(focus.scales)
+        rule = replace(rule, formula=scaled, lowered=scaled)
+        horizon = self.monitor.compiled.grid.horizon
+        starts = starts_of(rule, signals.samples, horizon, None)
+        _, high = rule_bounds(rule, Record.of(signals.env, signals.ops), starts, horizon, "open")
+        return _JudgedTrace(margin, float(high.min()), inside, sizes)
+
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> NDArray[np.float64] | None:
+        """Margins at half the time step, (count,); None if the plant file does not allow it.
+
+        The margin of a simulation that fails is NaN.
+        """
+        if self._finer is None:
+            return None
+        name, found = self.requirements[requirement], []
+        for run in self._finer.plant.simulate(self._finer.plant.points_of(points), jobs=self.jobs):
+            if isinstance(run.outcome, PlantFinding):
+                found.append(np.nan)
+                continue
+            verdict = self._finer.monitor.check(run.outcome, require=(name,))
+            found.append(float(verdict.requirements[0].high.min()))
+        return np.array(found)
+
+    @cached_property
+    def _finer(self) -> PlantJudge | None:
+        return self.judge.at_half_step()
+
+    def close(self) -> None:
+        """End all processes of the plant."""
+        self.plant.close()
+        finer = self.__dict__.get("_finer")
+        if finer is not None:
+            finer.plant.close()
+
+    def outcome(self, point: Point) -> Trace | PlantFinding:
+        """Simulate one point, (dim,); return its trace, or the failure."""
+        (run,) = self.plant.simulate(self.plant.points_of(point[None]))
         return run.outcome
 
-    def _margins(self, run: PlantRun) -> NDArray[np.float64]:
-        """Robustness of each requirement, (requirements,); NaN if the simulation failed."""
-        if isinstance(run.outcome, PlantFinding):
-            self.findings.append(run.outcome)
-            return np.full(len(self.requirements), np.nan)
-        judgements: Sequence[float] = [float(each.high.min()) for each in self.monitor.check(run.outcome)]
-        return np.array(judgements)
+    def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002
+        """Simulate one point, (1, dim), and return its trace, with the specification.
+
+        Raises:
+            SystemFileError: S401, the simulation fails, as it did not before.
+        """
+        found = self.outcome(points[0])
+        if isinstance(found, PlantFinding):
+            decl = self.plant.decl
+            message = f"`{decl.name}` gave a trace, and fails when it is simulated again at the same point"
+            note = (f"{found.reason}: {found.message}",)
+            raise SystemFileError(Diagnostic("S401", message, decl.places.get(decl.kind), note=note))
+        return self.judge.stored([found])
+
+
+def _reads_everything(rule: CompiledRequirement) -> bool:
+    """Whether a requirement reads a simulation to its end, whatever its length."""
+    ahead = (node for node in nodes(rule.formula) if isinstance(node, ir.Windowed) and not node.back)
+    return rule.windowed or rule.uses_end or any(node.window.hi is None for node in ahead)
+
+
+def _ahead(signal: InputDecl) -> float:
+    """Share of the duration by which a value of an input signal affects the signal before its own time."""
+    return _AHEAD[signal.interpolate] / signal.pieces

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.files import find_spec, read_source
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.signals import arrange, needs_of
 from stlc.monitor.verdict import Monitor
 from stlc.plants.plant import Plant, PlantFinding, PlantRun, load_plant
 from stlc.trace import Trace
+from stlc.version import __version__
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
@@ -80,10 +82,12 @@ class PlantJudge:
     Attributes:
         plant: the black box, which the caller closes.
         monitor: the specification, compiled for the time step of the plant.
+        overrides: constants of the specification with new values.
     """
 
     plant: Plant
     monitor: Monitor
+    overrides: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def load(cls, spec: Path | str, plant: Path | str, overrides: Mapping[str, str]) -> PlantJudge:
@@ -104,7 +108,16 @@ class PlantJudge:
             name=found.decl.name,
         )
         arrange(sample, needs_of(compiled, [*compiled.requirements, *compiled.assumptions]), plain=True)
-        return cls(found, monitor)
+        return cls(found, monitor, overrides)
+
+    def at_half_step(self) -> PlantJudge | None:
+        """Return the same at half the time step; None if the plant file does not allow it."""
+        if not self.plant.decl.halves:
+            return None
+        finer = self.plant.decl.at_half_step()
+        return PlantJudge(
+            Plant(finer), Monitor(self.monitor.spec, dt=finer.dt, overrides=self.overrides), self.overrides
+        )
 
     @property
     def long(self) -> bool:
@@ -140,6 +153,29 @@ class PlantJudge:
             batch = [seeds[row] for row in chosen]
             for run in self.plant.simulate(points[chosen], seeds=batch, jobs=jobs):
                 yield self._judged(run)
+
+    def stored(self, traces: Sequence[Trace]) -> Trace:
+        """Join traces into one with the specification; shorter ones end in unknown samples (NaN)."""
+        longest = max(trace.samples for trace in traces)
+        data = {}
+        for name in traces[0].signature.names:
+            data[name] = np.full((len(traces), longest), np.nan)
+            for row, trace in enumerate(traces):
+                data[name][row, : trace.samples] = trace.data[name][0]
+        spec = self.monitor.spec
+        library = library_of(spec)
+        meta = replace(
+            traces[0].meta,
+            spec_name=self.monitor.compiled.name,
+            spec_path=spec.source.name,
+            spec_text=spec.source.text,
+            spec_library=library,
+            spec_set=dict(self.overrides),
+            spec_hash=spec_sha256(spec.source.text, library),
+            seed=traces[0].meta.seed if len(traces) == 1 else None,
+            stlc_version=__version__,
+        )
+        return replace(traces[0], data=data, meta=meta)
 
     def _judged(self, run: PlantRun) -> JudgedRun:
         point = self._named(run.point)

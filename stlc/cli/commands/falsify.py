@@ -6,12 +6,19 @@ import json as json_text
 import shlex
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from stlc.cli.framework.assured import FalsifiedRequirement, FalsifiedSystem, ReplayedCounterexample
+from stlc.cli.falsify import findings
+from stlc.cli.framework.assured import (
+    FalsifiedRequirement,
+    FalsifiedSystem,
+    FalsifyResult,
+    ReplayedCounterexample,
+)
 from stlc.cli.framework.options import (
     RequireOption,
     RunsOption,
@@ -23,7 +30,6 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import PULSE, Answer, emit
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
-from stlc.escape import visible
 from stlc.registry import closest
 
 if TYPE_CHECKING:
@@ -83,7 +89,7 @@ def falsify(
     ] = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
-) -> Answer[FalsifiedSystem | ReplayedCounterexample]:
+) -> Answer[FalsifyResult]:
     """Search for simulations that violate requirements.
 
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
@@ -91,7 +97,8 @@ def falsify(
     ranges come first. Then random vertices, hill climbing, CMA-ES (if the package `cma` is installed) and
     periodic inputs take turns. A violation counts only if it remains at half the time step. It is written as
     a trace, in a simpler form where one violates the requirement too, with a file for --replay. If nothing is
-    found, that is no proof. Exit code: 1 if a requirement is violated, else 0.
+    found, that is no proof. Of a plant, simulations that fail are written, too. Exit code: 1 if a requirement
+    is violated or a simulation fails, else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 
@@ -111,15 +118,17 @@ def falsify(
             with PULSE.doing(f"searching for a violation of {simulator.requirements[index]}"):
                 result = next(results)
             found.append(_written(made, simulator, result, output))
+    failures = getattr(simulator, "failures", [])
     document: FalsifiedSystem = {
         "target": target,
         "simulations": simulations,
         "seed": seed,
         "coordinates": simulator.space.dim,
-        "failures": _failures(simulator),
+        "failures": [f"{each.finding.reason}: {each.finding.message}" for each in failures],
+        "findings": findings.written(failures, output, made.settings(), partial(_command, made)),
         "requirements": found,
     }
-    violated = any(each["verdict"] == "violated" for each in found) or bool(document["failures"])
+    violated = any(each["verdict"] == "violated" for each in found) or bool(failures)
     return Answer(document, lambda: emit("\n".join(_lines(document))), int(violated))
 
 
@@ -244,12 +253,6 @@ def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:
     return [index for index, name in enumerate(names) if not require or name in require]
 
 
-def _failures(simulator: _Simulator) -> list[str]:
-    """Reasons of the failed simulations of a black box, each once."""
-    found = getattr(simulator, "findings", ())
-    return list(dict.fromkeys(f"{each.reason}: {each.message}" for each in found))
-
-
 # ------------------------------------------------------------------------ counterexamples
 
 
@@ -313,9 +316,7 @@ def _command(target: _Target, path: Path) -> str:
     return shlex.join([*words, "--replay", str(path)])
 
 
-def _replayed(
-    target: _Target, path: Path, overrides: Mapping[str, str], runs: Path
-) -> Answer[FalsifiedSystem | ReplayedCounterexample]:
+def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: Path) -> Answer[FalsifyResult]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
     from stlc.assurance.simulation import Focus
     from stlc.trace import load_trace
@@ -329,9 +330,15 @@ def _replayed(
         _optional(given.get("seed")) or 0,
     )
     simulator = again.simulator(overrides, runs)
+    if stored["format"] == findings.FORMAT:
+        point = _point(stored, simulator.space.dim, path)
+        return findings.replayed(_plant_of(simulator, path), point, stored)
     index = _wanted(simulator.requirements, [stored["requirement"]])[0]
     point = _point(stored, simulator.space.dim, path)
     margin = float(simulator.simulate(point[None], Focus(index)).margins[0])
+    if getattr(simulator, "failures", ()):
+        before = {"reason": f"a violation of {stored['requirement']}"}
+        return findings.replayed(_plant_of(simulator, path), point, before)
     different = _different(
         load_trace(path.parent / Path(str(stored["trace"])).name), simulator.trace(point[None])
     )
@@ -349,6 +356,17 @@ def _replayed(
         emit(f"{document['requirement']}: {verdict}, robustness {margin:.6g}; {same}")
 
     return Answer(document, show, int(margin < 0.0))
+
+
+def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:
+    """The simulator of the plant whose failure the file `path` holds. Raises UsageError (U101) for others."""
+    from stlc.assurance.plant_simulator import PlantSimulator
+
+    if not isinstance(simulator, PlantSimulator):
+        raise usage(
+            f"`{path}` is a failed simulation of a plant", "stlc falsify SPEC --plant FILE --replay FILE"
+        )
+    return simulator
 
 
 def _optional(value: object) -> int | None:
@@ -374,8 +392,11 @@ def _stored(path: Path) -> dict[str, Any]:
         "settings": dict,
         "point": list,
     }
-    whole = isinstance(found, dict) and found.get("format") == FORMAT
-    if not whole or not all(isinstance(found.get(key), kind) for key, kind in keys.items()):
+    kind = found.get("format") if isinstance(found, dict) else None
+    keys = findings.KEYS if kind == findings.FORMAT else keys
+    if kind not in (FORMAT, findings.FORMAT) or not all(
+        isinstance(found.get(key), kind) for key, kind in keys.items()
+    ):
         raise usage(f"`{path}` is not a counterexample", "a file that `stlc falsify` wrote")
     return dict(found)
 
@@ -418,7 +439,7 @@ def _lines(document: FalsifiedSystem) -> list[str]:
     lines = []
     for each in document["requirements"]:
         lines.extend(_of_requirement(each))
-    return [*lines, *(f"the plant failed: {visible(each)}" for each in document["failures"])]
+    return [*lines, *findings.lines(document["findings"])]
 
 
 def _of_requirement(each: FalsifiedRequirement) -> list[str]:
@@ -434,6 +455,7 @@ def _of_requirement(each: FalsifiedRequirement) -> list[str]:
             f"  pairwise coverage of the search space {share(each['coverage'])}; this is no proof",
         ]
     half = "" if found["half_step"] is None else f", {float(found['half_step']):.4g} at half the time step"
+    half = half.replace("nan at", "but no trace at")
     lines = [
         f"{name}: violated, robustness {float(found['margin']):.4g}{half}; simulation "
         f"{found['simulation']:,}, {found['strategy']}{spurious}"

@@ -219,14 +219,28 @@ class FalsifiedRequirement(TypedDict):
     replay: str | None
 
 
+class FalsifiedFinding(TypedDict):
+    """Failed simulations of a plant of one kind: how many, and the first of them."""
+
+    reason: str
+    message: str
+    time: float | None
+    stderr: str
+    simulations: int
+    point: dict[str, float]
+    file: str
+    replay: str
+
+
 class FalsifiedSystem(TypedDict):
-    """Searches for violations of the requirements of a system or run."""
+    """Searches for violations of the requirements of a system or run; failures are those of a plant."""
 
     target: str
     simulations: int
     seed: int
     coordinates: int
     failures: list[str]
+    findings: list[FalsifiedFinding]
     requirements: list[FalsifiedRequirement]
 
 
@@ -238,6 +252,20 @@ class ReplayedCounterexample(TypedDict):
     stored_margin: Num
     identical: bool
     different: list[str]
+
+
+class ReplayedFinding(TypedDict):
+    """Failed simulation of a plant that was simulated again; without a reason if it gives a trace now."""
+
+    reason: str | None
+    message: str | None
+    time: float | None
+    stored_reason: str
+    identical: bool
+
+
+FalsifyResult: TypeAlias = FalsifiedSystem | ReplayedCounterexample | ReplayedFinding
+"""Result of `stlc falsify`."""
 
 
 class UncertainSignal(TypedDict):

@@ -23,8 +23,7 @@ from typing import (
 from stlc.cli.framework.assured import (
     Assurance,
     CertifyResult,
-    FalsifiedSystem,
-    ReplayedCounterexample,
+    FalsifyResult,
     UncertainSignal,
     Verified,
 )
@@ -728,7 +727,7 @@ RESULTS: dict[str, Any] = {
     "doctor": InstallationReport,
     "explain": ExplainResult,
     "export": ExportedRun,
-    "falsify": FalsifiedSystem | ReplayedCounterexample,
+    "falsify": FalsifyResult,
     "fmt": FormattedFiles,
     "init": CreatedFiles,
     "lint": LintedFiles,

@@ -72,7 +72,7 @@ def simulate_plant(order: PlantOrder) -> Answer[PlantSimulation]:
             together.
     """
     from stlc.plants.judge import PlantJudge
-    from stlc.trace import check_writable
+    from stlc.trace import check_writable, save_trace
 
     if order.record is not None:
         check_writable(order.record)
@@ -93,7 +93,7 @@ def simulate_plant(order: PlantOrder) -> Answer[PlantSimulation]:
                 runs.append(replace(run, trace=None))
                 PULSE.now(f"simulating {plant.decl.name}, {len(runs)} of {len(points)}")
     if order.record is not None and traces:
-        _save(order.record, traces, monitor)
+        save_trace(order.record, judge.stored(traces))
     document = _document(plant, monitor, runs, order, stream=stream)
     return Answer(document, lambda: _show(plant, monitor, runs, order), _code(runs, order.fail_under))
 
@@ -152,36 +152,6 @@ def _value(variable: PlantVariable, part: str, text: str) -> float:
         span = in_unit(f"[{variable.low:g}, {variable.high:g}]", variable.unit.text)
         raise usage(f"`{part}` is outside the range of `{variable.name}`, {span}")
     return found
-
-
-# --------------------------------------------------------------------------------- records
-
-
-def _save(path: Path, traces: Sequence[Trace], monitor: Monitor) -> None:
-    """Write the traces to one file, with the specification; shorter ones end in unknown samples (NaN)."""
-    from stlc.compile.frontend.modules import library_of, spec_sha256
-    from stlc.trace import save_trace
-    from stlc.version import __version__
-
-    longest = max(trace.samples for trace in traces)
-    data = {}
-    for name in traces[0].signature.names:
-        data[name] = np.full((len(traces), longest), np.nan)
-        for row, trace in enumerate(traces):
-            data[name][row, : trace.samples] = trace.data[name][0]
-    spec = monitor.spec
-    library = library_of(spec)
-    meta = replace(
-        traces[0].meta,
-        spec_name=monitor.compiled.name,
-        spec_path=spec.source.name,
-        spec_text=spec.source.text,
-        spec_library=library,
-        spec_hash=spec_sha256(spec.source.text, library),
-        seed=None,
-        stlc_version=__version__,
-    )
-    save_trace(path, replace(traces[0], data=data, meta=meta))
 
 
 # --------------------------------------------------------------------------------- results
