@@ -363,7 +363,7 @@ def _finding_lines(result: DrawnCertificate) -> Iterator[str]:
     shown = findings["first"][:MOST_SHOWN]
     if not shown:
         return
-    yield f"  {findings['count']:,} simulations failed:"
+    yield f"  {findings['count']:,} simulation{'s' * (findings['count'] > 1)} failed:"
     yield from (f"    - {_finding_text(each)}" for each in shown)
     if findings["count"] > len(shown):
         yield f"    - and {findings['count'] - len(shown):,} more"

@@ -393,7 +393,7 @@ def _stored(path: Path) -> dict[str, Any]:
         "point": list,
     }
     kind = found.get("format") if isinstance(found, dict) else None
-    keys = findings.KEYS if kind == findings.FORMAT else keys
+    keys = dict(findings.KEYS) if kind == findings.FORMAT else keys
     if kind not in (FORMAT, findings.FORMAT) or not all(
         isinstance(found.get(key), kind) for key, kind in keys.items()
     ):

@@ -58,15 +58,18 @@ def written(
         }
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(path, dumps(stored) + "\n")
-        described: Any = _described(finding)
-        record: FalsifiedFinding = {
-            **described,
-            "simulations": len(alike),
-            "point": dict(finding.point),
-            "file": str(path),
-            "replay": command(path),
-        }
-        records.append(record)
+        records.append(
+            {
+                "reason": finding.reason,
+                "message": finding.message,
+                "time": finding.time,
+                "stderr": finding.stderr,
+                "simulations": len(alike),
+                "point": dict(finding.point),
+                "file": str(path),
+                "replay": command(path),
+            }
+        )
     return records
 
 

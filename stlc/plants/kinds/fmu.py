@@ -38,6 +38,8 @@ def open_fmu(layout: Layout) -> Fmu:
     """Unpack the FMU and load its library. Raises UnfitError if it cannot be used."""
     try:
         import fmpy
+        import fmpy.simulation
+        import fmpy.sundials  # now, so that the time limit of the first simulation does not count it
     except ImportError:
         raise AbsentError("fmpy", "fmu") from None
     path = layout.path(str(layout.options["file"]))
