@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_text
+import math
 import shlex
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -449,9 +450,10 @@ def _of_requirement(each: FalsifiedRequirement) -> list[str]:
     lost = len(each["spurious"])
     spurious = f"; {lost} violations vanish at half the time step" if lost else ""
     if found is None:
+        least = float(each["least"])
+        told = f"least robustness {least:.4g}" if least < math.inf else "and no trace"
         return [
-            f"{name}: no violation in {each['simulations']:,} simulations, least robustness "
-            f"{float(each['least']):.4g}{spurious}",
+            f"{name}: no violation in {each['simulations']:,} simulations, {told}{spurious}",
             f"  pairwise coverage of the search space {share(each['coverage'])}; this is no proof",
         ]
     half = "" if found["half_step"] is None else f", {float(found['half_step']):.4g} at half the time step"

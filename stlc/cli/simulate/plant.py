@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from stlc.plants.plant import Plant, PlantVariable
     from stlc.trace import Trace
 
+CARRYING = (".npz", ".mcap")
+"""Suffixes of recorded traces that carry their specification."""
 MOST_SHOWN = 5
 """Findings that are printed in full."""
 _VALUE = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>\D.*)?")
@@ -235,7 +237,15 @@ def _show(plant: Plant, monitor: Monitor, runs: Sequence[JudgedRun], order: Plan
     emit(_summary(runs))
     if order.record is not None:
         say(f"the traces are in {order.record}")
-        emit(f"next: {shell(('stlc', 'check', operand(str(order.record))))}")
+        emit(f"next: {shell(('stlc', 'check', *_judging(order), operand(str(order.record))))}")
+
+
+def _judging(order: PlantOrder) -> tuple[str, ...]:
+    """Words that name the specification for `stlc check`; none if the file of `--record` carries it."""
+    if order.record is not None and order.record.suffix in CARRYING:
+        return ()
+    changed = (word for name, value in order.overrides.items() for word in ("--set", f"{name}={value}"))
+    return (*changed, operand(order.spec))
 
 
 def _rows(plant: Plant, runs: Sequence[JudgedRun]) -> Iterator[tuple[str, ...]]:
