@@ -271,6 +271,7 @@ CODES: dict[str, str] = {
     "R403": "a process of a training that is gone",
     "R404": "requirements that no plan was found for",
     "R405": "starts from none of which a plan is known",
+    "R406": "work that was lost with the process or machine that did it",
     "W603": "a control without effect",
     "W701": "a cache folder, or a file in it, that others could have changed",
     "W702": "a C compiler that fails or hangs",

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError, os_reason
@@ -225,6 +227,42 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
         if path.is_file() or _is_bag(path):
             return path
     raise UsageError(_no_such("trace", name, folders))
+
+
+def has_wildcard(name: str) -> bool:
+    """True if `name` is a pattern (`*`, `?`, `[…]`) and not the path of a file that is called so."""
+    return glob.has_magic(name) and not Path(name).exists()
+
+
+def matching_traces(pattern: str) -> list[str]:
+    """Paths of the trace files that match a pattern, sorted; `**` stands for any number of folders.
+
+    Hidden files and folders are left out. `**` does not enter links to folders, which may lead back. A folder
+    matches only if it is a trace itself (a ROS 2 bag); files inside it are then left out.
+
+    Raises:
+        UsageError: U102, no file matches.
+    """
+    parts = [part if part == "**" else re.sub(r"\*\*+", "*", part) for part in Path(pattern).parts]
+    literal = tuple(takewhile(lambda part: not glob.has_magic(part), parts))
+    rest = [*parts[len(literal) :], *(["*"] if parts[-1] == "**" else [])]
+    start = Path(*literal)
+    try:
+        paths = [path for path in start.glob(str(Path(*rest))) if not _hidden(path.relative_to(start), rest)]
+    except OSError as error:
+        raise UsageError(Diagnostic("U102", f"cannot look up `{pattern}`: {os_reason(error)}")) from None
+    found = {path for path in paths if path.is_file() or _is_bag(path)}
+    bags = {path for path in found if path.is_dir()}
+    names = sorted(str(path) for path in found if bags.isdisjoint(path.parents))
+    if not names:
+        advice = () if "**" in parts else ("`**` stands for any number of folders, as in 'logs/**/*.csv'",)
+        raise UsageError(Diagnostic("U102", f"no file matches `{pattern}`", help=advice))
+    return names
+
+
+def _hidden(path: Path, pattern: Sequence[str]) -> bool:
+    """True if a part of `path` begins with a dot and is not itself a part of the pattern."""
+    return any(part.startswith(".") and part not in pattern for part in path.parts)
 
 
 def _is_bag(path: Path) -> bool:

@@ -15,7 +15,17 @@ import pytest
 from stlc import files
 from stlc.cli.framework.render import render_text
 from stlc.diagnostics import MissingError, SpecError, StlcError, UsageError
-from stlc.files import MAX_BYTES, atomic_path, find_spec, find_system, find_trace, read_source, write_atomic
+from stlc.files import (
+    MAX_BYTES,
+    atomic_path,
+    find_spec,
+    find_system,
+    find_trace,
+    has_wildcard,
+    matching_traces,
+    read_source,
+    write_atomic,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 FULL = Path("/dev/full")
@@ -289,3 +299,29 @@ def test_a_name_that_no_file_can_have():
     with pytest.raises(UsageError) as caught:
         read_source("a\0b.stl")
     assert finding(caught).message == r"no file can be called 'a\x00b.stl'"
+
+
+def test_patterns_of_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("z.csv", "a/1.csv", "a/b/2.csv", "a/b/.3.csv", ".h/x.csv", "a/b/c/[4].csv", "a/t.txt"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).touch()
+    Path("bag").mkdir()
+    for name in ("bag/metadata.yaml", "bag/x.db3"):
+        Path(name).touch()
+    for link in ("a/again", "a/b/again"):  # without end, if links were followed
+        Path(link).symlink_to(tmp_path / "a")
+    deep = ["a/1.csv", "a/b/2.csv", "a/b/c/[4].csv"]
+    assert matching_traces("**/*.csv") == [*deep, "z.csv"]
+    assert matching_traces(f"{tmp_path}/a/**/*.csv") == [f"{tmp_path}/{name}" for name in deep]
+    assert matching_traces("a/**") == [*deep, "a/t.txt"]
+    assert matching_traces("*") == ["bag", "z.csv"]
+    assert matching_traces("**/*.db3") == ["bag/x.db3"]
+    assert matching_traces("a/b/*/[[]4].csv") == ["a/b/c/[4].csv"]
+    assert matching_traces(".h/*.csv") == [".h/x.csv"]
+    assert matching_traces("a**/?.csv") == ["a/1.csv"]
+    assert has_wildcard("a/*.csv")
+    assert not has_wildcard("a/b/c/[4].csv")
+    for pattern in ("none/*.csv", "a/**/*.npz"):
+        with pytest.raises(UsageError, match="U102: no file matches"):
+            matching_traces(pattern)

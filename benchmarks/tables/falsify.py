@@ -43,7 +43,7 @@ class Case:
     @property
     def name(self) -> str:
         """Requirement and instance."""
-        return f"{self.requirement}, instance {1 if self.changes else 2}"
+        return f"{self.requirement}, instance {1 if self.changes or self.spec in POINTS else 2}"
 
 
 FALCAUN = "FalCAuN 2024"
@@ -54,9 +54,12 @@ FINER = {
         *(("inputs.brake.pieces", "10"), ("inputs.brake.interpolate", "linear")),
     ),
     "neural_maglev": (("inputs.ref.pieces", "13"),),
+    "neural_maglev_narrow": (("inputs.ref.duration", "3 s"),),
     "steam_condenser": (("inputs.steam.pieces", "18"), ("inputs.steam.times", "free")),
 }
 """Inputs of instance 1, which the tool chooses."""
+POINTS = ("f16",)
+"""Models without input signals: an initial state is searched, which is instance 1."""
 PUBLISHED = {
     "AT1": f"{FALCAUN}: 896",
     "AT2": f"{FALCAUN}: 256",
@@ -67,18 +70,25 @@ PUBLISHED = {
     "CC3": f"{FALCAUN}: 122",
     "CC4": f"{FALCAUN}: 1256, 4 of 10",
     "NN": "MoonLight 2024: 26.8 (1), 48.0 (2)",
+    "NNx": "MoonLight 2024: 142.7, 9 of 10 (1), 0 of 10 (2)",
     "SC": f"{FALCAUN}: 0 of 10",
+    "F16": "MoonLight 2024: 21.0",
 }
 REQUIREMENTS = {
     "transmission": ("AT1", "AT2", "AT51", "AT52", "AT53", "AT54", "AT6a", "AT6b", "AT6c", "AT6abc"),
     "chasing_cars": ("CC1", "CC2", "CC3", "CC4", "CC5", "CCx"),
     "neural_maglev": ("NN",),
+    "neural_maglev_narrow": ("NNx",),
     "steam_condenser": ("SC",),
+    "fuel_control": ("AFC27", "AFC29"),
+    "fuel_control_power": ("AFC33",),
+    "f16": ("F16",),
 }
 CASES = tuple(
     Case(spec, name, PUBLISHED.get(name, ""), changes)
     for changes_of in ({}, FINER)
     for spec, names in REQUIREMENTS.items()
+    if not changes_of or spec in changes_of
     for name in names
     for changes in [changes_of.get(spec, ())]
 )

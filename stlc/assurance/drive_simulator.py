@@ -78,6 +78,10 @@ class DriveSimulator:
         """1: a drive has no input signals."""
         return 1.0
 
+    def graded(self, requirement: int) -> bool:  # noqa: ARG002
+        """True: robustness of drives varies with their states."""
+        return True
+
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate `points`, (count, dim), and judge the drives."""
         margins = self.margins(self.drive(points))[:, focus.requirement]
@@ -103,8 +107,8 @@ class DriveSimulator:
     def at_half_step(
         self,
         points: NDArray[np.float64],  # noqa: ARG002
-        requirement: int,  # noqa: ARG002
-    ) -> NDArray[np.float64] | None:
+        focus: Focus,  # noqa: ARG002
+    ) -> Simulations | None:
         """None: a world has the time step for which it was written, and the policy that of its training."""
         return None
 

@@ -19,10 +19,15 @@ from numpy.typing import NDArray
 
 from stlc.assurance.guidance import SAMPLES, scales_of
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.simulation import Focus, SharedSimulator, Simulations, Simulator, Workers
+from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
+from stlc.assurance.simulation import Focus, Simulations, Simulator
 from stlc.assurance.strategies import (
+    STARTS,
+    CoarseSampling,
+    CoarseVertices,
     ConstantVertices,
     CovarianceAdaptation,
+    DiscreteSampling,
     HillClimbing,
     PeriodicInputs,
     Strategy,
@@ -30,8 +35,9 @@ from stlc.assurance.strategies import (
     VertexSampling,
 )
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.parallel.workers import LostCall
 
-FALSIFIER_VERSION = 1
+FALSIFIER_VERSION = 2
 """Version of the search; results of older versions are recomputed."""
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
@@ -117,24 +123,38 @@ class Proposal:
 
 
 class Portfolio:
-    """The strategies of a search, in turn: constant vertices first, then the others.
+    """The strategies of a search, in turn: constant vertices first, then points for the others to start from.
 
-    Every other turn goes to the strategy that has found the least robust point.
-
-    While the robustness is flat, that is, hardly ever changes, nothing can be learnt from it: then points are
-    uniform.
+    After that every other turn goes to the strategy that has found the least robust point. If the robustness
+    takes few values, as that of conditions on gears does, nothing can be learnt from it: then points are
+    drawn at random.
     """
 
-    def __init__(self, space: SearchSpace, generator: np.random.Generator, *, random: bool = False) -> None:
-        """Take turns between all strategies, or sample uniformly if `random`."""
+    def __init__(
+        self, space: SearchSpace, generator: np.random.Generator, *, random: bool = False, graded: bool = True
+    ) -> None:
+        """Take turns between all strategies, or sample uniformly if `random`.
+
+        Args:
+            space: the search space.
+            generator: source of all random numbers.
+            random: whether points are drawn from the declared distribution only.
+            graded: whether the robustness varies with the signals, rather than taking a few values.
+        """
         self._uniform = UniformSampling(space, generator)
-        self._first: Strategy | None = None
+        self._discrete = DiscreteSampling(space, generator)
+        self._first: list[Strategy] = []
         self._turns: list[Strategy] = []
-        if not random and space.dim:
-            self._first = ConstantVertices(space, generator)
-            self._turns = [VertexSampling(space, generator), HillClimbing(space, generator)]
+        self._random, self._graded = random, graded
+        if not random and graded and space.dim:
+            kinds = [CoarseSampling, CoarseVertices, VertexSampling] if space.blocks else [VertexSampling]
+            samplers: list[Strategy] = [kind(space, generator) for kind in kinds]
+            self._first = [samplers[index % len(samplers)] for index in range(STARTS)]
+            self._vertices: Strategy | None = ConstantVertices(space, generator)
+            self._turns = [HillClimbing(space, generator)]
             if CovarianceAdaptation.available(space):
                 self._turns.append(CovarianceAdaptation(space, generator))
+            self._turns += samplers
             if space.blocks:
                 self._turns.append(PeriodicInputs(space, generator))
         self._turn = 0
@@ -148,22 +168,31 @@ class Portfolio:
 
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
-        if not self._turns or self.flat:
-            return Proposal(self._uniform, self._uniform.propose())
-        if self._first is not None:
-            point = self._first.propose()
-            if point is not None:
-                return Proposal(self._first, point)
-            self._first = None
-        leads = self._turn % 2 == 1
-        self._turn += 1
-        strategy = min(self._turns, key=lambda each: each.best) if leads else self._turns[0]
-        if not leads:
-            self._turns = [*self._turns[1:], strategy]
+        strategy = self._chosen()
         point = strategy.propose()
+        if point is None and strategy is self._vertices:
+            self._vertices = None
+            return self.next()
         return (
             Proposal(self._uniform, self._uniform.propose()) if point is None else Proposal(strategy, point)
         )
+
+    def _chosen(self) -> Strategy:
+        """The strategy whose turn it is."""
+        if not self._turns:
+            return self._uniform if self._random or self._graded else self._discrete
+        if self._vertices is not None:
+            return self._vertices
+        if self._first:
+            return self._first.pop(0)
+        if self.flat:
+            return self._discrete
+        self._turn += 1
+        if self._turn % 2 == 0:
+            return min(self._turns, key=lambda each: each.best)
+        first, *others = self._turns
+        self._turns = [*others, first]
+        return first
 
     def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others."""
@@ -174,6 +203,113 @@ class Portfolio:
                 other.observe(proposal.point, value)
 
 
+class Search:
+    """A search for a violation of one requirement, as a dialogue: points are asked for, outcomes are told.
+
+    The first simulations measure the sizes of the predicates. They are judged again with the scales that
+    follow, before the strategies learn from them.
+
+    Attributes:
+        focus: what the next points are judged by.
+        found: the counterexample; None until there is one.
+        tried: number of simulations.
+        least: least robustness of all simulations.
+    """
+
+    def __init__(self, simulator: Simulator, requirement: int, seed: int, *, random: bool = False) -> None:
+        """Begin a search; arguments as of `falsify`."""
+        self._simulator, self._requirement = simulator, requirement
+        self._part = simulator.space.visible(simulator.seen(requirement))
+        generator, graded = np.random.default_rng(seed), simulator.graded(requirement)
+        self._portfolio = Portfolio(self._part.space, generator, random=random, graded=graded)
+        self.focus = Focus(requirement, sized=True)
+        self.found: Counterexample | None = None
+        self.tried, self.least = 0, math.inf
+        self._open: list[Proposal] = []
+        self._first: list[Proposal] = []
+        self._sizes: list[NDArray[np.float64]] = []
+        self._again = False
+        self._points: list[Point] = []
+        self._spurious: list[Counterexample] = []
+        self._counts: Counter[str] = Counter()
+        self._rejected = self._row = 0
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the last points had no admissible initial state."""
+        return self._row >= REJECTED
+
+    def ask(self, count: int) -> NDArray[np.float64]:
+        """Points to simulate next, (k, dim); k is `count`, unless the first ones are judged again."""
+        if self._again:
+            self._open, self._first = self._first, []
+        else:
+            self._open = [self._portfolio.next() for _ in range(count)]
+        return np.stack([self._part.whole(each.point) for each in self._open])
+
+    def tell(self, points: NDArray[np.float64], outcome: Simulations) -> None:
+        """Take the outcomes of the points that were asked for."""
+        again, self._again = self._again, False
+        told = outcome.guidance.copy()
+        if not again:
+            self._count(points, outcome, told)
+        if outcome.sizes.shape[1] == 0:
+            self.focus = Focus(self._requirement, self.focus.scales)
+            self._teach(outcome.admissible, told)
+            return
+        self._first += self._open
+        self._sizes.append(outcome.sizes)
+        if len(self._first) >= SAMPLES:
+            self.focus = Focus(self._requirement, scales_of(np.concatenate(self._sizes)))
+            self._again = True
+
+    def _teach(self, admissible: NDArray[np.bool_], told: NDArray[np.float64]) -> None:
+        for index, each in enumerate(self._open):
+            self._portfolio.tell(each, float(told[index]) if admissible[index] else math.inf)
+
+    def _count(self, points: NDArray[np.float64], outcome: Simulations, told: NDArray[np.float64]) -> None:
+        """Count simulations, and examine violations; `told`, (count,), becomes what strategies are told."""
+        for index, each in enumerate(self._open):
+            if not outcome.admissible[index]:
+                self._rejected, self._row = self._rejected + 1, self._row + 1
+                continue
+            self._row = 0
+            self.tried += 1
+            self._points.append(each.point)
+            name, margin = each.strategy.name, float(outcome.margins[index])
+            self._counts[name] += 1
+            self.least = min(self.least, margin)
+            if margin < -TOLERANCE and self.found is None:
+                told[index] = self._examined(points[index], margin, name)
+
+    def _examined(self, point: Point, margin: float, name: str) -> float:
+        """Examine a violation at half the time step, and return the guidance there, which may be positive."""
+        half = self._simulator.at_half_step(point[None], self.focus)
+        at_half = None if half is None else float(half.margins[0])
+        candidate = Counterexample(point, margin, at_half, name, self.tried)
+        if candidate.spurious:
+            self._spurious.append(candidate)
+        else:
+            self.found = candidate
+        return margin if half is None else float(half.guidance[0])
+
+    def result(self, seconds: float = 0.0, *, shrinks: bool = True) -> Falsification:
+        """The result so far, after `seconds`; a counterexample is shrunk if `shrinks`."""
+        simulator, found = self._simulator, self.found
+        return Falsification(
+            simulator.requirements[self._requirement],
+            found,
+            shrunk(simulator, self._requirement, found) if found is not None and shrinks else None,
+            tuple(self._spurious),
+            self.tried if found is None else found.simulation,
+            self.least,
+            coverage(np.array(self._points).reshape(len(self._points), self._part.space.dim)),
+            self._rejected,
+            seconds,
+            dict(self._counts),
+        )
+
+
 def falsify(
     simulator: Simulator,
     requirement: int,
@@ -182,7 +318,6 @@ def falsify(
     seed: int,
     random: bool = False,
     shrinks: bool = True,
-    progress: Callable[[int, float], None] | None = None,
 ) -> Falsification:
     """Search for a violation of one requirement.
 
@@ -193,85 +328,68 @@ def falsify(
         seed: seed of the search; the same seed gives the same simulations.
         random: whether points are drawn from the declared distribution only, as a baseline.
         shrinks: whether a counterexample is shrunk.
-        progress: function that receives the number of simulations and the least robustness so far.
     """
-    began, generator = perf_counter(), np.random.default_rng(seed)
-    whole = simulator.space
-    part = whole.visible(simulator.seen(requirement))
-    portfolio = Portfolio(part.space, generator, random=random)
-    judged = _Judged(simulator, requirement, portfolio)
-    tried: list[Point] = []
-    spurious: list[Counterexample] = []
-    counts: dict[str, int] = {}
-    least, rejected, row, found = math.inf, 0, 0, None
-    while found is None and len(tried) < budget.simulations and row < REJECTED:
+    began = perf_counter()
+    search = Search(simulator, requirement, seed, random=random)
+    while search.found is None and search.tried < budget.simulations and not search.exhausted:
         if budget.seconds is not None and perf_counter() - began > budget.seconds:
             break
-        count = min(simulator.batch, budget.simulations - len(tried))
-        proposals = [portfolio.next() for _ in range(count)]
-        points = np.stack([part.whole(each.point) for each in proposals])
-        outcome = judged(proposals, points)
-        for index, each in enumerate(proposals):
-            if not outcome.admissible[index]:
-                rejected, row = rejected + 1, row + 1
-                continue
-            row = 0
-            tried.append(each.point)
-            name = each.strategy.name
-            counts[name] = counts.get(name, 0) + 1
-            margin = float(outcome.margins[index])
-            least = min(least, margin)
-            if margin < -TOLERANCE and found is None:
-                candidate = _candidate(simulator, requirement, points[index], margin, name, len(tried))
-                if candidate.spurious:
-                    spurious.append(candidate)
-                else:
-                    found = candidate
-        if progress is not None:
-            progress(len(tried), least)
-    return Falsification(
-        simulator.requirements[requirement],
-        found,
-        shrunk(simulator, requirement, found) if found is not None and shrinks else None,
-        tuple(spurious),
-        len(tried) if found is None else found.simulation,
-        least,
-        coverage(np.array(tried).reshape(len(tried), part.space.dim)),
-        rejected,
-        perf_counter() - began,
-        counts,
-    )
+        points = search.ask(min(simulator.batch, budget.simulations - search.tried))
+        search.tell(points, simulator.simulate(points, search.focus))
+    return search.result(perf_counter() - began, shrinks=shrinks)
 
 
 @dataclass(frozen=True, slots=True)
 class SearchOrder:
-    """Settings of searches that differ only in their requirements; as the arguments of `falsify`."""
+    """Settings of searches that differ only in their requirements.
+
+    Attributes:
+        budget: limits of each search.
+        seed: seed of each search.
+        random: whether points are drawn from the declared distribution only, as a baseline.
+        shrinks: whether counterexamples are shrunk.
+        batch: number of points that a search proposes at a time; None: as many as there are workers for. The
+            same seed and number give the same simulations, whatever workers there are.
+    """
 
     budget: SearchBudget
     seed: int
     random: bool = False
     shrinks: bool = True
+    batch: int | None = None
 
 
 def falsify_each(
-    simulator: Simulator, requirements: Sequence[int], order: SearchOrder, workers: Workers | None = None
+    simulator: Simulator,
+    requirements: Sequence[int],
+    order: SearchOrder,
+    workers: SimulatorWorkers | None = None,
 ) -> Iterator[Falsification]:
     """Search for violations of several requirements, and yield the results in order.
 
     With workers, each search is carried out by one of them, with the same result; if there is only one
     requirement, its simulations are shared out, and the search proposes as many points at a time as there are
-    workers.
+    workers. A search that is lost with its workers is carried out in that way too, so that it costs only the
+    simulations that end them.
     """
-    if workers is not None and len(requirements) > 1:
-        yield from workers.run(_search, [(each, order) for each in requirements])
+    shared = simulator if workers is None else SharedSimulator(simulator, workers, order.batch)
+    if workers is None or len(requirements) == 1:
+        for each in requirements:
+            yield _search(shared, (each, order))
         return
-    shared = simulator if workers is None else SharedSimulator(simulator, workers)
+    ended = workers.run(_search, [(each, order) for each in requirements])
     for each in requirements:
-        yield _search(shared, (each, order))
+        found = next(ended)
+        if isinstance(found, LostCall):
+            ended = iter(list(ended))  # the workers must be free
+            found = _search(shared, (each, order))
+        yield found
 
 
 def _search(simulator: Simulator, what: tuple[int, SearchOrder]) -> Falsification:
     requirement, order = what
+    if order.batch is not None and not isinstance(simulator, SharedSimulator):
+        simulator = SharedSimulator(simulator, None, order.batch)
     return falsify(
         simulator,
         requirement,
@@ -282,44 +400,11 @@ def _search(simulator: Simulator, what: tuple[int, SearchOrder]) -> Falsificatio
     )
 
 
-class _Judged:
-    """Simulations of a search, whose guidance is told to its strategies.
-
-    Until the sizes of the predicates are known, nothing is told. Then the first simulations are judged again.
-    """
-
-    def __init__(self, simulator: Simulator, requirement: int, portfolio: Portfolio) -> None:
-        self._simulator, self._portfolio = simulator, portfolio
-        self._focus, self._settled = Focus(requirement, sized=True), False
-        self._first: list[tuple[Proposal, Point]] = []
-        self._sizes: list[NDArray[np.float64]] = []
-
-    def __call__(self, proposals: Sequence[Proposal], points: NDArray[np.float64]) -> Simulations:
-        """Simulate the points of proposals, (count, dim)."""
-        outcome = self._simulator.simulate(points, self._focus)
-        if self._settled or outcome.sizes.shape[1] == 0:
-            self._tell(proposals, outcome)
-            return outcome
-        self._first += zip(proposals, points, strict=True)
-        self._sizes.append(outcome.sizes)
-        if len(self._first) >= SAMPLES:
-            scales = scales_of(np.concatenate(self._sizes))
-            self._focus, self._settled = Focus(self._focus.requirement, scales), True
-            first = np.stack([point for _, point in self._first])
-            self._tell([each for each, _ in self._first], self._simulator.simulate(first, self._focus))
-        return outcome
-
-    def _tell(self, proposals: Sequence[Proposal], outcome: Simulations) -> None:
-        for index, each in enumerate(proposals):
-            value = float(outcome.guidance[index]) if outcome.admissible[index] else math.inf
-            self._portfolio.tell(each, value)
-
-
 def _candidate(
     simulator: Simulator, requirement: int, point: Point, margin: float, strategy: str, count: int
 ) -> Counterexample:
-    half = simulator.at_half_step(point[None], requirement)
-    at_half = None if half is None else float(half[0])
+    half = simulator.at_half_step(point[None], Focus(requirement))
+    at_half = None if half is None else float(half.margins[0])
     return Counterexample(point, margin, at_half, strategy, count)
 
 

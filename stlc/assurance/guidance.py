@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import reach_of
+from stlc.compile.ir.support import columns_of, reach_of
 from stlc.compile.ir.traverse import map_children, nodes
+from stlc.signature import Signature
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Signals of simulations: name -> (time, batch)."""
@@ -83,6 +84,13 @@ def scales_of(sizes: NDArray[np.float64]) -> tuple[float, ...] | None:
         return None
     typical = np.where(usable, typical, typical[usable].max())
     return tuple((1.0 / typical).tolist())
+
+
+def graded(formula: ir.Formula, signature: Signature) -> bool:
+    """Whether some predicate of a formula reads a real number, so that its margin varies continuously."""
+    whole = {column.name for column in signature.columns if column.kind != "real"}
+    predicates = [node for node in nodes(formula) if isinstance(node, ir.Predicate) and not node.guard]
+    return not predicates or any(columns_of(each.num) - whole for each in predicates)
 
 
 @lru_cache(maxsize=64)

@@ -48,12 +48,70 @@ class FailedSimulation:
 
 @dataclass(frozen=True, slots=True)
 class _JudgedTrace:
-    """One trace under one requirement: robustness, guidance, scope, and sizes of the predicates."""
+    """One simulation under one requirement.
+
+    Attributes:
+        margin: exact robustness; +inf if the simulation failed.
+        guidance: robustness with scaled predicates.
+        sizes: sizes of the margins of the predicates, (predicates,); empty if they are not wanted.
+        inside: whether the assumptions of the specification hold.
+        failed: whether there is no trace.
+    """
 
     margin: float
     guidance: float
-    inside: bool
     sizes: NDArray[np.float64]
+    inside: bool = True
+    failed: bool = False
+
+
+@dataclass(frozen=True)
+class _Judging:
+    """Judgement of simulations by the requirements of a monitor, with scaled guidance."""
+
+    monitor: Monitor
+
+    @cached_property
+    def _guides(self) -> tuple[ScaledRobustness, ...]:
+        return tuple(ScaledRobustness(rule.formula) for rule in self.monitor.compiled.requirements)
+
+    def __call__(self, run: PlantRun, focus: Focus) -> _JudgedTrace:
+        """Judge one simulation."""
+        guide, compiled = self._guides[focus.requirement], self.monitor.compiled
+        sizes = np.zeros(len(guide.predicates) if focus.sized else 0)
+        if isinstance(run.outcome, PlantFinding):
+            return _JudgedTrace(np.inf, np.inf, sizes, failed=True)
+        rule = compiled.requirements[focus.requirement]
+        verdict = self.monitor.check(run.outcome, require=(rule.name,))
+        margin = float(verdict.requirements[0].high.min())
+        inside = verdict.statuses[0] != "out of scope"
+        if not guide.predicates:
+            return _JudgedTrace(margin, margin, sizes, inside)
+        signals = arrange(run.outcome, needs_of(compiled, [rule]), plain=True)
+        if focus.sized:
+            (sizes,) = guide.sizes(signals.env)
+        if focus.scales is None:
+            return _JudgedTrace(margin, margin, sizes, inside)
+        scaled = guide.scaled(focus.scales)
+        rule = replace(rule, formula=scaled, lowered=scaled)
+        starts = starts_of(rule, signals.samples, compiled.grid.horizon, None)
+        record = Record.of(signals.env, signals.ops)
+        _, high = rule_bounds(rule, record, starts, compiled.grid.horizon, "open")
+        return _JudgedTrace(margin, float(high.min()), sizes, inside)
+
+
+def _together(found: Sequence[_JudgedTrace]) -> Simulations:
+    """Outcomes of several simulations; the sizes of failed ones are taken to be typical of the others."""
+    sizes = np.stack([each.sizes for each in found])
+    failed = np.array([each.failed for each in found], dtype=np.bool_)
+    if failed.any() and not failed.all():
+        sizes[failed] = np.median(sizes[~failed], axis=0)
+    return Simulations(
+        np.array([each.margin for each in found]),
+        np.array([each.guidance for each in found]),
+        np.array([each.inside for each in found], dtype=np.bool_),
+        sizes,
+    )
 
 
 @dataclass(frozen=True)
@@ -61,18 +119,18 @@ class PlantSimulator:
     """Simulator of a plant file.
 
     A simulation that fails gives no trace, so that it violates no requirement: its robustness is +inf, and it
-    is kept among the failures. A simulation in which the assumptions of the specification do not hold is not
+    is kept among the findings. A simulation in which the assumptions of the specification do not hold is not
     admissible.
 
     Attributes:
         judge: the black box, which the caller closes, and the specification of its signals.
         jobs: number of processes that simulate side by side.
-        failures: failed simulations until now.
+        findings: failed simulations until now, one for each point.
     """
 
     judge: PlantJudge
     jobs: int = 1
-    failures: list[FailedSimulation] = field(default_factory=list)
+    findings: list[FailedSimulation] = field(default_factory=list)
 
     @classmethod
     def load(cls, spec: str, plant: Path, overrides: Mapping[str, str], jobs: int = 1) -> PlantSimulator:
@@ -117,12 +175,8 @@ class PlantSimulator:
         return self.monitor.requirements
 
     @cached_property
-    def _guides(self) -> tuple[ScaledRobustness, ...]:
-        return tuple(ScaledRobustness(rule.formula) for rule in self._rules)
-
-    @property
-    def _rules(self) -> Sequence[CompiledRequirement]:
-        return self.monitor.compiled.requirements
+    def _judging(self) -> _Judging:
+        return _Judging(self.judge.monitor)
 
     def seen(self, requirement: int) -> float:
         """Share of the duration, at most 1, after which values of inputs no longer affect a requirement.
@@ -131,64 +185,43 @@ class PlantSimulator:
         interpolated signal depends on values that lie ahead.
         """
         decl = self.plant.decl
-        read_by = (self._rules[requirement], *self.monitor.compiled.assumptions)
+        compiled = self.monitor.compiled
+        read_by = (compiled.requirements[requirement], *compiled.assumptions)
         if not decl.free or any(_reads_everything(rule) for rule in read_by):
             return 1.0
         read = (max(rule.reach for rule in read_by) + 1) * float(decl.dt) / float(decl.duration)
         return min(read + max(_ahead(signal) for signal in decl.free), 1.0)
+
+    def graded(self, requirement: int) -> bool:  # noqa: ARG002
+        """True: the outputs of a plant are real numbers."""
+        return True
 
     # ------------------------------------------------------------------------ simulation
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
-        found = [self._judged(point, run, focus) for point, run in zip(points, runs, strict=True)]
-        return Simulations(
-            np.array([each.margin for each in found]),
-            np.array([each.guidance for each in found]),
-            np.array([each.inside for each in found], dtype=np.bool_),
-            np.stack([each.sizes for each in found]),
-        )
+        for point, run in zip(points, runs, strict=True):
+            known = any(np.array_equal(each.point, point) for each in self.findings)
+            if isinstance(run.outcome, PlantFinding) and not known:
+                self.findings.append(FailedSimulation(point, run.outcome))
+        return _together([self._judging(run, focus) for run in runs])
 
-    def _judged(self, point: Point, run: PlantRun, focus: Focus) -> _JudgedTrace:
-        guide = self._guides[focus.requirement]
-        sizes = np.zeros(len(guide.predicates) if focus.sized else 0)
-        if isinstance(run.outcome, PlantFinding):
-            self.failures.append(FailedSimulation(point, run.outcome))
-            return _JudgedTrace(np.inf, np.inf, inside=True, sizes=sizes)
-        rule = self._rules[focus.requirement]
-        verdict = self.monitor.check(run.outcome, require=(rule.name,))
-        margin = float(verdict.requirements[0].high.min())
-        inside = verdict.statuses[0] != "out of scope"
-        if not guide.predicates:
-            return _JudgedTrace(margin, margin, inside, sizes)
-        signals = arrange(run.outcome, needs_of(self.monitor.compiled, [rule]), plain=True)
-        if focus.sized:
-            (sizes,) = guide.sizes(signals.env)
-        if focus.scales is None:
-            return _JudgedTrace(margin, margin, inside, sizes)
-        scaled = guide.scaled(focus.scales)
-        rule = replace(rule, formula=scaled, lowered=scaled)
-        horizon = self.monitor.compiled.grid.horizon
-        starts = starts_of(rule, signals.samples, horizon, None)
-        _, high = rule_bounds(rule, Record.of(signals.env, signals.ops), starts, horizon, "open")
-        return _JudgedTrace(margin, float(high.min()), inside, sizes)
+    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+        """Outcomes at half the time step; None if the plant file does not allow it.
 
-    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> NDArray[np.float64] | None:
-        """Margins at half the time step, (count,); None if the plant file does not allow it.
-
-        The margin of a simulation that fails is NaN.
+        The margin of a simulation that fails is NaN there: it neither confirms a violation nor refutes it.
         """
         if self._finer is None:
             return None
-        name, found = self.requirements[requirement], []
-        for run in self._finer.plant.simulate(self._finer.plant.points_of(points), jobs=self.jobs):
-            if isinstance(run.outcome, PlantFinding):
-                found.append(np.nan)
-                continue
-            verdict = self._finer.monitor.check(run.outcome, require=(name,))
-            found.append(float(verdict.requirements[0].high.min()))
-        return np.array(found)
+        plant = self._finer.plant
+        found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]
+        return _together([replace(each, margin=np.nan) if each.failed else each for each in found])
+
+    @cached_property
+    def _finer_judging(self) -> _Judging:
+        assert self._finer is not None
+        return _Judging(self._finer.monitor)
 
     @cached_property
     def _finer(self) -> PlantJudge | None:

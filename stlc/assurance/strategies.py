@@ -18,12 +18,18 @@ STARTS = 10
 """Points from which the best is the start of a climb."""
 PATIENCE = 60
 """Steps without progress after which a climb starts anew."""
-WIDTH = 0.3
-"""First step width of a climb, in the unit cube."""
-CMA_WIDTH, CMA_LENGTH, CMA_DIMENSIONS = 0.4, 400, 200
+NARROW, WIDE = 0.01, 0.5
+"""Least and greatest step width of a climb, in the unit cube."""
+CMA_WIDTH, CMA_LENGTH, CMA_DIMENSIONS = 0.3, 400, 200
 """First step width of CMA-ES, evaluations after which it restarts, and coordinates up to which it is used."""
 SHORTEST, LONGEST = 0.01, 0.5
 """Half periods of periodic inputs, as shares of the duration."""
+SWEPT = 12
+"""Half periods that are tried before the best is refined."""
+ENDS, FEW_ENDS = 2.0 / 3.0, 0.2
+"""Share of values at the ends of their ranges: of vertices, and where robustness is no guide."""
+PIECES = 5
+"""Maximum number of pieces of coarse inputs."""
 
 
 class Strategy(ABC):
@@ -65,14 +71,16 @@ class ConstantVertices(Strategy):
         return next(self._left, None)
 
 
-def _ends(space: SearchSpace, generator: np.random.Generator, labels: NDArray[np.int64]) -> Point:
-    """Point whose values are, per label, the low end, the high end, or uniform, with a third each.
+def _values(
+    space: SearchSpace, generator: np.random.Generator, labels: NDArray[np.int64], ends: float
+) -> Point:
+    """Point with one value per label: at an end of the range with the probability `ends`, else uniform.
 
-    Free switching times stay uniform.
+    Free switching times are uniform.
     """
     count = int(labels.max()) + 1 if len(labels) else 0
-    values = generator.choice(3, count) / 2.0
-    values = np.where(values == 0.5, generator.random(count), values)
+    drawn, at_end = generator.random((2, count))
+    values = np.where(at_end < ends, np.round(drawn), drawn)
     point: Point = values[labels]
     for block in space.blocks:
         point[list(block.times)] = generator.random(len(block.times))
@@ -88,59 +96,102 @@ class UniformSampling(Strategy):
         return self.generator.random(self.space.dim)
 
 
+class DiscreteSampling(Strategy):
+    """Uniform values, some of them at the ends of their ranges; for requirements that give no guidance."""
+
+    name = "discrete"
+
+    def propose(self) -> Point:
+        return _values(self.space, self.generator, np.arange(self.space.dim), FEW_ENDS)
+
+
 class VertexSampling(Strategy):
-    """Each value independently at the low end, at the high end, or uniform between them."""
+    """Each value independently at the low end, at the high end, or uniform between them, a third each."""
 
     name = "vertices"
 
     def propose(self) -> Point:
-        return _ends(self.space, self.generator, np.arange(self.space.dim))
+        return _values(self.space, self.generator, np.arange(self.space.dim), ENDS)
+
+
+class CoarseSampling(Strategy):
+    """Inputs of a few long pieces with uniform values."""
+
+    name = "coarse"
+    ends = 0.0
+
+    def propose(self) -> Point:
+        labels = self.space.held(self.generator, PIECES)
+        return _values(self.space, self.generator, labels, self.ends)
+
+
+class CoarseVertices(CoarseSampling):
+    """Inputs of a few long pieces: each at the low end, at the high end, or uniform, a third each."""
+
+    name = "coarse vertices"
+    ends = ENDS
+
+
+class _Start:
+    """The best of the last points that were simulated, from which a local search starts.
+
+    Attributes:
+        point: the best point; None if there is none.
+        value: its guidance value.
+        seen: number of points.
+    """
+
+    def __init__(self) -> None:
+        self.point: Point | None = None
+        self.value, self.seen = math.inf, 0
+
+    def add(self, point: Point, value: float) -> None:
+        """Take a point into account."""
+        self.seen += 1
+        if value < self.value:
+            self.point, self.value = point, value
 
 
 class HillClimbing(Strategy):
-    """Steps from the best of a few points with long pieces: single values, or runs of values of an input."""
+    """Steps from the best of the points so far: single values, or runs of successive values of an input.
+
+    After `PATIENCE` steps without progress it starts anew from the best of `STARTS` later points.
+    """
 
     name = "hill climbing"
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
+        self._coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
         self._restart()
 
     def _restart(self) -> None:
-        self._point: Point | None = None
-        self._value, self._tried, self._failed, self._width = math.inf, 0, 0, WIDTH
+        self._start, self._failed = _Start(), 0
 
     def propose(self) -> Point:
-        self._tried += 1
-        if self._tried <= STARTS or self._point is None:
-            return _ends(self.space, self.generator, self.space.held(self.generator))
-        return self._neighbour(self._point)
+        if self._start.point is None or self._start.seen < STARTS:
+            return self._coarse[int(self.generator.integers(2))].propose()
+        return self._neighbour(self._start.point)
 
     def tell(self, point: Point, value: float) -> None:
         super().tell(point, value)
-        if value < self._value:
-            self._point, self._value, self._failed = point, value, 0
-            self._width = min(1.5 * self._width, 0.5)
-        elif self._tried > STARTS:
-            self._failed += 1
-            self._width = max(0.93 * self._width, 0.01)
+        self._failed = 0 if value < self._start.value else self._failed + 1
+        self._start.add(point, value)
         if self._failed > PATIENCE:
             self._restart()
 
     def observe(self, point: Point, value: float) -> None:
-        if self._tried <= STARTS and value < self._value:
-            self._point, self._value = point, value
+        self._start.add(point, value)
 
     def _neighbour(self, point: Point) -> Point:
         """Copy of a point with a few coordinates, or with a run of successive values of an input, changed."""
         generator, changed = self.generator, point.copy()
+        width = math.exp(generator.uniform(math.log(NARROW), math.log(WIDE)))
         for picked in self._picked():
             if generator.random() < 0.35:
                 changed[picked] = generator.choice((0.0, 1.0, generator.random()))
             else:
-                changed[picked] = np.clip(
-                    changed[picked] + self._width * generator.standard_normal(), 0.0, 1.0
-                )
+                changed[picked] = np.clip(changed[picked] + width * generator.standard_normal(), 0.0, 1.0)
         return changed
 
     def _picked(self) -> Iterator[list[int]]:
@@ -157,9 +208,10 @@ class HillClimbing(Strategy):
 
 
 class PeriodicInputs(Strategy):
-    """Square waves between the ends of an input's range, with random half period and phase.
+    """Square waves between the ends of an input's range.
 
-    The best wave so far is changed slightly half of the time.
+    First half periods are swept, from short to long in the order of a van der Corput sequence, with random
+    phases. Then the best wave is changed slightly.
     """
 
     name = "periodic"
@@ -167,18 +219,21 @@ class PeriodicInputs(Strategy):
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
         self._waves: NDArray[np.float64] | None = None
-        self._value = math.inf
+        self._value, self._proposed, self._width = math.inf, 0, 0.15
+        self._shift = generator.random()
         self._open: dict[int, NDArray[np.float64]] = {}
 
     def propose(self) -> Point | None:
         if not self.space.blocks:
             return None
         generator, count = self.generator, len(self.space.blocks)
-        if self._waves is not None and generator.random() < 0.5:
-            waves = self._waves + generator.normal(0.0, 0.1, self._waves.shape)
+        self._proposed += 1
+        if self._waves is not None and self._proposed > SWEPT and generator.random() < 0.8:
+            waves = self._waves + generator.normal(0.0, self._width, self._waves.shape)
         else:
-            ends = math.log(SHORTEST), math.log(LONGEST)
-            waves = np.stack([generator.uniform(*ends, count), generator.random(count) * 2.0], 1)
+            share = (_van_der_corput(self._proposed) + self._shift) % 1.0
+            half = math.log(SHORTEST) + share * (math.log(LONGEST) - math.log(SHORTEST))
+            waves = np.stack([np.full(count, half), generator.random(count) * 2.0], 1)
         point = self.space.middle()
         for block, (period, phase) in zip(self.space.blocks, waves, strict=True):
             self._fill(point, block.values, block.times, math.exp(period), phase, block.fractions)
@@ -210,11 +265,21 @@ class PeriodicInputs(Strategy):
         super().tell(point, value)
         waves = self._open.pop(id(point))
         if value < self._value:
-            self._waves, self._value = waves, value
+            self._waves, self._value, self._width = waves, value, 0.15
+        elif self._proposed > SWEPT:
+            self._width = max(0.9 * self._width, 0.02)
+
+
+def _van_der_corput(index: int) -> float:
+    """Element of the van der Corput sequence in base 2: 1/2, 1/4, 3/4, 1/8, and so on."""
+    return int(f"{index:b}"[::-1], 2) / (1 << index.bit_length())
 
 
 class CovarianceAdaptation(Strategy):
-    """CMA-ES (Hansen and Ostermeier 2001) in the unit cube, by the package `cma`."""
+    """CMA-ES (Hansen and Ostermeier 2001) in the unit cube, by the package `cma`.
+
+    It starts from the best point so far, and then from the best of later ones.
+    """
 
     name = "cma-es"
 
@@ -224,6 +289,7 @@ class CovarianceAdaptation(Strategy):
         self._asked: list[Point] = []
         self._open: list[Point] = []
         self._told: list[tuple[Point, float]] = []
+        self._start = _Start()
 
     @classmethod
     def available(cls, space: SearchSpace) -> bool:
@@ -242,12 +308,16 @@ class CovarianceAdaptation(Strategy):
 
     def tell(self, point: Point, value: float) -> None:
         super().tell(point, value)
+        self._start.add(point, value)
         if any(point is each for each in self._asked):
             self._told.append((point, value))
         if self._told and len(self._told) == len(self._asked):
             finite = [min(value, 1e9) for _, value in self._told]
             self._search.tell([each for each, _ in self._told], finite)
             self._asked, self._told = [], []
+
+    def observe(self, point: Point, value: float) -> None:
+        self._start.add(point, value)
 
     def _started(self) -> Any:
         with warnings.catch_warnings():
@@ -259,7 +329,8 @@ class CovarianceAdaptation(Strategy):
             "verbose": -9,
             "verb_log": 0,
         }
-        start = self.generator.random(self.space.dim)
+        start = self.generator.random(self.space.dim) if self._start.point is None else self._start.point
+        self._start = _Start()
         return cma.CMAEvolutionStrategy(start, CMA_WIDTH, options)
 
 

@@ -7,6 +7,7 @@ with names in the program that includes the header, so every name gets a prefix.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +16,6 @@ from string import Template
 from typing import TYPE_CHECKING, assert_never
 
 import torch
-from torch import nn
 
 from stlc.compile.backends.c.emit import CHECK, HEAD, forward_blocks, passes, state_index
 from stlc.compile.backends.c.numbers import NumberWriter, literal
@@ -26,6 +26,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import nodes
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
+from stlc.controller.policies.policy import ClosedLoopActor
 from stlc.controller.problem.native import motion_of
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
@@ -50,7 +51,8 @@ if TYPE_CHECKING:
     from stlc.compile.backends.c.emit import Motion
     from stlc.compile.backends.c.plan import Plan
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.policies.policy import PlanProposer
+    from stlc.dynamics.schema.names import ControlDecl
     from stlc.signature import Column
 
 
@@ -133,51 +135,50 @@ def _framed(text: str, guard: str) -> str:
 # --------------------------------------------------------------------------------------------- weights
 
 
-def weights(network: PlanNetwork) -> str:
+def weights(network: PlanProposer) -> str:
     """Return the weights of a network as C arrays.
 
     The arrays are `centre` and `spread`, by which the inputs are normalised, and `weight_i` (in, out) and
     `bias_i` of each layer.
     """
+    layers = network.layers
     lines = ["/* float32, row by row; generated */"]
-    lines += [f"static const float centre[] = {{{_row(network.centre)}}};"]
-    lines += [f"static const float spread[] = {{{_row(network.spread)}}};"]
-    for number, layer in enumerate(_layers(network)):
-        rows = ",\n".join(f"{{{_row(row)}}}" for row in layer.weight.detach().t())
-        lines.append(
-            f"static const float weight_{number}[{layer.in_features}][{layer.out_features}] = {{\n{rows}}};"
-        )
-        lines.append(f"static const float bias_{number}[{layer.out_features}] = {{{_row(layer.bias)}}};")
+    lines += [f"static const float centre[] = {{{_row(layers.centre)}}};"]
+    lines += [f"static const float spread[] = {{{_row(layers.spread)}}};"]
+    for number, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
+        outputs, inputs = weight.shape
+        rows = ",\n".join(f"{{{_row(row)}}}" for row in weight.detach().t())
+        lines.append(f"static const float weight_{number}[{inputs}][{outputs}] = {{\n{rows}}};")
+        lines.append(f"static const float bias_{number}[{outputs}] = {{{_row(bias)}}};")
     return "\n".join(lines) + "\n"
 
 
-def forward(network: PlanNetwork) -> list[str]:
+def forward(network: PlanProposer) -> list[str]:
     """C statements of the network: from the observation `seen` (double) to the output `raw` (float).
 
     The layers use two C arrays in turn: layer 0 reads `h0` and writes `h1`, layer 1 reads `h1` and writes
     `h0`, and so on. The last layer writes `raw`.
     """
-    layers = list(_layers(network))
-    lines = [
-        f"for (int i = 0; i < {layers[0].in_features}; ++i) h0[i] = ((float)seen[i] - centre[i]) / spread[i];"
-    ]
-    for number, layer in enumerate(layers):
-        last = number == len(layers) - 1
+    layers = network.layers
+    scaled = "((float)seen[i] - centre[i]) / spread[i]"
+    if math.isfinite(layers.bound):
+        bound = _float(layers.bound)
+        scaled = f"MAX(MIN({scaled}, {bound}), -{bound})"
+    lines = [f"for (int i = 0; i < {len(layers.centre)}; ++i) h0[i] = {scaled};"]
+    for number, weight in enumerate(layers.weights):
+        last = number == len(layers.weights) - 1
         source, target = f"h{number % 2}", "raw" if last else f"h{(number + 1) % 2}"
-        sizes = f"{layer.in_features}, {layer.out_features}"
+        sizes = f"{weight.shape[1]}, {weight.shape[0]}"
+        function = 0 if last else 1 if layers.activation == "relu" else 2
         lines.append(
-            f"layer({source}, {target}, &weight_{number}[0][0], bias_{number}, {sizes}, {int(not last)});"
+            f"layer({source}, {target}, &weight_{number}[0][0], bias_{number}, {sizes}, {function});"
         )
     return lines
 
 
-def widest(network: PlanNetwork) -> int:
+def widest(network: PlanProposer) -> int:
     """Greatest number of inputs among the network's layers."""
-    return max(layer.in_features for layer in _layers(network))
-
-
-def _layers(network: PlanNetwork) -> Iterator[nn.Linear]:
-    return (layer for layer in network.body if isinstance(layer, nn.Linear))
+    return max(weight.shape[1] for weight in network.layers.weights)
 
 
 def _row(values: Tensor) -> str:
@@ -193,13 +194,13 @@ def _float(value: float) -> str:
 # --------------------------------------------------------------------------------------------- numbers
 
 
-def squashed(task: Task) -> list[str]:
+def squashed(controls: Sequence[ControlDecl]) -> list[str]:
     """C statements that compute the controls `u` of one time step from outputs `raw` of the network.
 
     The outputs are mapped to the ranges of the controls, by `tanh` for instance.
     """
     lines, at = [], 0
-    for i, each in enumerate(task.system.decl.controls):
+    for i, each in enumerate(controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
         match each.squash:
             case "tanh":
@@ -275,7 +276,7 @@ def _term(term: CostTerm, at: Mapping[str, str]) -> list[str]:
 # ------------------------------------------------------------------------------------------ the header
 
 
-def header(task: Task, network: PlanNetwork) -> str:
+def header(task: Task, network: PlanProposer) -> str:
     """Return the text of `stlc_controller.h`, which includes `stlc_weights.h`.
 
     Raises:
@@ -310,14 +311,12 @@ class _Template(Template):
     delimiter = "@"
 
 
-def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
+def _numbers(task: Task, network: PlanProposer) -> dict[str, object]:
     """Values for the template of the header: placeholder -> a size, a constant or generated code."""
-    grid, mirror = grid_of(task), network.mirror
+    grid = grid_of(task)
     most = max((grid.count(length) for length in grid.lengths), default=0)
     controls, names = task.system.decl.controls, task.system.control_names
     states, inputs = _places("x", task.system.names), _places("u", names)
-    moved, reflected = state_images(task), list(control_images(task).values())
-    images = [moved.get(name, ir.Signal(name)) for name in task.system.names]
     given = commands(task.system.decl)
     commanded = [given.get(name, ir.Signal(name)) for name in names]
     return {
@@ -337,8 +336,8 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         **_changes(network),
         "LOW": ", ".join(literal(each.low) for each in controls),
         "HIGH": ", ".join(literal(each.high) for each in controls),
-        "RAW": raw_width(controls),
-        "OBSERVED": task.system.observed_count,
+        "RAW": raw_width(network.outputs),
+        "OBSERVED": len(network.layers.centre),
         "WIDEST": widest(network),
         "CHOICES": most + 1,
         "LENGTHS": ", ".join(map(str, grid.lengths)) or "0",
@@ -350,13 +349,9 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "MOST_LEVELS": max(map(len, grid.values)),
         "LEVELS": ", ".join("{" + ", ".join(map(literal, values)) + "}" for values in grid.values),
         "REST": ", ".join(literal(min(max(0.0, each.low), each.high)) for each in controls),
-        "MIRRORED": int(mirror is not None),
-        "SIDE": 0 if mirror is None else mirror.side,
         "OBSERVE": _block(_assigned("seen", observation(task), states)),
-        "IMAGE_STATE": "" if mirror is None else _block(_assigned("image", images, states)),
-        "IMAGE_ACTION": "" if mirror is None else _block(_assigned("image", reflected, inputs)),
-        "SQUASH": _block(squashed(task)),
-        "FORWARD": _block(forward(network)),
+        "SQUASH": _block(squashed(network.outputs)),
+        "PROPOSE": _proposing(task, network),
         "COMMAND": _block(_assigned("command", commanded, states | inputs)),
         "COST": _block(cost(task)),
         "OVERALL": _block(_overall(task.rules, task.rules)),
@@ -364,7 +359,36 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
     }
 
 
-def _changes(network: PlanNetwork) -> dict[str, object]:
+def _proposing(task: Task, network: PlanProposer) -> str:
+    """C function `propose`: the plans of the network, or the closed loop of an actor on the model."""
+    parts: dict[str, object] = {"FORWARD": _block(forward(network))}
+    if isinstance(network, ClosedLoopActor):
+        return _template("propose_actor.c.txt").substitute(parts | {"STEP": _block(_step(task))}).rstrip()
+    mirror = network.mirror
+    states, inputs = _places("x", task.system.names), _places("u", task.system.control_names)
+    moved, reflected = state_images(task), list(control_images(task).values())
+    images = [moved.get(name, ir.Signal(name)) for name in task.system.names]
+    parts |= {
+        "MIRRORED": int(mirror is not None),
+        "SIDE": 0 if mirror is None else mirror.side,
+        "IMAGE_STATE": "" if mirror is None else _block(_assigned("image", images, states)),
+        "IMAGE_ACTION": "" if mirror is None else _block(_assigned("image", reflected, inputs)),
+    }
+    return _template("propose_plans.c.txt").substitute(parts).rstrip()
+
+
+def _step(task: Task) -> list[str]:
+    """C statements of one exact step of the model: from states `x` and controls `u` to states `after`."""
+    system, step = task.system, task.system.exact_step
+    writer = NumberWriter(_columns(_places("x", system.names) | _places("u", system.control_names)))
+    for name, number in step.lets:
+        writer.bound[name] = writer.number(number)
+    moved = {name: writer.number(number) for name, number in step.next.items()}
+    places = {name: i for i, name in enumerate(system.names)}
+    return [*writer.lines, *(f"after[{places[name]}] = {value};" for name, value in moved.items())]
+
+
+def _changes(network: PlanProposer) -> dict[str, object]:
     """Texts for the header about the changed copies of plans: placeholder -> number or C text.
 
     If a plan violates the specification, the policy also tries copies of it in which one control is changed.

@@ -12,19 +12,18 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
 
-from torch import nn
-
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numbers, written
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
+from stlc.controller.policies.policy import ClosedLoopActor
 from stlc.controller.problem.task import TIE, Task
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.controls import EPS, raw_width
-from stlc.dynamics.model.schedule import RolloutStage, schedule
+from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.description import (
     MARGIN,
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.policies.policy import PlanProposer
     from stlc.dynamics.schema.names import ControlDecl
 
 
@@ -165,8 +164,8 @@ def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Col
 # ---------------------------------------------------------------------------------------------- policy
 
 
-def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Value:
-    """Return all plans that a network proposes.
+def proposed(task: Task, network: PlanProposer, state: Mapping[str, Value]) -> Value:
+    """Return all plans that a network proposes; those of an actor are its closed loop on the model.
 
     Args:
         task: the task that the network was trained for.
@@ -179,8 +178,10 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
     Raises:
         Untranslatable: the expression of an observation or of a mirrored value calls a Python function.
     """
+    if isinstance(network, ClosedLoopActor):
+        return _closed_loop(task, network, state)
     folded, swapped = _folded(task, network, state)
-    raw = _layers(network, _observed(task, folded))
+    raw = _layers(network, _observed(task, folded).T.cast("float32"))
     raw = raw.reshaped(BATCH, network.plans, task.horizon, raw_width(task.system.decl.controls))
     columns = iter(raw.transposed(3, 0, 1, 2).rows())
     controls = {each.name: _squashed(each, columns) for each in task.system.decl.controls}
@@ -191,8 +192,42 @@ def proposed(task: Task, network: PlanNetwork, state: Mapping[str, Value]) -> Va
     return joined(list(controls.values())).transposed(1, 2, 3, 0).cast("float64")
 
 
+def _closed_loop(task: Task, network: ClosedLoopActor, state: Mapping[str, Value]) -> Value:
+    """Controls of an actor over the horizon, each step from the states that it has reached.
+
+    Arguments and result are those of `proposed`, with one plan per agent.
+    """
+    step = task.system.exact_step
+    numbers = dict(step.lets) | {f"{name}'": number for name, number in step.next.items()}
+    require_numbers(list(numbers.values()))
+    programs = [ArrayProgram(block) for block in blocks(numbers)]
+    moving = list(step.next)
+
+    def turn(
+        sheet: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
+    ) -> tuple[Sequence[Value], Sequence[Value]]:
+        env = {name: value.on(sheet) for name, value in state.items()} | dict(zip(moving, now, strict=True))
+        seen = joined([_observed(task, env), rows[0].expand(1, BATCH, like=now[0])])
+        columns = iter(_layers(network, seen.T.cast("float32")).T.rows())
+        actions = {}
+        for each in network.outputs:
+            action = _squashed(each, columns).cast("float64")
+            actions[each.name] = ONNX_OPS.clamp(action, each.low, each.high)
+        env |= actions
+        for program in programs:
+            env.update(program(env, ONNX))
+        later = [env[f"{name}'"].expand(1, BATCH, like=now[0]) for name in moving]
+        return later, list(actions.values())
+
+    carried = [state[name] for name in moving]
+    elapsed = carried[0].sheet.constant([[k / task.horizon] for k in range(task.horizon)])
+    controls = carried[0].sheet.repeated(carried, [elapsed], turn)
+    planes = [each.reshaped(1, task.horizon, BATCH) for each in controls]
+    return joined(planes).transposed(2, 1, 0).reshaped(BATCH, 1, task.horizon, len(controls))
+
+
 def _folded(
-    task: Task, network: PlanNetwork, state: Mapping[str, Value]
+    task: Task, network: PlanProposer, state: Mapping[str, Value]
 ) -> tuple[Mapping[str, Value], Value | None]:
     """Replace states on one side of the system's mirror symmetry by their mirror images.
 
@@ -209,23 +244,25 @@ def _folded(
 
 
 def _observed(task: Task, state: Mapping[str, Value]) -> Value:
-    """Observations of the network, (batch, k) float32."""
+    """Observations of the network, (k, batch) float64."""
     numbers = observation(task)
     seen = assigned({str(place): number for place, number in enumerate(numbers)}, state)
     like = next(iter(state.values()))
     rows = [seen[str(place)].expand(1, BATCH, like=like) for place in range(len(numbers))]
-    return joined(rows).T.cast("float32")
+    return joined(rows)
 
 
-def _layers(network: PlanNetwork, seen: Value) -> Value:
-    sheet = seen.sheet
-    x = (seen - _weights(seen, network.centre)) / _weights(seen, network.spread)
-    for layer in network.body:
-        if isinstance(layer, nn.Linear):
-            parts = (x, _weights(seen, layer.weight), _weights(seen, layer.bias))
-            (x,) = sheet.emit("Gemm", parts, [(BATCH, layer.out_features)], "float32", {"transB": 1})
-        else:
-            x = x.apply("Relu")
+def _layers(network: PlanProposer, seen: Value) -> Value:
+    """Outputs of the feed-forward network, (batch, outputs), for observations (batch, k), both float32."""
+    layers = network.layers
+    x = (seen - _weights(seen, layers.centre)) / _weights(seen, layers.spread)
+    if math.isfinite(layers.bound):
+        x = ONNX_OPS.clamp(x, -layers.bound, layers.bound)
+    for place, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
+        if place:
+            x = x.apply({"relu": "Relu", "tanh": "Tanh"}[layers.activation])
+        parts = (x, _weights(seen, weight), _weights(seen, bias))
+        (x,) = seen.sheet.emit("Gemm", parts, [(BATCH, len(bias))], "float32", {"transB": 1})
     return x
 
 
@@ -445,7 +482,7 @@ def falls(task: Task, start: States, plans: Value) -> Value:
 # ---------------------------------------------------------------------------------------------- graphs
 
 
-def deciding(task: Task, network: PlanNetwork, *, varied: bool = True) -> dict[str, Value]:
+def deciding(task: Task, network: PlanProposer, *, varied: bool = True) -> dict[str, Value]:
     """Graph from `state` (batch, n) to the best of the policy's plans and its verdict, all float64.
 
     If the best plan of the network violates the specification, copies of it with small changes are tried,
@@ -463,7 +500,7 @@ def deciding(task: Task, network: PlanNetwork, *, varied: bool = True) -> dict[s
     return _shown(_varied(task, network, state, policy) if varied else policy) | _added(task, state)
 
 
-def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
+def following(task: Task, network: PlanProposer) -> dict[str, Value]:
     """Graph from `state` (batch, n) and `begun` (batch, T, m) to the plan that `Guard` chooses.
 
     `begun` is the rest of the previous plan. It is kept if it satisfies the specification and one of two
@@ -496,7 +533,7 @@ def following(task: Task, network: PlanNetwork) -> dict[str, Value]:
     return chosen | shown | _added(task, state)
 
 
-def _varied(task: Task, network: PlanNetwork, state: Value, policy: Mapping[str, Value]) -> dict[str, Value]:
+def _varied(task: Task, network: PlanProposer, state: Value, policy: Mapping[str, Value]) -> dict[str, Value]:
     """Replace each plan that violates the specification by a changed copy, if one ranks higher.
 
     A changed copy is the plan plus one of the changes that the network declares. The copies are judged only

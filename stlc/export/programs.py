@@ -27,7 +27,7 @@ from stlc.runtime.prefixes import PrefixGrid
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
-    from stlc.controller.policies.policy import PlanNetwork
+    from stlc.controller.policies.policy import PlanProposer
 
 
 class Deciding(nn.Module):
@@ -37,7 +37,7 @@ class Deciding(nn.Module):
     and `requirements` that of each requirement.
     """
 
-    def __init__(self, task: Task, network: PlanNetwork) -> None:
+    def __init__(self, task: Task, network: PlanProposer) -> None:
         super().__init__()
         self.network = network
         self._task = task
@@ -96,7 +96,7 @@ def without_deprecations() -> Iterator[None]:
         yield
 
 
-def recorded(task: Task, network: PlanNetwork) -> ExportedProgram:
+def recorded(task: Task, network: PlanProposer) -> ExportedProgram:
     """Return the controller as an exported torch program for any number of agents; states are float64."""
     return _exported(Deciding(task, network), task.sample(3, seed=0, dtype=torch.float64))
 
@@ -153,7 +153,7 @@ class Guarding(nn.Module):
         t0 (B,): number of actions in the prefix of the plan; 0 if the system file declares no prefixes.
     """
 
-    def __init__(self, task: Task, network: PlanNetwork, grid: PrefixGrid | None = None) -> None:
+    def __init__(self, task: Task, network: PlanProposer, grid: PrefixGrid | None = None) -> None:
         super().__init__()
         self.deciding = Deciding(task, network)
         self.grid = grid or grid_of(task)
@@ -241,7 +241,7 @@ def _safest(tried: _Tried, falls: Tensor) -> Tensor:
 
 def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
     """Select entry `pick` (rows,) of every row: (rows, choices, …) -> (rows, …)."""
-    rows = torch.arange(len(pick))
+    rows = torch.arange(pick.shape[0])  # `len` would fix the size of the batch
     return [value[rows, pick] for value in values]
 
 
@@ -257,7 +257,7 @@ def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) 
     )
 
 
-def recorded_guard(task: Task, network: PlanNetwork) -> ExportedProgram:
+def recorded_guard(task: Task, network: PlanProposer) -> ExportedProgram:
     """Return the guard of Meng and Fan 2023 as an exported torch program for any batch size.
 
     All floating-point inputs and outputs are float64.

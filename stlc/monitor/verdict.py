@@ -356,6 +356,31 @@ def _judge(
     return Judgement(rule, starts.start, low, high, holds, fails, ready.signals.shape)
 
 
+def first_violation(judgement: Judgement, subject: Prepared, tolerance: float = TOLERANCE) -> int:
+    """Return the sample from which a violated requirement is certainly violated, whatever follows.
+
+    An online monitor reports the violation at this sample. It is found by bisection, since a prefix that
+    certainly violates a requirement does so however it goes on. If the end of the trace decides, the last
+    sample is returned.
+
+    Args:
+        judgement: a judgement that is `violated`.
+        subject: the evaluated signals, `Verdict.subject`.
+        tolerance: the tolerance of the judgement.
+    """
+    low, high = judgement.start + 1, subject.record.samples
+    while low < high:
+        middle = (low + high) // 2
+        cut = replace(subject, record=subject.record.cut(middle))
+        starts = range(judgement.start, min(judgement.start + judgement.instants, middle))
+        fails = _judge(judgement.rule, cut, starts, "open", tolerance).fails
+        if judgement.counted(fails).any():
+            high = middle
+        else:
+            low = middle + 1
+    return high - 1
+
+
 def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
     """Return a copy of the judgement whose `reported` bounds are in the semantics that `ready` selects.
 

@@ -15,9 +15,11 @@ from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify, falsify_e
 from stlc.assurance.guidance import ScaledRobustness, scales_of
 from stlc.assurance.model_simulator import ModelSimulator
 from stlc.assurance.plant_simulator import PlantSimulator
-from stlc.assurance.simulation import Focus, LocalWorkers, SharedSimulator
+from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
+from stlc.assurance.simulation import Focus
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
+from stlc.controller.parallel.workers import LocalProcesses
 from stlc.trace import load_trace
 
 SYSTEM = """
@@ -143,7 +145,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
         outcome = simulator.simulate(np.stack([np.ones(5), np.zeros(5)]), Focus(0))
     assert outcome.admissible.tolist() == [True, True]
     assert outcome.margins[1] == np.inf
-    assert "below the ground" in simulator.failures[0].finding.message
+    assert "below the ground" in simulator.findings[0].finding.message
     assert main(["falsify", "fall.stl", "--plant", "fall.yaml", "--simulations", "20"]) == 1
     text = capsys.readouterr().out
     assert "up: violated, robustness -" in text
@@ -213,7 +215,7 @@ def test_workers_search_several_requirements_with_the_results_of_one_process(hom
     source = Oscillator(home)
     simulator, order = source.load(), SearchOrder(SearchBudget(30), seed=1, shrinks=False)
     points = np.random.default_rng(0).random((5, simulator.space.dim))
-    with LocalWorkers(source, 2) as workers:
+    with SimulatorWorkers(source, LocalProcesses(2, fresh=True)) as workers:
         apart = list(falsify_each(simulator, (0, 1), order, workers))
         (one,) = falsify_each(simulator, (1,), order, workers)
         shared = SharedSimulator(simulator, workers)

@@ -119,14 +119,18 @@ def test_a_counterexample_must_remain_at_half_the_time_step():
 @pytest.mark.usefixtures("home")
 def test_a_plant_has_a_half_step_only_if_its_file_says_so():
     simulator = load()
-    assert simulator.at_half_step(np.full((1, simulator.space.dim), 0.5), 0) is None
+    assert simulator.at_half_step(np.full((1, simulator.space.dim), 0.5), Focus(0)) is None
     Path("half.yaml").write_text(PLANT.replace("duration: 2 s", "duration: 2 s, halves: true"))
     halved = load(plant="half.yaml")
     ones = np.ones((1, halved.space.dim))
-    found = halved.at_half_step(ones, 0)
-    margin = halved.simulate(ones, Focus(0)).margins
+    found = halved.at_half_step(ones, Focus(4, (1e-3, 1.0)))
+    outcome = halved.simulate(ones, Focus(4, (1e-3, 1.0)))
     halved.close()
-    assert found == pytest.approx(margin)  # the right-hand side is integrated exactly at both steps
+    assert found is not None
+    assert found.guidance == pytest.approx(outcome.guidance)
+    assert found.margins == pytest.approx(
+        outcome.margins
+    )  # the right-hand side is integrated exactly at both steps
 
 
 @pytest.mark.usefixtures("home")
@@ -135,11 +139,11 @@ def test_a_failure_at_half_the_time_step_confirms_nothing_and_refutes_nothing():
     Path("pair.py").write_text(code)
     Path("half.yaml").write_text(PLANT.replace("duration: 2 s", "duration: 2 s, halves: true"))
     simulator = load(plant="half.yaml")
-    found = simulator.at_half_step(np.ones((1, simulator.space.dim)), 0)
+    found = simulator.at_half_step(np.ones((1, simulator.space.dim)), Focus(0))
     simulator.close()
     assert found is not None
-    assert np.isnan(found).all()
-    assert simulator.failures == []
+    assert np.isnan(found.margins).all()
+    assert simulator.findings == []
 
 
 @pytest.mark.usefixtures("home")

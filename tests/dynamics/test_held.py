@@ -181,10 +181,67 @@ def test_delays(make: Make) -> None:
     assert [num.name for num in system.decl.policy.observe] == ["x", "y", "w", "one", "late", "wind"]
 
 
+VARYING = (
+    "time: {dt: 0.1 s, horizon: 60 steps, integrator: rk4}\n"
+    "state: {phase: {}, x: {unit: m}}\n"
+    "def: {wait: 0.5 s + 0.3 s * sin(phase), value: 1 m * cos(2 * phase)}\n"
+    "flow: {phase: 1 / (1 s), x: late / (1 s)}\n"
+    "init: {mixture: [{draw: {phase: 'uniform(0, 6)', x: 0}}]}\n"
+)
+
+
+@pytest.mark.parametrize("transport", [False, True])
+def test_delays_that_vary(make: Make, transport: bool) -> None:
+    keys = "of: value, by: wait, at_most: 0.8 s, before: 20 cm" + ", transport: true" * transport
+    system = make(VARYING + f"delay: {{late: {{unit: cm, {keys}}}}}\n")
+    columns = rolled(system)
+    time, fine = np.arange(61) * 0.1, np.linspace(0, 6, 6001)
+    for row, phase in enumerate(columns["phase"][:, 0]):
+        wait = 0.5 + 0.3 * np.sin(phase + fine)
+        if transport:  # the way passed so far; what leaves the pipe entered it one length before
+            way = np.concatenate(([0.0], np.cumsum(0.0005 * (1 / wait[1:] + 1 / wait[:-1]))))
+            at = np.interp(np.interp(time, fine, way) - 1, way, fine, left=np.nan)
+        else:
+            at = time - np.interp(time, fine, wait)
+        known = at >= 0
+        wanted = 100 * np.cos(2 * (phase + at))
+        np.testing.assert_allclose(columns["late"][row, known], wanted[known], atol=0.6)
+        np.testing.assert_array_equal(columns["late"][row, :2], 20)
+    # within a step the value moves, so that the integral is that of the trapezoidal rule
+    moved = np.diff(columns["x"]) / 0.1 * 100
+    middle = (columns["late"][:, 13:] + columns["late"][:, 12:-1]) / 2
+    np.testing.assert_allclose(moved[:, 12:], middle, atol=1.2 if transport else 3.5)
+    assert [num.name for num in system.decl.policy.observe] == ["phase", "x", "late"]
+
+
+def test_a_delay_that_varies_in_c_and_its_gradient(make: Make) -> None:
+    keys = "of: value, by: wait, at_most: 0.8 s, transport: true"
+    system = make(VARYING + f"delay: {{late: {{unit: cm, {keys}}}}}\n")
+    task = Task.of(stlc.parse("state signal x [m]\nrequire r: always x < 1 m"), system)
+    x0, u = task.sample(5, seed=1, dtype=torch.float64), torch.zeros(5, 60, 0, dtype=torch.float64)
+    assert task.native is not None
+    judged = task.judge(x0, u)
+    _, columns = task._judged_by_torch(x0, u)
+    for name in system.names:
+        torch.testing.assert_close(judged.columns[name], columns[name], atol=1e-10, rtol=0)
+    start = x0[:1].clone().requires_grad_()
+    last = system.rollout(start, u[:1])[:, -1, 1].sum()
+    (gradient,) = torch.autograd.grad(last, start)
+    moved = x0[:1].clone()
+    moved[:, 0] += 1e-6
+    change = (system.rollout(moved, u[:1])[:, -1, 1].sum() - last) / 1e-6
+    assert gradient[0, 0].item() == pytest.approx(change.item(), rel=1e-4)
+
+
 @pytest.mark.parametrize(
     ("text", "code"),
     [
         ("delay: {d: {of: x}}", "S102"),
+        ("delay: {d: {unit: m, of: x, by: y / (1 m/s), transport: true}}", "S102"),
+        ("delay: {d: {unit: m, of: x, by: y / (1 m/s)}}", "S103"),
+        ("delay: {d: {unit: m, of: x, by: y, at_most: 1 s}}", "E203"),
+        ("delay: {d: {unit: m, of: x, by: 0.2 s, at_most: 101 s}}", "S103"),
+        ("delay: {d: {unit: m, of: x, by: 0.2 s, at_most: 1 s}}\nflow: {d: 1 m/s}", "S202"),
         ("delay: {d: {of: x, by: 0.25 s}}", "S103"),
         ("delay: {d: {of: x, by: 1001}}", "S103"),
         ("delay: {d: {unit: s, of: x, by: 1}}", "E203"),

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.documents import misfits
-from helpers.exported import CART, MISSION, run_of, untrained
+from helpers.exported import CART, MISSION, STRICT, build, run_of, untrained
 
 from stlc import native
 from stlc.cli.commands.schema import load_schema
@@ -23,23 +23,12 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
 from stlc.diagnostics import RunError, UsageError
 from stlc.export.programs import without_deprecations
-from stlc.export.verify import BUILT, agreement, answers
+from stlc.export.verify import agreement, answers
 from stlc.export.write import export, target_of
 from stlc.runtime.prefixes import SAMPLINGS
 
 ROOT = Path(__file__).parents[2]
 compiled = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
-
-
-STRICT = ("-Wall", "-Wextra", "-Wshadow", "-pedantic", "-Werror")
-
-
-def build(folder: Path) -> Path:
-    using = native.compiler()
-    assert using is not None
-    target = folder / "controller"
-    subprocess.run([using, *BUILT, *STRICT, "-o", str(target), str(folder / "main.c"), "-lm"], check=True)
-    return target
 
 
 def build_in_cpp(folder: Path) -> Path:

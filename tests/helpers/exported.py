@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import atexit
 import shutil
+import subprocess
 import tempfile
 from functools import cache
 from pathlib import Path
 
 import torch
 
+from stlc import native
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
 from stlc.dynamics.model.system import System
+from stlc.export.verify import BUILT
 from stlc.export.write import export
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 
 ROOT = Path(__file__).parents[2]
+STRICT = ("-Wall", "-Wextra", "-Wshadow", "-pedantic", "-Werror")
+"""Warnings of the C compiler that count as errors."""
 
 CART = """stlc: 1
 name: cart
@@ -84,6 +89,15 @@ def mission() -> tuple[Run, Path]:
     (folder / "cart.stl").write_text(MISSION)
     run = untrained(folder / "cart.stl", folder / "cart.yaml", folder / "runs")
     return run, export(run, "onnx", folder / "out").folder
+
+
+def build(folder: Path) -> Path:
+    """The example program of an exported C controller, compiled without a warning."""
+    using = native.compiler()
+    assert using is not None
+    target = folder / "controller"
+    subprocess.run([using, *BUILT, *STRICT, "-o", str(target), str(folder / "main.c"), "-lm"], check=True)
+    return target
 
 
 def _kept() -> Path:

@@ -80,6 +80,7 @@ class Work:
         color: whether the text of the result has colour codes.
         mode: value of `--color`; the worker process uses the same value.
         certify: whether the traces are returned as a sample for bounds.
+        table: whether the times of first violations are looked for.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Work:
     color: bool = False
     mode: ColorMode = "never"
     certify: bool = False
+    table: bool = False
 
 
 def found(name: str, runs: Path) -> Path:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,42 +14,121 @@ from stlc.cli.check.judge import Work, found, judge
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
 from stlc.cli.framework.documents import InvalidTrace
 from stlc.cli.framework.output import COLOR, table
-from stlc.diagnostics import StlcError, usage
-from stlc.stopping import leaving
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, usage
+from stlc.escape import operand
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Sample
+    from stlc.cli.check.judge import Question
     from stlc.cli.check.outcome import Checked
+    from stlc.controller.parallel.workers import CallFiles, LostCall
 
 SMALL = 1_000_000
 """File size in bytes below which the unpacked content always fits into memory."""
 
 
-def all_outcomes(works: Sequence[Work], jobs: int) -> Iterator[Outcome]:
-    """Yield the outcomes of all files in order, computed by `jobs` processes (0: one per core).
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Workers that judge files.
+
+    Attributes:
+        jobs: number of processes of this machine; 0: one per core.
+        cluster: address of a Ray cluster, instead of this machine; None without one.
+    """
+
+    jobs: int = 1
+    cluster: str | None = None
+
+    def processes(self, files: int) -> int:
+        """Number of processes of this machine for a number of files."""
+        return min(self.jobs or os.cpu_count() or 1, files)
+
+
+def all_outcomes(
+    works: Sequence[Work], places: Places, progress: Callable[[str], object] = lambda _: None
+) -> list[Outcome]:
+    """Judge all files, and return their outcomes in order.
 
     If there is only one file and it cannot be judged, its error is raised. If there are several files, errors
-    are stored in the outcome of the file.
+    are stored in the outcome of the file. A file whose worker is lost is judged again, `ATTEMPTS` times in
+    all; after that its outcome is an error too.
+
+    Args:
+        works: the files.
+        places: workers that judge them.
+        progress: function that receives the progress as text.
+
+    Raises:
+        MissingError: R301, R302, R406: the cluster cannot be used.
     """
-    if len(works) == 1:
-        yield outcome_of(works[0])
-    elif jobs == 1:
-        yield from map(safe_outcome, works)
-    else:
-        from concurrent.futures import ProcessPoolExecutor
-
-        with ProcessPoolExecutor(min(jobs or os.cpu_count() or 1, len(works))) as pool, leaving(_end_all):
-            try:
-                yield from pool.map(safe_outcome, works, chunksize=max(len(works) // 64, 1))
-            except (KeyboardInterrupt, SystemExit):
-                _end_all()
-                raise
+    if places.cluster is None and len(works) == 1:
+        return [outcome_of(works[0])]
+    outcomes: list[Outcome | None] = [None] * len(works)
+    known: dict[Diagnostic, Diagnostic] = {}
+    for done, (index, outcome) in enumerate(_judged(works, places), start=1):
+        warnings = tuple(known.setdefault(each, each) for each in outcome.warnings)
+        shown = outcome.text if outcome.status != "satisfied" or len(works) == 1 else ""
+        outcomes[index] = replace(outcome, warnings=warnings, text=shown)
+        progress(f"{done:,} of {len(works):,} files judged")
+    return [outcome for outcome in outcomes if outcome is not None]
 
 
-def _end_all(_code: int = 0) -> None:
-    """Kill all worker processes after an interruption."""
-    for process in multiprocessing.active_children():
-        process.kill()
+def _judged(works: Sequence[Work], places: Places) -> Iterator[tuple[int, Outcome]]:
+    """Yield the position and the outcome of each file when it is judged."""
+    if places.cluster is None and places.processes(len(works)) == 1:
+        yield from enumerate(map(safe_outcome, works))
+        return
+    from stlc.controller.parallel import workers_of
+    from stlc.controller.parallel.workers import LostCall, results
+
+    sent: Sequence[Work] = works
+    read: Callable[[Work], CallFiles] = _no_files
+    if places.cluster is not None:
+        sent = [replace(work, name=_seen(work)) for work in works]
+        read = _files_of(works[0].question)
+    with workers_of(places.processes(len(works)), places.cluster) as workers:
+        for ended in results(workers, safe_outcome, sent, files=read):
+            value = ended.value
+            yield ended.index, _lost(works[ended.index], value) if isinstance(value, LostCall) else value
+
+
+def _lost(work: Work, lost: LostCall) -> Outcome:
+    """Outcome of a file whose worker was lost each time."""
+    finding = Diagnostic(
+        "R406",
+        f"`{work.name}` is not judged: its worker was lost {lost.attempts} times",
+        note=(lost.reason,),
+        help=("--chunk reads a large file in pieces", f"stlc check … {operand(work.name)} judges it alone"),
+    )
+    entry: InvalidTrace = {"trace": work.name, "verdict": "not judged"}
+    return Outcome(work.name, entry, errors=(finding,), exit_code=MissingError.exit_code)
+
+
+def _seen(work: Work) -> str:
+    """Path of a file, which may lie in the newest run; the name as given if there is no such file."""
+    with suppress(StlcError):
+        return str(found(work.name, work.runs))
+    return work.name
+
+
+def _no_files(_work: Work) -> CallFiles:
+    from stlc.controller.parallel.workers import NO_FILES
+
+    return NO_FILES
+
+
+def _files_of(question: Question) -> Callable[[Work], CallFiles]:
+    """Return the function that lists the files of a call: the specification, what it names, and the trace."""
+    from stlc.controller.parallel.bundle import input_files
+    from stlc.controller.parallel.workers import CallFiles
+
+    spec = question.spec
+    texts = () if spec is None else input_files(spec, question.system, question.overrides)
+
+    def of(work: Work) -> CallFiles:
+        return CallFiles((*texts, Path(work.name)), () if work.out is None else (work.out,))
+
+    return of
 
 
 def safe_outcome(work: Work) -> Outcome:
@@ -80,7 +159,7 @@ def outcome_of(work: Work) -> Outcome:
         from stlc.cli.check.document import write_robustness
 
         write_robustness(work.out, result, work.question)
-    rows = rows_of(result)
+    rows = rows_of(result, violated_at=_violated_at(result, work.question) if work.table else {})
     return Outcome(
         name=str(path),
         entry=result_record(result, work.question.end),
@@ -95,6 +174,19 @@ def outcome_of(work: Work) -> Outcome:
         remarks=result.remarks,
         sample=_sample(result) if work.certify else None,
     )
+
+
+def _violated_at(result: Checked, question: Question) -> dict[str, float]:
+    """Times in seconds from which violated requirements are certainly violated, by name."""
+    from stlc.monitor.verdict import first_violation
+
+    verdict = result.verdict
+    samples = {
+        judged.name: first_violation(judged, verdict.subject, question.tolerance)
+        for judged in verdict
+        if judged.overall == "violated"
+    }
+    return {name: verdict.subject.time(sample) for name, sample in samples.items()}
 
 
 def _sample(result: Checked) -> Sample | None:
@@ -132,9 +224,11 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     lines = [_line(outcome) for outcome in outcomes]
     satisfied = sum(outcome.status == "satisfied" for outcome in outcomes)
     parts = [f"{satisfied} of {len(outcomes)} files satisfy every requirement"]
-    broken = sum(bool(outcome.errors) for outcome in outcomes)
+    lost = sum(outcome.entry["verdict"] == "not judged" for outcome in outcomes)
+    broken = sum(bool(outcome.errors) for outcome in outcomes) - lost
     outside = sum(outcome.status == "out of scope" for outcome in outcomes)
     parts += [f"{broken} cannot be judged"] if broken else []
+    parts += [f"{lost} not judged"] if lost else []
     parts += [f"{outside} out of scope"] if outside else []
     each = [_per_requirement(name, outcomes) for name in names]
     tables = [
@@ -147,7 +241,8 @@ def summary(outcomes: Sequence[Outcome]) -> str:
 def _line(outcome: Outcome) -> tuple[str, ...]:
     if outcome.errors:
         first = outcome.errors[0]
-        return (outcome.name, "INVALID", "", "", f"{first.code}: {first.message}")
+        word = "NOT JUDGED" if outcome.entry["verdict"] == "not judged" else "INVALID"
+        return (outcome.name, word, "", "", f"{first.code}: {first.message}")
     if not outcome.rows:
         return (outcome.name, WORDS[outcome.status])
     worst = _worst(outcome.rows)

@@ -136,7 +136,7 @@ def _row(name: str, tally: Tally, online: Online, cause: Cause | None, gaps: Map
         why = ", ".join(text for signal, text in gaps.items() if signal in needed)
         why = why or "the trace is too short to say"
     least = tally.low if tally.status == "inconclusive" else tally.robustness
-    return VerdictRow(name, tally.status, value, share, where, why, least)
+    return VerdictRow(name, tally.status, value, share, where, why, least, unit)
 
 
 def _moment(online: Online, sample: int) -> str:

@@ -46,6 +46,9 @@ class VerdictRow:
         where: trace and time of the least robustness.
         why: reason in one line, if the requirement is not satisfied.
         least: least robustness as a number, or its lower bound if inconclusive; 0 if there is none.
+        unit: unit of the robustness.
+        violated_at: time in seconds from which the requirement is certainly violated, whatever follows; None
+            if it is not violated, or if the time was not looked for.
     """
 
     name: str
@@ -55,6 +58,8 @@ class VerdictRow:
     where: str
     why: str = ""
     least: float = 0.0
+    unit: str = ""
+    violated_at: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -122,22 +122,26 @@ def _where(judged: Judgement, result: Checked) -> str:
     return ", ".join(words)
 
 
-def rows_of(result: Checked) -> tuple[VerdictRow, ...]:
-    """The rows of the table, with a reason for each unsatisfied requirement."""
+def rows_of(result: Checked, violated_at: Mapping[str, float]) -> tuple[VerdictRow, ...]:
+    """The rows of the table, with a reason for each unsatisfied requirement.
+
+    `violated_at` is the time of the first violation in seconds, by requirement, where it is known.
+    """
     rows = []
     for judged in result.verdict:
         cause, status = result.causes.get(judged.name), judged.overall
         low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
         robustness, least = "", 0.0
+        unit = judged.unit or ("" if cause is None else cause.unit)
         if judged.counted(judged.least).size:
-            unit = judged.unit or ("" if cause is None else cause.unit)
             least = low if status == "inconclusive" else float(judged.counted(judged.least).min())
             shown = "inconclusive" if result.uncertain else status
             robustness = robustness_text(shown, low, high, least, unit)
         share = "" if judged.holds.size == 1 else percent(judged.share)
         why = _inconclusive(judged, result) if status == "inconclusive" else ""
         why, where = why if cause is None else cause.because, _where(judged, result)
-        rows.append(VerdictRow(judged.name, status, robustness, share, where, why, least))
+        at = violated_at.get(judged.name)
+        rows.append(VerdictRow(judged.name, status, robustness, share, where, why, least, unit, at))
     return tuple(rows)
 
 

@@ -16,11 +16,19 @@ from stlc.cli.check import options as given
 from stlc.cli.check.judge import End, Work, uncertainties
 from stlc.cli.framework.assured import Assurance
 from stlc.cli.framework.documents import CheckResult
-from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, FailUnderOption, JsonOption, parse_pairs
+from stlc.cli.framework.options import (
+    SPEC_SUFFIXES,
+    STDIN,
+    ClusterOption,
+    FailUnderOption,
+    JsonOption,
+    parse_pairs,
+    require_no_jobs,
+)
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import usage
-from stlc.files import write_atomic
+from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.files import has_wildcard, matching_traces, write_atomic
 from stlc.registry import SEMANTICS
 
 if TYPE_CHECKING:
@@ -31,6 +39,7 @@ if TYPE_CHECKING:
     "stlc check trace.npz",
     "stlc check specs/traffic.stl drive.csv --require give_way",
     "stlc check specs/traffic.stl drives/*.parquet --jobs 0 --junit checks.xml",
+    "stlc check specs/traffic.stl 'logs/**/*.parquet' --cluster auto --table verdicts.parquet",
     "stlc check specs/traffic.stl logs/*.csv --certify .95",
     "stlc check specs/traffic.stl drive.csv --uncertain dx=0.1m --uncertain v=2%",
     "stlc check specs/traffic.stl bag.mcap --resample 0.1s --map dx=lead.gap",
@@ -40,7 +49,8 @@ def check(
         list[str],
         typer.Argument(
             metavar="[SPEC] TRACE…",
-            help="Traces (.npz, .csv, .parquet, .mat, .mcap, bags of ROS, or -), after a spec.",
+            help="Traces (.npz, .csv, .parquet, .mat, .mcap, bags of ROS, or -), or patterns of their "
+            "names such as 'logs/**/*.csv', after a spec.",
         ),
     ],
     at: Annotated[
@@ -75,9 +85,14 @@ def check(
     junit: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the verdicts there, as JUnit XML.")
     ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a row per file and requirement there (.parquet, .csv)."),
+    ] = None,
     jobs: Annotated[
         int, typer.Option("--jobs", "-j", min=0, help="Number of processes; 0: one per core.")
     ] = 1,
+    cluster: ClusterOption = None,
     chunk: Annotated[
         int,
         typer.Option(
@@ -92,20 +107,25 @@ def check(
     A trace is looked for at the given path, then in the newest run. It is judged by SPEC or --spec, if given.
     Otherwise it is judged by the specification and the constants that it stores. If the trace is -, samples
     come from the standard input, as CSV with a header or as one JSON object per line. A file larger than
-    memory is judged in chunks. Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short); with
-    --certify 0 certified, 1 refuted, 4 undecided; with -q nothing is printed.
+    memory is judged in chunks. A file whose process is lost is judged up to three times. Exit code: 0 all
+    satisfied, 1 violated, 4 inconclusive (trace too short), 5 a file is not judged, as its process was lost
+    each time; with --certify 0 certified, 1 refuted, 4 undecided; with -q nothing is printed.
     """
     from stlc.cli.check.document import document
     from stlc.cli.check.document import junit as junit_xml
-    from stlc.cli.check.many import all_outcomes, out_paths
+    from stlc.cli.check.many import Places, all_outcomes, out_paths
     from stlc.cli.check.outcome import exit_code
+    from stlc.cli.check.table import require_table, write_table
 
-    spec, traces = _split_files(files, reading.spec)
+    spec, names = _split_files(files, reading.spec)
+    traces = _expanded(names, [path for path in (table, out) if path is not None])
+    require_table(table)
+    require_no_jobs(cluster, jobs)
     if not 0 <= tolerance < math.inf:
         raise usage(f"`--tolerance {tolerance}` is not a number from 0 on")
     require_claim(certify, fail_under)
-    if certify is not None and STDIN in traces:
-        raise usage("`--certify` needs several traces, and the standard input is one")
+    if STDIN in traces:
+        _require_alone(traces, certify, out, cluster)
     errors = uncertainties(parse_pairs(uncertain, "--uncertain", "SIGNAL=ERROR", "x=0.1m"))
     if errors and (STDIN in traces or chunk):
         raise usage("`--uncertain` needs the whole trace, and this one is judged in pieces")
@@ -118,19 +138,21 @@ def check(
     if STDIN in traces:
         from stlc.cli.check.online import outcome_of_stream
 
-        if out is not None:
-            raise usage("`--out` needs the whole trace, and the standard input is judged line by line")
-        if len(traces) > 1:
-            raise usage("the standard input is judged alone", "stlc check SPEC -")
         with PULSE.doing(""):  # waits for samples
             outcomes = [outcome_of_stream(question, talk=talk)]
     else:
         color, paths = wants_color(sys.stdout), out_paths(out, traces)
         works = [
-            Work(name, question, reading.runs, path, chunk, color, COLOR.get(), certify is not None)
+            Work(
+                *(name, question, reading.runs, path, chunk, color, COLOR.get()),
+                certify=certify is not None,
+                table=table is not None,
+            )
             for name, path in zip(traces, paths, strict=True)
         ]
-        outcomes = list(all_outcomes(works, jobs))
+        outcomes = all_outcomes(works, Places(jobs, cluster), PULSE.now)
+    if table is not None:
+        write_table(table, outcomes)
     if junit is not None:
         write_atomic(junit, junit_xml(outcomes))
     findings = dict.fromkeys(f for outcome in outcomes for f in (*outcome.errors, *outcome.warnings))
@@ -139,6 +161,20 @@ def check(
         code = _bounded(record, outcomes, certify, code)
     show = partial(_print, outcomes, record.get("assurance")) if talk else lambda: None
     return Answer(record, show, code, findings)
+
+
+def _require_alone(
+    traces: Sequence[str], certify: float | None, out: Path | None, cluster: str | None
+) -> None:
+    """Raise UsageError (U101) if the standard input is not the only trace, or an option does not suit it."""
+    if certify is not None:
+        raise usage("`--certify` needs several traces, and the standard input is one")
+    if out is not None:
+        raise usage("`--out` needs the whole trace, and the standard input is judged line by line")
+    if len(traces) > 1:
+        raise usage("the standard input is judged alone", "stlc check SPEC -")
+    if cluster is not None:
+        raise usage("`--cluster` is for files, and the standard input is judged here")
 
 
 def _bounded(record: CheckResult, outcomes: Sequence[Outcome], share: float, code: int) -> int:
@@ -179,6 +215,30 @@ def _print(outcomes: Sequence[Outcome], assurance: Assurance | None) -> None:
         emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
     if assurance is not None:
         emit("\n".join(["", *bounds_lines(assurance)]))
+
+
+def _expanded(names: Sequence[str], written: Sequence[Path]) -> list[str]:
+    """Replace patterns such as `logs/**/*.csv` by the files that match them, each of which is named once.
+
+    Specifications, and the files and folders in `written`, which the command itself writes, do not match.
+
+    Raises:
+        UsageError: U102, no file matches.
+    """
+    found: list[str] = []
+    own = {path.resolve() for path in written}
+    for name in names:
+        if not has_wildcard(name):
+            found.append(name)
+            continue
+        known = set(found)
+        for match in matching_traces(name):
+            places = {Path(match).resolve(), *Path(match).resolve().parents}
+            if match not in known and Path(match).suffix not in SPEC_SUFFIXES and own.isdisjoint(places):
+                found.append(match)
+    if not found:
+        raise UsageError(Diagnostic("U102", f"no trace matches `{names[0]}`"))
+    return found
 
 
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:

@@ -6,7 +6,7 @@ import json as json_text
 import math
 import shlex
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
@@ -21,16 +21,18 @@ from stlc.cli.framework.assured import (
     ReplayedCounterexample,
 )
 from stlc.cli.framework.options import (
+    ClusterOption,
     RequireOption,
     RunsOption,
     SetOption,
     SystemOption,
     parse_overrides,
     parse_seconds,
+    require_no_jobs,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit
+from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import Diagnostic, MissingError, UsageError, usage
 from stlc.registry import closest
 
 if TYPE_CHECKING:
@@ -42,8 +44,9 @@ if TYPE_CHECKING:
     from stlc.assurance.falsify import Counterexample, Falsification
     from stlc.assurance.model_simulator import ModelSimulator
     from stlc.assurance.plant_simulator import PlantSimulator
-    from stlc.assurance.simulation import Workers
+    from stlc.assurance.sharing import SimulatorWorkers
     from stlc.controller.guard.candidates import Mode
+    from stlc.controller.parallel.workers import CallFiles
     from stlc.trace import Trace
 
     _Simulator: TypeAlias = ModelSimulator | DriveSimulator | PlantSimulator
@@ -75,6 +78,15 @@ def falsify(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that simulate.")] = 1,
+    cluster: ClusterOption = None,
+    batch: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Points that a search proposes at a time; by default as many as there are processes.",
+        ),
+    ] = None,
     random: Annotated[
         bool, typer.Option("--random", help="Draw from the declared distributions only, as a baseline.")
     ] = False,
@@ -98,8 +110,9 @@ def falsify(
     ranges come first. Then random vertices, hill climbing, CMA-ES (if the package `cma` is installed) and
     periodic inputs take turns. A violation counts only if it remains at half the time step. It is written as
     a trace, in a simpler form where one violates the requirement too, with a file for --replay. If nothing is
-    found, that is no proof. Of a plant, simulations that fail are written, too. Exit code: 1 if a requirement
-    is violated or a simulation fails, else 0.
+    found, that is no proof. The same --seed and --batch give the same simulations, whatever processes there
+    are. Of a plant, simulations that fail are written, too. Exit code: 1 if a requirement is violated or a
+    simulation fails; else 5 if simulations were lost with their processes, three times each; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 
@@ -108,10 +121,11 @@ def falsify(
     if replay is not None:
         return _replayed(made, replay, overrides, runs)
     limit = None if time is None else parse_seconds(time)
-    source = _Source(made, overrides, runs, jobs)
+    require_no_jobs(cluster, jobs)
+    source = _Source(made, overrides, runs, jobs, cluster)
     simulator = source.load()
     wanted = _wanted(simulator.requirements, require)
-    order = SearchOrder(SearchBudget(simulations, limit), seed, random)
+    order = SearchOrder(SearchBudget(simulations, limit), seed, random, batch=batch)
     found: list[FalsifiedRequirement] = []
     with source.workers() as workers:
         results = falsify_each(simulator, wanted, order, workers)
@@ -119,18 +133,27 @@ def falsify(
             with PULSE.doing(f"searching for a violation of {simulator.requirements[index]}"):
                 result = next(results)
             found.append(_written(made, simulator, result, output))
-    failures = getattr(simulator, "failures", [])
+    failed = [*getattr(simulator, "findings", ()), *(() if workers is None else workers.findings)]
     document: FalsifiedSystem = {
         "target": target,
         "simulations": simulations,
         "seed": seed,
         "coordinates": simulator.space.dim,
-        "failures": [f"{each.finding.reason}: {each.finding.message}" for each in failures],
-        "findings": findings.written(failures, output, made.settings(), partial(_command, made)),
+        "failures": list(dict.fromkeys(f"{each.finding.reason}: {each.finding.message}" for each in failed)),
+        "findings": findings.written(failed, output, made.settings(), partial(_command, made)),
         "requirements": found,
+        "lost": 0 if workers is None else workers.lost,
     }
-    violated = any(each["verdict"] == "violated" for each in found) or bool(failures)
-    return Answer(document, lambda: emit("\n".join(_lines(document))), int(violated))
+    lost = () if workers is None or not workers.lost else (_lost(workers),)
+    code = MissingError.exit_code if lost else 0
+    if document["failures"] or any(each["verdict"] == "violated" for each in found):
+        code = 1
+
+    def show() -> None:
+        show_diagnostics(lost)
+        emit("\n".join(_lines(document)))
+
+    return Answer(document, show, code, lost)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,24 +235,57 @@ class _Source:
         target: the target.
         overrides: values of `--set`.
         runs: folder of runs.
-        jobs: number of processes.
+        jobs: number of processes of this machine.
+        cluster: address of a Ray cluster; None without one.
     """
 
     target: _Target
     overrides: Mapping[str, str]
     runs: Path
-    jobs: int
+    jobs: int = 1
+    cluster: str | None = None
 
     def load(self) -> _Simulator:
         """Load the simulator."""
         return self.target.simulator(self.overrides, self.runs, self.jobs)
 
-    def workers(self) -> AbstractContextManager[Workers | None]:
+    def workers(self) -> AbstractContextManager[SimulatorWorkers | None]:
         """Processes that simulate; None if this one does, or a black box, which has its own."""
-        from stlc.assurance.simulation import LocalWorkers
+        from stlc.assurance.sharing import SimulatorWorkers
+        from stlc.controller.parallel import workers_of
+        from stlc.rundir import RunDir
 
-        alone = self.jobs == 1 or self.target.plant is not None
-        return nullcontext() if alone else LocalWorkers(self, self.jobs)
+        if self.cluster is None and (self.jobs == 1 or self.target.plant is not None):
+            return nullcontext()
+        target = self.target
+        if not target.model:  # `latest` may be another run later
+            target = replace(target, name=str(RunDir.open(target.name, self.runs).path))
+        sent = replace(self, target=target, jobs=1, cluster=None)
+        calls = workers_of(self.jobs, self.cluster, fresh=True)
+        return SimulatorWorkers(sent, calls, sent.files())
+
+    def files(self) -> CallFiles:
+        """Files that the simulator reads, those of a black box among them."""
+        from stlc.controller.parallel.bundle import input_files
+        from stlc.controller.parallel.workers import CallFiles
+
+        target = self.target
+        if not target.model:
+            return CallFiles((Path(target.name),))
+        plant: tuple[Path, ...] = ()
+        if target.plant is not None:
+            from stlc.plants.declaration import load_plant_decl
+
+            named = (target.plant.parent / name for name in load_plant_decl(target.plant).files)
+            plant = (target.plant, *(path for path in named if path.is_file()))
+        return CallFiles((*input_files(Path(target.name), target.system, self.overrides), *plant))
+
+
+def _lost(workers: SimulatorWorkers) -> Diagnostic:
+    """The finding R406 about simulations that were lost with their workers."""
+    count = f"{workers.lost:,} simulation{'s were' if workers.lost != 1 else ' was'}"
+    message = f"{count} lost with the processes that made them"
+    return Diagnostic("R406", message, note=tuple(workers.reasons))
 
 
 def _mode(name: str) -> Mode:
@@ -337,7 +393,7 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
     index = _wanted(simulator.requirements, [stored["requirement"]])[0]
     point = _point(stored, simulator.space.dim, path)
     margin = float(simulator.simulate(point[None], Focus(index)).margins[0])
-    if getattr(simulator, "failures", ()):
+    if getattr(simulator, "findings", ()):
         before = {"reason": f"a violation of {stored['requirement']}"}
         return findings.replayed(_plant_of(simulator, path), point, before)
     different = _different(

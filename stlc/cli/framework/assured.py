@@ -241,6 +241,7 @@ class FalsifiedSystem(TypedDict):
     coordinates: int
     failures: list[str]
     findings: list[FalsifiedFinding]
+    lost: int
     requirements: list[FalsifiedRequirement]
 
 

@@ -140,7 +140,7 @@ class CheckedTrace(TypedDict):
 
 class InvalidTrace(TypedDict):
     trace: str
-    verdict: Literal["invalid"]
+    verdict: Literal["invalid", "not judged"]
 
 
 class CheckedTraces(TypedDict):

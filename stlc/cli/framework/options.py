@@ -59,6 +59,14 @@ FailUnderOption = Annotated[
         help="Exit with 1 if a smaller share satisfies everything, else with 0.",
     ),
 ]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="auto|local|HOST:PORT",
+        help="Work on a Ray cluster, with as many processes as it has cores.",
+    ),
+]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
 PicturesOption = Annotated[bool, typer.Option(help="Draw pictures and the report.")]
 SetOption = Annotated[
@@ -89,6 +97,12 @@ def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> Plann
 
     options = parse_pairs(pairs, "--option", "NAME=VALUE", "population=500")
     return PlannerChoice(name, options, parse_seconds(budget))
+
+
+def require_no_jobs(cluster: str | None, jobs: int) -> None:
+    """Raise UsageError (U101) if `--cluster` and `--jobs` are both given."""
+    if cluster is not None and jobs != 1:
+        raise usage("`--jobs` and `--cluster` contradict each other", "a cluster uses all of its cores")
 
 
 def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:

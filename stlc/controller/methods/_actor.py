@@ -6,19 +6,19 @@ The actor runs in closed loop on the model of the system. The sequence of its co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
 
 from stlc.controller.methods import Learner
-from stlc.controller.policies.policy import Policy
+from stlc.controller.policies.policy import ActorNetwork, ClosedLoopActor, Policy
 from stlc.controller.problem.environments import observe
 from stlc.controller.problem.native import NativeStep
 from stlc.controller.training.config import ResolvedConfig
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from stlc.controller.problem.task import Task
     from stlc.dynamics.model.system import System
@@ -48,25 +48,31 @@ class ActorPolicy(Policy):
             `stlc.controller.problem.environments.observe` computes the observations.
     """
 
-    def __init__(self, task: Task, actor: Callable[[Tensor], Tensor]) -> None:
+    network: ClosedLoopActor
+
+    def __init__(self, task: Task, actor: ActorNetwork) -> None:
         super().__init__(task)
-        self.actor = actor
+        self.network = ClosedLoopActor(task, actor)
         self._compiled: tuple[System, NativeStep | None] | None = None
+
+    def for_task(self, task: Task) -> Self:
+        """Copy of this policy whose actor runs on the model of `task`, another task of the same system."""
+        other = super().for_task(task)
+        other.network = ClosedLoopActor(task, self.network.actor)
+        return other
 
     @torch.no_grad()
     def candidates(self, x0: Tensor) -> Tensor:
         """One plan per state: (B, n) -> (B, 1, T, m) float64. The closed loop runs in C if possible."""
-        system, x, actions = self.task.system, x0.double(), []
-        low, high = system.control_low.to(x), system.control_high.to(x)
-        native = self._native(system) if x0.device.type == "cpu" else None
+        x, actions = x0.double(), []
+        native = self._native(self.task.system) if x0.device.type == "cpu" else None
+        if native is None:
+            plans: Tensor = self.network(x)
+            return plans
         seen = observe(self.task, x, 0).float()
         for step in range(1, self.task.horizon + 1):
-            actions.append(torch.clamp(self.actor(seen).to(x), low, high))
-            if native is not None:
-                x, seen, _ = native.advance(x, actions[-1], step / self.task.horizon)
-            else:
-                x = system.step(x, actions[-1])
-                seen = observe(self.task, x, step).float()
+            actions.append(self.network.act(seen))
+            x, seen, _ = native.advance(x, actions[-1], step / self.task.horizon)
         return torch.stack(actions, 1)[:, None]
 
     def _native(self, system: System) -> NativeStep | None:

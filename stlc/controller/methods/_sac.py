@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from stlc.controller.methods._actor import ActorConfig
+from stlc.controller.policies.policy import ActorNetwork, DenseLayers
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,7 +37,7 @@ class SacConfig(ActorConfig):
     smoothing: float = 0.005
 
 
-class SacActor(nn.Module):
+class SacActor(ActorNetwork):
     """Copy of the actor of stable-baselines3: a network from observations to the most probable controls.
 
     Its weights have the same names as those of the original actor, from which they are copied. The package
@@ -47,6 +48,7 @@ class SacActor(nn.Module):
         spread: standard deviation of the observations of initial states, (k,).
     """
 
+    squash = "tanh"
     centre: Tensor
     spread: Tensor
     middle: Tensor
@@ -65,6 +67,12 @@ class SacActor(nn.Module):
         self.register_buffer("spread", torch.ones(width))
         self.register_buffer("middle", 0.5 * (system.control_low + system.control_high).float())
         self.register_buffer("extent", 0.5 * (system.control_high - system.control_low).float())
+
+    @property
+    def layers(self) -> DenseLayers:
+        """Weights of the network."""
+        normalisation = self.centre, self.spread
+        return DenseLayers.of([*self.latent_pi, self.mu], normalisation=normalisation, activation="relu")
 
     def normalised(self, observation: Tensor) -> Tensor:
         """Observations minus their mean, divided by their standard deviation, (B, k)."""

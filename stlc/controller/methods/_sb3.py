@@ -273,7 +273,7 @@ class SacLearner(ActorLearner):
         the states of the random number generators.
         """
         found = super().tensors()
-        found |= {f"policy.{name}": value for name, value in self.policy.actor.state_dict().items()}  # type: ignore[attr-defined]
+        found |= {f"policy.{name}": value for name, value in self.policy.network.actor.state_dict().items()}
         for prefix, module in self._modules().items():
             found |= {f"{prefix}.{name}": value for name, value in module.state_dict().items()}
         for prefix, optimizer in self._optimizers().items():

@@ -25,6 +25,10 @@ LOG_LOW, LOG_HIGH = -5.0, 2.0
 """Bounds on the logarithm of the standard deviation of an action before squashing."""
 
 
+BOUND = 10.0
+"""Bound on normalised observations."""
+
+
 @dataclass(frozen=True, slots=True)
 class Batch:
     """B transitions; each is one step of an episode.
@@ -168,7 +172,7 @@ class SoftActorCritic(nn.Module):
         optimizer.step()
 
     def _normalised(self, seen: Tensor) -> Tensor:
-        return ((seen - self.centre) / self.spread).clamp(-10.0, 10.0)
+        return ((seen - self.centre) / self.spread).clamp(-BOUND, BOUND)
 
     def _parameters_of(self, seen: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of the actions before the tanh, (B, m) each.

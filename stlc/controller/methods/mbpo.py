@@ -19,13 +19,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from stlc.controller.methods import Method
 from stlc.controller.methods._actor import ActorPolicy
 from stlc.controller.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
-from stlc.controller.methods._soft_actor_critic import Batch, SacOptions, SoftActorCritic
+from stlc.controller.methods._soft_actor_critic import BOUND, Batch, SacOptions, SoftActorCritic
 from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.policies.policy import ActorNetwork, DenseLayers
 from stlc.controller.training.config import base_config, bounded
 from stlc.controller.training.run import load_weights
 
@@ -70,7 +71,7 @@ class MbpoConfig(ModelConfig):
     temperature: float = 0.0
 
 
-class Acting(nn.Module):
+class Acting(ActorNetwork):
     """Network from observations to controls in physical units: the actor of a soft actor-critic.
 
     Args:
@@ -78,15 +79,30 @@ class Acting(nn.Module):
         learner: soft actor-critic, whose actor is used.
     """
 
+    squash = "tanh"
+
     def __init__(self, task: Task, learner: SoftActorCritic) -> None:
         super().__init__()
         self._learner = learner
         low, high = task.system.control_low, task.system.control_high
         self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
 
-    def forward(self, seen: Tensor) -> Tensor:
+    @property
+    def layers(self) -> DenseLayers:
+        """Weights of the actor; of its last layer, only those of the means."""
+        learner, count = self._learner, len(self._half)
+        weights = [weight[0].T for weight in learner.actor.weights]
+        biases = [bias[0, 0] for bias in learner.actor.biases]
+        return DenseLayers(
+            *(learner.centre, learner.spread, BOUND),
+            (*weights[:-1], weights[-1][:count]),
+            (*biases[:-1], biases[-1][:count]),
+            "relu",
+        )
+
+    def forward(self, observation: Tensor) -> Tensor:
         """The most probable controls in physical units, for observations: (B, k) -> (B, m)."""
-        return self.physical(self._learner(seen))
+        return self.physical(self._learner(observation))
 
     def physical(self, actions: Tensor) -> Tensor:
         """Scale actions from [-1, 1] to controls in physical units: (…, m) -> (…, m)."""

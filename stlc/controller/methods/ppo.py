@@ -26,6 +26,7 @@ from stlc.controller.methods._actor import (
     restore_optimizer,
 )
 from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.policies.policy import ActorNetwork, DenseLayers
 from stlc.controller.problem.environments import Environments, Reward
 from stlc.controller.training.checkpoint import below
 from stlc.controller.training.config import base_config
@@ -123,7 +124,7 @@ class Moments(nn.Module):
         self.spread.copy_(torch.where(spread > NARROW, spread, torch.ones_like(spread)))
 
 
-class ActorCritic(nn.Module):
+class ActorCritic(ActorNetwork):
     """Two separate networks of a normalised observation: a Gaussian policy and a value function.
 
     The policy network outputs w raw controls, unbounded numbers that are then squashed to the control ranges.
@@ -143,6 +144,13 @@ class ActorCritic(nn.Module):
         self.critic = _network([width, *hidden, 1], last=1.0)
         self.deviation = nn.Parameter(torch.full((outputs,), math.log(config.deviation)))
         self.observations, self.returns = Moments(width), Moments(1)
+
+    @property
+    def layers(self) -> DenseLayers:
+        """Weights of the policy network."""
+        seen = self.observations
+        normalisation = seen.mean, seen.spread
+        return DenseLayers.of(list(self.actor), normalisation=normalisation, activation="tanh", bound=MOST)
 
     def normalised(self, observation: Tensor) -> Tensor:
         """Observations minus their running mean, divided by their standard deviation, (B, k)."""

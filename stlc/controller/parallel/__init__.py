@@ -1,4 +1,4 @@
-"""Parallel training: several runs at a time (local processes, Ray), or one run in several processes."""
+"""Parallel work: calls and training runs, here or on a Ray cluster; one run in several processes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.jobs import Executor
+    from stlc.controller.parallel.workers import CallWorkers
 
 
 def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gpus: int = 0) -> Executor:
@@ -24,3 +25,20 @@ def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gp
     from stlc.controller.parallel.ray_cluster import RayExecutor
 
     return RayExecutor(cluster, cores, gpus)
+
+
+def workers_of(count: int = 1, cluster: str | None = None, *, fresh: bool = False) -> CallWorkers:
+    """Return workers that call functions: local processes, or a Ray cluster if an address is given.
+
+    Args:
+        count: number of local processes.
+        cluster: address of the Ray cluster; None: local processes.
+        fresh: whether local processes start with an empty interpreter, see `LocalProcesses`.
+    """
+    if cluster is None:
+        from stlc.controller.parallel.workers import LocalProcesses
+
+        return LocalProcesses(count, fresh=fresh)
+    from stlc.controller.parallel.ray_cluster import RayWorkers
+
+    return RayWorkers(cluster)

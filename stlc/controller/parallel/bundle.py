@@ -67,8 +67,8 @@ class JobBundle:
         Raises:
             MissingError: R201, the folder of the job's runs cannot be written.
         """
-        folder, runs = Path.cwd(), _absolute(job.runs or RUNS)
-        inputs = tuple(dict.fromkeys(map(_absolute, job.inputs)))
+        folder, runs = Path.cwd(), absolute(job.runs or RUNS)
+        inputs = tuple(dict.fromkeys(map(absolute, job.inputs)))
         probe = runs / f".probe-{secrets.token_hex(8)}"
         with atomic_path(probe) as written:
             written.touch()
@@ -115,7 +115,7 @@ class BundleResult:
 # ---------------------------------------------------------------------- caller
 
 
-def _absolute(path: Path) -> Path:
+def absolute(path: Path) -> Path:
     """Absolute path without `..`; symbolic links are not resolved."""
     return Path(os.path.normpath(Path.cwd() / path))
 

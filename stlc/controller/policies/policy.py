@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from copy import copy
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
+from stlc.controller.problem.environments import observe
 from stlc.controller.problem.task import PlanVerdicts, rank, satisfied
 from stlc.dynamics.model.controls import raw_width, squash
 
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.problem.task import Task
     from stlc.dynamics.model.mirror import Mirror
+    from stlc.dynamics.schema.names import ControlDecl
 
 
 VARIATIONS = (0.01, 0.05)
@@ -59,7 +62,7 @@ class Policy(ABC):
         network: network that proposes the plans. A policy without network (None) cannot be exported.
     """
 
-    network: PlanNetwork | None = None
+    network: PlanProposer | None = None
     judged_at_once: int = 500
 
     def __init__(self, task: Task) -> None:
@@ -141,23 +144,96 @@ class ModelRollout(Policy):
         return torch.stack(actions, 1)[:, None]
 
 
-class PlanNetwork(nn.Module):
+@dataclass(frozen=True, slots=True)
+class DenseLayers:
+    """Weights of a feed-forward network (MLP), in the form in which exports write it.
+
+    Attributes:
+        centre: mean of the inputs, (k,), which is subtracted first.
+        spread: standard deviation of the inputs, (k,), by which they are divided.
+        bound: bound on the absolute value of the normalised inputs; infinite if there is none.
+        weights: weights of each layer, (outputs, inputs).
+        biases: biases of each layer, (outputs,).
+        activation: function between the layers.
+    """
+
+    centre: Tensor
+    spread: Tensor
+    bound: float
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+    activation: Literal["relu", "tanh"]
+
+    @classmethod
+    def of(
+        cls,
+        layers: Sequence[nn.Module],
+        *,
+        normalisation: tuple[Tensor, Tensor],
+        activation: Literal["relu", "tanh"],
+        bound: float = math.inf,
+    ) -> DenseLayers:
+        """Return the weights of the linear modules among `layers`, in order.
+
+        `normalisation` holds `centre` and `spread`.
+        """
+        linear = [each for each in layers if isinstance(each, nn.Linear)]
+        weights, biases = tuple(each.weight for each in linear), tuple(each.bias for each in linear)
+        return cls(*normalisation, bound, weights, biases, activation)
+
+
+class PlanProposer(nn.Module, ABC):
+    """Network that proposes plans: the part of a policy that is trained, and that exports write.
+
+    Attributes:
+        plans: number of plans per state.
+        changes: changes that `BestOfKPolicy` adds to a plan that fails, (V, T, m) float64; V may be 0.
+        mirror: mirror symmetry of the system; None if the system has none or the network does not use it.
+    """
+
+    plans: int
+    changes: Tensor
+    mirror: Mirror | None = None
+
+    def __init__(self, task: Task) -> None:
+        super().__init__()
+        self._task = task
+
+    @property
+    @abstractmethod
+    def layers(self) -> DenseLayers:
+        """Weights of the feed-forward network."""
+
+    @property
+    def outputs(self) -> tuple[ControlDecl, ...]:
+        """Controls as the network's outputs stand for them: `squash` of each maps outputs to its range."""
+        return self._task.system.decl.controls
+
+    @abstractmethod
+    def forward(self, x0: Tensor) -> Tensor:
+        """All plans, within the control bounds: (B, n) -> (B, plans, T, m)."""
+
+    def with_changes(self, plans: Tensor) -> Tensor:
+        """Each plan and its changed copies, within the control bounds: (k, T, m) -> (k, 1 + V, T, m)."""
+        system = self._task.system
+        low, high = system.control_low.to(plans), system.control_high.to(plans)
+        changed = plans[:, None] + self.changes.to(plans)
+        return torch.cat((plans[:, None], changed.clamp(low, high)), 1)
+
+
+class PlanNetwork(PlanProposer):
     """MLP from the observation to `plans` open-loop plans over the horizon.
 
     If the system declares a mirror symmetry, states on one side of it are mirrored before the network is
     evaluated, and their plans are mirrored back.
 
     Attributes:
-        plans: number of plans.
-        changes: changes that `BestOfKPolicy` adds to a plan that fails, (V, T, m) float64; V may be 0.
-        mirror: the system's mirror symmetry; None if the system has none or the network does not use it.
         centre: mean of the observations, (k,), by which the network's inputs are centred.
         spread: standard deviation of the observations, (k,), by which the network's inputs are divided.
     """
 
     centre: Tensor
     spread: Tensor
-    changes: Tensor
 
     def __init__(
         self,
@@ -168,10 +244,9 @@ class PlanNetwork(nn.Module):
         mirrored: bool = True,
         varied: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(task)
         self.plans = plans
-        self.mirror: Mirror | None = task.system.mirror if mirrored else None
-        self._task = task
+        self.mirror = task.system.mirror if mirrored else None
         self._width = raw_width(task.system.decl.controls)
         widths = [task.system.observed_count, *hidden]
         layers: list[nn.Module] = []
@@ -181,7 +256,7 @@ class PlanNetwork(nn.Module):
         self.body = nn.Sequential(*layers)
         self.register_buffer("centre", torch.zeros(widths[0]))
         self.register_buffer("spread", torch.ones(widths[0]))
-        changes = variations(task) if varied else variations(task)[:0]
+        changes = variations(task) if varied else variations(task)[:0].clone()
         self.register_buffer("changes", changes, persistent=False)
 
     def normalise(self, x0: Tensor) -> None:
@@ -198,6 +273,12 @@ class PlanNetwork(nn.Module):
         self.centre.copy_(centre)
         self.spread.copy_(torch.where(spread > 1e-6, spread, torch.ones_like(spread)))
 
+    @property
+    def layers(self) -> DenseLayers:
+        """Weights of the feed-forward network."""
+        normalisation = self.centre, self.spread
+        return DenseLayers.of(list(self.body), normalisation=normalisation, activation="relu")
+
     def forward(self, x0: Tensor) -> Tensor:
         """All plans, within the control bounds: (B, n) -> (B, plans, T, m)."""
         x0, swapped = self._folded(x0)
@@ -209,13 +290,6 @@ class PlanNetwork(nn.Module):
             return plans
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
 
-    def with_changes(self, plans: Tensor) -> Tensor:
-        """Each plan and its changed copies, within the control bounds: (k, T, m) -> (k, 1 + V, T, m)."""
-        system = self._task.system
-        low, high = system.control_low.to(plans), system.control_high.to(plans)
-        changed = plans[:, None] + self.changes.to(plans)
-        return torch.cat((plans[:, None], changed.clamp(low, high)), 1)
-
     def _folded(self, x0: Tensor) -> tuple[Tensor, Tensor | None]:
         """Replace states on one side of the mirror symmetry by their mirror images on the other side.
 
@@ -226,6 +300,64 @@ class PlanNetwork(nn.Module):
             None, all states are returned unchanged, and the mask is None.
         """
         return (x0, None) if self.mirror is None else self.mirror.fold(x0)
+
+
+class ActorNetwork(nn.Module, ABC):
+    """Network that chooses one action per step, from the observation and the elapsed share of the plan.
+
+    Attributes:
+        squash: map from outputs of the network to control ranges, if it is not that of the system file.
+    """
+
+    squash: Literal["tanh"] | None = None
+
+    @property
+    @abstractmethod
+    def layers(self) -> DenseLayers:
+        """Weights of the feed-forward network."""
+
+    def outputs(self, task: Task) -> tuple[ControlDecl, ...]:
+        """Controls of a task as the network's outputs stand for them."""
+        controls = task.system.decl.controls
+        return controls if self.squash is None else tuple(replace(each, squash="tanh") for each in controls)
+
+    @abstractmethod
+    def forward(self, observation: Tensor) -> Tensor:
+        """Controls in physical units, without exploration noise: (B, k) float32 -> (B, m)."""
+
+
+class ClosedLoopActor(PlanProposer):
+    """Actor in closed loop on the model of the system: the sequence of its controls is its only plan."""
+
+    plans = 1
+
+    def __init__(self, task: Task, actor: ActorNetwork) -> None:
+        super().__init__(task)
+        self.actor = actor
+        self.register_buffer("changes", variations(task)[:0].clone(), persistent=False)
+
+    @property
+    def layers(self) -> DenseLayers:
+        """Weights of the actor."""
+        return self.actor.layers
+
+    @property
+    def outputs(self) -> tuple[ControlDecl, ...]:
+        """Controls as the actor's outputs stand for them."""
+        return self.actor.outputs(self._task)
+
+    def forward(self, x0: Tensor) -> Tensor:
+        """The plan of each state: (B, n) -> (B, 1, T, m) in the dtype of `x0`."""
+        x, actions = x0, []
+        for step in range(self._task.horizon):
+            actions.append(self.act(observe(self._task, x, step).float()).to(x))
+            x = self._task.system.step(x, actions[-1])
+        return torch.stack(actions, 1)[:, None]
+
+    def act(self, observation: Tensor) -> Tensor:
+        """Controls for observations, limited to their ranges: (B, k) float32 -> (B, m) float64."""
+        system, action = self._task.system, self.actor(observation).double()
+        return torch.clamp(action, system.control_low.to(action), system.control_high.to(action))
 
 
 class BestOfKPolicy(Policy):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.evaluation.held_out import Score
-    from stlc.controller.policies.policy import PlanNetwork, Policy
+    from stlc.controller.policies.policy import PlanProposer, Policy
     from stlc.controller.problem.task import PlanVerdicts
     from stlc.rundir import Status
 
@@ -87,15 +87,17 @@ class Run:
         return cls(folder, task, METHODS.get(config.method).load(task, folder, config, device))
 
     @property
-    def network(self) -> PlanNetwork:
+    def network(self) -> PlanProposer:
         """The network of the policy.
 
         Raises:
             RunError: R101, the run's method trains no network.
         """
         if self.policy.network is None:
-            message = f"the policy of `{self.dir.shown}` is no network"
-            raise RunError(Diagnostic("R101", message, help=("train with `--method guided`",)))
+            message = f"the policy of `{self.dir.shown}` has no network that proposes plans"
+            raise RunError(
+                Diagnostic("R101", message, help=("export a run of another `--method`, such as `guided`",))
+            )
         return self.policy.network
 
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
@@ -17,7 +18,8 @@ from stlc.dynamics.declaration.columns import (
 )
 from stlc.dynamics.declaration.motion import Assign, state_assigns
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
-from stlc.dynamics.schema.expressions import written
+from stlc.dynamics.model.algebra import add, multiply, total
+from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
 from stlc.dynamics.schema.record import (
@@ -63,7 +65,13 @@ class DelayKeys:
     """The keys that the declaration of one delayed value may have."""
 
     of: Node | None = key(raw(EXPRESSION), "the value that is delayed", required=True)
-    by: int | None = key(STEPS, "the delay, as a time or in steps", required=True)
+    by: Node | None = key(
+        raw(EXPRESSION),
+        "the delay, as a time or in steps; with `at_most`, a time that may change",
+        required=True,
+    )
+    at_most: int | None = key(STEPS, "the longest delay, which makes `by` an expression of the state")
+    transport: bool = key(FLAG, "the delay of a pipe, whose flow carries the value along", False)
     before: Node | None = key(
         raw(EXPRESSION), "value before the start; that of `of` at the start unless given"
     )
@@ -72,17 +80,32 @@ class DelayKeys:
 
 
 @dataclass(frozen=True, slots=True)
+class DelayEntry:
+    """One entry of the section `delay`.
+
+    Attributes:
+        entry: the entry in the file.
+        keys: its keys.
+        steps: the delay in steps, rounded up; the longest one if it varies.
+    """
+
+    entry: Entry
+    keys: DelayKeys
+    steps: int
+
+
+@dataclass(frozen=True, slots=True)
 class HeldSection:
     """The sections `held` and `delay`, of which only names and keys are read.
 
     Attributes:
         entries: the entries of the section `held`, each with its keys.
-        delays: the entries of the section `delay`, each with its keys.
+        delays: the entries of the section `delay`.
         ticks: the clock, if a value is not computed at every step.
     """
 
     entries: tuple[tuple[Entry, HeldKeys], ...] = ()
-    delays: tuple[tuple[Entry, DelayKeys], ...] = ()
+    delays: tuple[DelayEntry, ...] = ()
     ticks: Sampled = field(default_factory=Sampled)
 
 
@@ -108,9 +131,9 @@ def declare_held(node: Node | None, delay: Node | None, cx: Context) -> HeldSect
     return HeldSection(tuple(found), delays, clock(cx, first_line(node.span), flows=False))
 
 
-def _declared_delays(node: Node | None, cx: Context) -> tuple[tuple[Entry, DelayKeys], ...]:
+def _declared_delays(node: Node | None, cx: Context) -> tuple[DelayEntry, ...]:
     """Read the section `delay` except for the values, and declare its names."""
-    found: list[tuple[Entry, DelayKeys]] = []
+    found: list[DelayEntry] = []
     for entry in cx.reader.entries(node, "`delay`"):
         name = entry.key.text
         if not cx.names.declare(entry.key, "delayed value", cx.reader):
@@ -120,11 +143,18 @@ def _declared_delays(node: Node | None, cx: Context) -> tuple[tuple[Entry, Delay
         ranges = read_ranges(keys.ends, keys.unit, 1, where, cx.plain)
         low, high = ranges[0] if ranges else (None, None)
         cx.names.columns.append(Column(name, keys.unit, low=low, high=high))
-        if keys.by is not None and keys.by > MAX_DELAY:
-            message = f"{where} is {keys.by} steps late, and {MAX_DELAY} are the most"
-            cx.reader.report("S103", message, entry.place("by"))
-        else:
-            found.append((entry, keys))
+        varies = keys.at_most is not None
+        if keys.transport and not varies:
+            cx.reader.report("S102", f"{where} needs its longest delay", entry.key.span, "at_most: 1 s")
+            continue
+        steps = keys.at_most
+        if steps is None and keys.by is not None:
+            steps = STEPS.read(cx.plain, keys.by, f"`by` of {where}")
+        if steps is not None and steps > MAX_DELAY:
+            message = f"{where} is {steps} steps late, and {MAX_DELAY} are the most"
+            cx.reader.report("S103", message, entry.place("at_most" if varies else "by"))
+        elif steps is not None:
+            found.append(DelayEntry(entry, keys, steps))
     return tuple(found)
 
 
@@ -144,14 +174,15 @@ def read_held(section: HeldSection, cx: Context) -> Sampled:
     for entry, keys in section.entries:
         cells |= {each.column.name: each for each in _cells(entry, keys, inside, cx)}
     late: tuple[str, ...] = ()
-    for entry, delay in section.delays:
-        pair = _delayed(entry, delay, replace(cx, here=here))
-        cells |= {each.column.name: each for each in pair}
-        late += tuple(each.column.name for each in pair[:1])
+    flow: tuple[Assign, ...] = ()
+    for delay in section.delays:
+        parts = _delayed(delay, replace(cx, here=here))
+        cells |= {each.column.name: each for each in parts.cells}
+        late, flow = late + parts.hidden, flow + parts.flow
     past = _Past(cells, cx)
     initial = tuple(Assign(name, past.at_start(cell), cell.text) for name, cell in cells.items())
     updates = tuple(Assign(name, past.later(cell), cell.text) for name, cell in cells.items())
-    return section.ticks + Sampled((), initial, updates, (), late) + past.kept()
+    return section.ticks + Sampled((), initial, updates, flow, late) + past.kept()
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,26 +223,136 @@ def _cells(entry: Entry, keys: HeldKeys, inside: Context, cx: Context) -> list[_
     ]
 
 
-def _delayed(entry: Entry, keys: DelayKeys, cx: Context) -> tuple[_Held, ...]:
-    """Read the value of one delay: return the column of the value itself, and the delayed one.
+@dataclass(frozen=True, slots=True)
+class _Delayed:
+    """The columns of one delay.
 
-    The column of the value itself is declared. Nothing is returned if the declaration is invalid.
+    Attributes:
+        cells: columns that are computed at samples; the last one is the delayed value.
+        flow: the derivative of the delayed value within a step, if the delay varies.
     """
-    name, place = entry.key.text, entry.key.span
+
+    cells: tuple[_Held, ...] = ()
+    flow: tuple[Assign, ...] = ()
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the columns that policies do not observe: all but the delayed value."""
+        return tuple(each.column.name for each in self.cells[:-1])
+
+
+def _delayed(delay: DelayEntry, cx: Context) -> _Delayed:
+    """Read one delay, and declare the columns that it needs; it has none if the declaration is invalid."""
+    name, place, keys = delay.entry.key.text, delay.entry.key.span, delay.keys
     where = f"the delayed value `{name}`"
     value = cx.here.stored(keys.of, where, keys.unit)
     before = value if keys.before is None else cx.here.stored(keys.before, f"`before` of {where}", keys.unit)
-    if value is None or before is None or keys.by is None:
-        return ()
+    if value is None or before is None:
+        return _Delayed()
     (column,) = cx.names.group(name)
-    present = replace(column, name=f"{name}_now")
-    declared(cx, present, place)
-    text = written(keys.of)
-    late = ir.Signal(present.name + ir.BEFORE * keys.by)
-    return (
-        _Held(present, 1, value, text, before, place),
-        _Held(column, 1, late, f"{text}, {keys.by} samples ago", before, place),
+    present = _Held(replace(column, name=f"{name}_now"), 1, value, written(keys.of), before, place)
+    if keys.at_most is not None:
+        return _varying(delay, column, present, cx)
+    declared(cx, present.column, place)
+    late = ir.Signal(present.column.name + ir.BEFORE * delay.steps)
+    text = f"{present.text}, {delay.steps} samples ago"
+    return _Delayed((present, _Held(column, 1, late, text, before, place)))
+
+
+def _varying(delay: DelayEntry, column: Column, present: _Held, cx: Context) -> _Delayed:
+    """Return the columns of a delay that varies; `present` is the value without the delay.
+
+    Within a step the delayed value moves evenly to the one at the next sample, which follows from samples
+    that are known, because the delay is at least one step.
+    """
+    keys, place = delay.keys, delay.entry.key.span
+    by = cx.here.stored(keys.by, f"`by` of the delayed value `{column.name}`", SECOND)
+    if by is None:
+        return _Delayed()
+    dt = float(cx.dt)
+    wait = ir.Op("clip", (by, ir.Const(dt), ir.Const(delay.steps * dt)))
+    text = f"{present.text}, {written(keys.by)} ago"
+    share: ir.Num = ir.Op("div", (ir.Const(dt), wait) if keys.transport else (wait, ir.Const(dt)))
+    rate = _Held(
+        Column(f"{column.name}_share", Unit()), 1, share, f"{written(keys.by)} and the step", share, place
     )
+    count = delay.steps if keys.transport else 0
+    read = (*_ago(present, delay.steps), *_ago(rate, count))
+    body = _pipe(delay.steps) if keys.transport else _earlier(delay.steps)
+    late, soon = (ir.Extern(f"{column.name}_late", read, index, body) for index in (0, 1))
+    slope: ir.Num = multiply(ir.Op("sub", (soon, late)), ir.Const(1.0 / dt))
+    moves = replace(
+        column, name=f"{column.name}_rate", unit=column.unit.interval / SECOND, low=None, high=None
+    )
+    cells = (
+        present,
+        rate,
+        _Held(moves, 1, slope, f"slope of {column.name}", None, place),
+        _Held(column, 1, late, text, present.before, place),
+    )
+    for cell in cells[:-1]:
+        declared(cx, cell.column, place)
+    rates = () if cx.discrete else (Assign(column.name, ir.Signal(moves.name), moves.name),)
+    return _Delayed(cells, rates)
+
+
+def _ago(cell: _Held, steps: int) -> tuple[ir.Num, ...]:
+    """Return a value at a sample, and at each of so many samples before it."""
+    return tuple(ir.Signal(cell.column.name + ir.BEFORE * back) for back in range(steps + 1))
+
+
+def _earlier(steps: int) -> ir.Body:
+    """Return the delayed value, and the one at the next sample, of a delay that is given as a time.
+
+    The arguments are the value at a sample, at each of `steps` samples before it, and the delay in steps.
+    """
+    ways = [(ir.Const(float(k)), ir.Const(1.0)) for k in range(steps)]
+    at = ir.Signal("by")
+    targets = (at, ir.Op("sub", (at, ir.Const(1.0))))
+    outputs = tuple(_between(ways, target) for target in targets)
+    return ir.Body((*_values(steps), "by"), (), outputs)
+
+
+def _pipe(steps: int) -> ir.Body:
+    """Return the delayed value, and the one at the next sample, of a transport delay.
+
+    The value that leaves a pipe of length 1 at time t entered it at s, where the integral of 1 / D over
+    [s, t] is 1: D is the time that the flow at an instant needs for the whole pipe. The arguments are the
+    value at a sample and at each of `steps` samples before it, and likewise the way per step, in lengths.
+    """
+    speeds = tuple(f"speed{k}" for k in range(steps + 1))
+    lets: list[tuple[str, ir.Num]] = []
+    ways: list[tuple[ir.Num, ir.Num]] = []
+    passed: ir.Num = ir.Const(0.0)
+    for k, pair in enumerate(pairwise(speeds)):
+        lets.append((f"way{k}", multiply(ir.Const(0.5), add(*map(ir.Signal, pair)))))
+        ways.append((passed, ir.Signal(f"way{k}")))
+        lets.append((f"passed{k}", add(*ways[-1])))
+        passed = ir.Signal(f"passed{k}")
+    soon = ir.Op("sub", (ir.Const(1.0), ir.Signal(speeds[0])))
+    outputs = tuple(_between(ways, target) for target in (ir.Const(1.0), soon))
+    return ir.Body((*_values(steps), *speeds), tuple(lets), outputs)
+
+
+def _values(steps: int) -> tuple[str, ...]:
+    """Names of the value at a sample, and at each of so many samples before it."""
+    return tuple(f"value{k}" for k in range(steps + 1))
+
+
+def _between(ways: Sequence[tuple[ir.Num, ir.Num]], at: ir.Num) -> ir.Num:
+    """Return the value at the way `at` before a sample, linear between samples.
+
+    `ways` has the way to each sample, and from there to the one before.
+    """
+    values = [ir.Signal(name) for name in _values(len(ways))]
+    parts: list[ir.Num] = [values[0]]
+    for (passed, way), (later, earlier) in zip(ways, pairwise(values), strict=True):
+        share: ir.Num = ir.Op("sub", (at, passed))
+        if way != ir.Const(1.0):
+            share = ir.Op("div", (share, way))
+        rise = ir.Op("sub", (earlier, later))
+        parts.append(multiply(rise, ir.Op("clip", (share, ir.Const(0.0), ir.Const(1.0)))))
+    return total(parts)
 
 
 class _Past:

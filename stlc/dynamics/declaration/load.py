@@ -194,9 +194,10 @@ def _declaration(
     names, cx = named.cx.names, named.cx
     sampled = named.sampled + read_held(named.held, cx)
     timer_flow, timer_jumps = read_timers(named.states, cx)
-    flow = (*timer_flow, *read_flow(found.flow, cx), *sampled.flow)
+    flow = (*timer_flow, *read_flow(found.flow, cx))
     jumps = (*read_jumps(found.jump, cx), *timer_jumps)
     _report_set((*flow, *(each for jump in jumps for each in jump.resets)), sampled, cx)
+    flow += sampled.flow
     _report_idle(found.control, cx, flow, jumps)
     spec = reader.text(found.spec, "`spec`")
     folder = path.parent
@@ -250,7 +251,7 @@ def _observing(policy: PolicyDecl, hidden: tuple[str, ...], cx: Context) -> Poli
 
 def _report_set(assigns: SequenceType[Assign], sampled: Sampled, cx: Context) -> None:
     """Report S202 where `flow` or a jump sets a column that is computed at every sample."""
-    computed = {each.name for each in sampled.updates} - {each.name for each in sampled.flow}
+    computed = {each.name for each in sampled.updates}
     for name in dict.fromkeys(base_name(each.name) for each in assigns if each.name in computed):
         message = f"`{name}` is computed at every sample, so that `flow` and jumps cannot set it"
         cx.reader.report("S202", message, cx.names.places[name])

@@ -98,7 +98,7 @@ def _flow(decl: SystemDecl, writer: Assignments, state: State, given: State) -> 
     for substep in range(decl.substeps):
         if substep:
             state = named(state)
-        moved = {**state, **rate(state)} if decl.discrete else integrate(rate, state, length)
+        moved = {**state, **rate(state)} if decl.discrete else integrate(rate, state, length, named)
         state = {name: _clamped(decl, name, num) for name, num in moved.items()}
     return state
 

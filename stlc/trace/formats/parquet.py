@@ -6,7 +6,7 @@ Columns of other types, such as structures, are left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.files import atomic_path
 from stlc.trace.formats.csv import split_head
 from stlc.trace.formats.registry import MAX_BYTES, damage, needed, room_for, unreadable
 from stlc.trace.formats.table import Table, of_table
@@ -53,6 +54,18 @@ def open_parquet(path: Path, *, whole: bool = True) -> Any:
         why = f"it unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
         raise unreadable(path, why, advice="split it")
     return file
+
+
+def write_columns(path: Path, columns: Mapping[str, tuple[str, Sequence[Any]]]) -> None:
+    """Write a table that is no trace: name -> type in Arrow's words (`string`, `float64`) and values.
+
+    Raises:
+        MissingError: R301, `pyarrow` is not installed; R201, the file cannot be written.
+    """
+    arrow = needed("pyarrow")
+    arrays = {name: arrow.array(values, type=kind) for name, (kind, values) in columns.items()}
+    with atomic_path(path) as temporary:
+        needed("pyarrow.parquet").write_table(arrow.table(arrays), temporary)
 
 
 def size(path: Path) -> int:

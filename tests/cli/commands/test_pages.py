@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import re
 import shlex
 import shutil
@@ -191,6 +192,10 @@ def bug(*_):
     raise ZeroDivisionError("this should not happen")
 
 
+def ends_its_process(_):
+    os._exit(3)
+
+
 def no_package(_):
     return None
 
@@ -210,6 +215,8 @@ def machine(monkeypatch, tmp_path):
             load_parser.cache_clear()
             (tmp_path / "cache/stlc").mkdir(parents=True)
             (tmp_path / "cache/stlc").chmod(0o770)
+        elif code == "R406":
+            monkeypatch.setattr("stlc.cli.check.many.outcome_of", ends_its_process)
         elif code == "W702":
             (tmp_path / "cc").write_text("#!/bin/sh\necho error: no licence\nexit 1\n")
             (tmp_path / "cc").chmod(0o755)

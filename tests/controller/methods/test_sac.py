@@ -73,7 +73,7 @@ def test_the_policy_is_the_library_s_deterministic_actor(car_task: Task) -> None
     observation = sac.environments.observe(sac.environments.states, 0).float()
     seen = sac.model.env.observed()
     theirs, _ = sac.model.predict(seen, deterministic=True)
-    ours = sac.policy.actor(observation)
+    ours = sac.policy.network.actor(observation)
     np.testing.assert_allclose(ours.detach().numpy(), 10.0 * theirs, rtol=1e-4, atol=1e-4)
 
 

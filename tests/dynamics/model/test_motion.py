@@ -56,7 +56,7 @@ init:
 """
 
 
-@pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("heun", 2), ("rk4", 4)])
+@pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("heun", 2), ("rk4", 4), ("ros2", 2)])
 def test_integrators_have_their_order(make: Make, integrator: str, order: int) -> None:
     def error(steps: int) -> float:
         system = make(OSCILLATOR.format(dt=f"{1 / steps}", integrator=integrator, substeps=1))
@@ -67,7 +67,7 @@ def test_integrators_have_their_order(make: Make, integrator: str, order: int) -
     assert math.log2(error(16) / error(32)) == pytest.approx(order, abs=0.15)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "heun", "rk4"])
+@pytest.mark.parametrize("integrator", ["euler", "heun", "rk4", "ros2"])
 def test_substeps_are_smaller_steps_with_the_same_control(make: Make, integrator: str) -> None:
     coarse = make(OSCILLATOR.format(dt="0.2", integrator=integrator, substeps=4))
     fine = make(OSCILLATOR.format(dt="0.05", integrator=integrator, substeps=1))

@@ -1,8 +1,8 @@
-"""Integrators, one per module; each module defines its Butcher tableau as `TABLEAU`."""
+"""Integrators, one per module; each module defines its method as `TABLEAU`."""
 
-from stlc.dynamics.model.integrators._tableau import Tableau
+from stlc.dynamics.model.integrators._tableau import Method
 from stlc.registry import PackageRegistry
 
-INTEGRATORS: PackageRegistry[Tableau] = PackageRegistry(
+INTEGRATORS: PackageRegistry[Method] = PackageRegistry(
     "integrator", "stlc.dynamics.model.integrators", "TABLEAU", default="euler"
 )

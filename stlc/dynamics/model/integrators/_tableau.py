@@ -15,6 +15,12 @@ from stlc.dynamics.model.algebra import add, multiply
 
 State: TypeAlias = Mapping[str, ir.Num]
 Rate: TypeAlias = Callable[[State], State]
+Method: TypeAlias = Callable[[Rate, State, float, Rate], State]
+"""One step of an integrator.
+
+From the function that computes derivatives, the state, the length of the step in seconds, and a function that
+gives names to expressions, so that each is computed once, it returns the state after the step.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +39,7 @@ class Tableau:
     weights: tuple[float, ...]
     divisor: float = 1.0
 
-    def __call__(self, rate: Rate, state: State, length: float) -> State:
+    def __call__(self, rate: Rate, state: State, length: float, named: Rate) -> State:  # noqa: ARG002
         """Return the state after a step of `length` seconds; `rate` computes the derivatives."""
         slopes: list[State] = []
         for row in self.stages:

@@ -1,0 +1,195 @@
+"""Simulations shared out among worker processes, of this machine or of a Ray cluster.
+
+Every worker loads the simulator once. The points of a search are cut into parts whose size depends on nothing
+but the simulator, so that the outcomes are the same however many workers there are.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.simulation import Focus, Simulations, Simulator, SimulatorSource
+from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall, results
+
+if TYPE_CHECKING:
+    from stlc.assurance.plant_simulator import FailedSimulation
+
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+
+PARTS = 4
+"""Number of parts into which the points are cut that a simulator prefers to simulate side by side."""
+
+
+class SimulatorWorkers:
+    """Worker processes that each hold the same simulator, as a context.
+
+    Attributes:
+        count: number of workers when the context was entered.
+        findings: failed simulations of black boxes in the workers.
+        lost: number of simulations that were lost with their workers, each time that they were tried.
+        reasons: causes of the losses, each once.
+    """
+
+    def __init__(self, source: SimulatorSource, calls: CallWorkers, files: CallFiles = NO_FILES) -> None:
+        """Use workers that make calls.
+
+        Args:
+            source: the simulator.
+            calls: the workers; local ones must be `fresh`, since this process has used PyTorch.
+            files: files that loading the simulator reads.
+        """
+        self._source, self._calls, self._files = source, calls, files
+        self.count = 1
+        self.findings: list[FailedSimulation] = []
+        self.lost = 0
+        self.reasons: dict[str, None] = {}
+
+    def __enter__(self) -> Self:
+        """Start the workers."""
+        self._calls.__enter__()
+        self.count = self._calls.size
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        """End the workers."""
+        self._calls.__exit__(*raised)
+
+    def run(
+        self, task: Callable[[Simulator, Argument], Result], arguments: Sequence[Argument]
+    ) -> Iterator[Result | LostCall]:
+        """Call `task`, a function of a module, for each argument; yield the results in order."""
+        orders = [_Order(self._source, task, argument) for argument in arguments]
+        ended: dict[int, Any] = {}
+        following = 0
+        for each in results(self._calls, _call, orders, files=lambda _: self._files):
+            ended[each.index] = each.value
+            while following in ended:
+                yield self._value(ended.pop(following))
+                following += 1
+
+    def _value(self, found: _Found | LostCall) -> Any:
+        if isinstance(found, LostCall):
+            self.reasons[found.reason] = None
+            return found
+        self.findings += found.findings
+        return found.value
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """Call of a task in a worker, and the simulator that it needs."""
+
+    source: SimulatorSource
+    task: Callable[[Simulator, Any], Any]
+    argument: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Value of a task, and the simulations of a black box that failed meanwhile."""
+
+    value: Any
+    findings: tuple[FailedSimulation, ...]
+
+
+_loaded: list[tuple[SimulatorSource, Simulator]] = []
+"""The simulator of a worker process, and its source."""
+
+
+def _call(order: _Order) -> _Found:
+    """Carry out a task in a worker process, which has one core."""
+    if not _loaded or _loaded[0][0] != order.source:
+        _loaded[:] = [(order.source, order.source.load())]
+        if (torch := sys.modules.get("torch")) is not None:
+            torch.set_num_threads(1)
+    simulator = _loaded[0][1]
+    findings: list[FailedSimulation] = getattr(simulator, "findings", [])
+    findings.clear()
+    return _Found(order.task(simulator, order.argument), tuple(findings))
+
+
+@dataclass(frozen=True)
+class SharedSimulator:
+    """Simulator whose points are shared out among workers.
+
+    A simulation that is lost with its worker counts as one without an admissible initial state.
+
+    Attributes:
+        local: the same simulator in this process, for single points and descriptions.
+        workers: the processes that simulate; None: this one, part by part.
+        points: number of points side by side; None: as many as the simulator prefers, and a part for each
+            worker at least.
+    """
+
+    local: Simulator
+    workers: SimulatorWorkers | None
+    points: int | None = None
+
+    @property
+    def space(self) -> SearchSpace:
+        """The search space."""
+        return self.local.space
+
+    @property
+    def requirements(self) -> Sequence[str]:
+        """Names of the requirements."""
+        return self.local.requirements
+
+    @property
+    def _part(self) -> int:
+        """Number of points of a part."""
+        return max(self.local.batch // PARTS, 1)
+
+    @property
+    def batch(self) -> int:
+        """Number of points side by side."""
+        count = 1 if self.workers is None else self.workers.count
+        return self.points or max(self.local.batch, self._part * count)
+
+    def seen(self, requirement: int) -> float:
+        """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
+        return self.local.seen(requirement)
+
+    def graded(self, requirement: int) -> bool:
+        """Whether the robustness varies with real signals, rather than with whole numbers."""
+        return self.local.graded(requirement)
+
+    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
+        """Simulate and judge `points`, (count, dim), in equal parts."""
+        parts = [points[first : first + self._part] for first in range(0, len(points), self._part)]
+        if self.workers is None or len(points) == 1:
+            return Simulations.joined([self.local.simulate(part, focus) for part in parts])
+        found = list(self.workers.run(_simulated, [(part, focus) for part in parts]))
+        known = [each for each in found if not isinstance(each, LostCall)]
+        sizes = np.concatenate([each.sizes for each in known]) if known else np.zeros((0, 0))
+        whole = []
+        for part, each in zip(parts, found, strict=True):
+            if isinstance(each, LostCall):
+                self.workers.lost += len(part)
+                whole.append(_missing(len(part), sizes))
+            else:
+                whole.append(each)
+        return Simulations.joined(whole)
+
+    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+        """Outcomes at half the time step; None if the step cannot be changed."""
+        return self.local.at_half_step(points, focus)
+
+
+def _missing(count: int, sizes: NDArray[np.float64]) -> Simulations:
+    """Outcomes of lost simulations; the sizes of their predicates are taken to be typical, of `sizes`."""
+    typical = np.median(sizes, axis=0) if len(sizes) else np.zeros(sizes.shape[1])
+    nothing = np.full(count, np.inf)
+    return Simulations(nothing, nothing, np.zeros(count, dtype=np.bool_), np.tile(typical, (count, 1)))
+
+
+def _simulated(simulator: Simulator, order: tuple[NDArray[np.float64], Focus]) -> Simulations:
+    return simulator.simulate(*order)
