@@ -38,6 +38,10 @@ class Subject(Protocol):
     """Subject of a certificate: what is observed, and what the observations depend on."""
 
     @property
+    def doing(self) -> str:
+        """Verb of an observation in progress, such as `simulating`."""
+
+    @property
     def per_seed(self) -> int:
         """Number of independent units that a seed gives, at most."""
 
@@ -57,6 +61,9 @@ class Subject(Protocol):
 
         `seeds` are those observed so far.
         """
+
+    def close(self) -> None:
+        """End the processes of the subject."""
 
 
 @dataclass(frozen=True, slots=True)

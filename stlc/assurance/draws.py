@@ -58,6 +58,7 @@ class PlantDraws:
     jobs: int = 1
     findings: list[PlantFinding] = field(default_factory=list)
 
+    doing: ClassVar[str] = "simulating"
     per_seed: ClassVar[int] = 1
     assumptions: ClassVar[tuple[str, ...]] = (
         "a simulation does not depend on those before it in the same process (`fresh: true` makes sure)",
@@ -112,6 +113,10 @@ class PlantDraws:
             "findings": {"count": len(self.findings), "first": found},
         }
 
+    def close(self) -> None:
+        """End the processes of the plant."""
+        self.judge.plant.close()
+
 
 @dataclass(frozen=True, slots=True)
 class ModelDraws:
@@ -129,6 +134,7 @@ class ModelDraws:
     require: tuple[str, ...] = ()
     overrides: Mapping[str, str] = field(default_factory=dict)
 
+    doing: ClassVar[str] = "simulating"
     per_seed: ClassVar[int] = 1
     packages: ClassVar[tuple[str, ...]] = ()
     assumptions: ClassVar[tuple[str, ...]] = (
@@ -178,6 +184,9 @@ class ModelDraws:
             "conditions": _conditions(self.overrides, self.require, seeds),
             "findings": {"count": 0, "first": []},
         }
+
+    def close(self) -> None:
+        """Do nothing: the system is simulated in this process."""
 
 
 def _conditions(overrides: Mapping[str, str], require: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:

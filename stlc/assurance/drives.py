@@ -126,6 +126,7 @@ class PolicyDrives:
     overrides: Mapping[str, str] = field(default_factory=dict)
     watch: Watch | None = None
 
+    doing: ClassVar[str] = "driving"
     packages: ClassVar[tuple[str, ...]] = ()
     assumptions: ClassVar[tuple[str, ...]] = ()
 
@@ -177,6 +178,9 @@ class PolicyDrives:
                 "seeds": seed_ranges(seeds),
             },
         }
+
+    def close(self) -> None:
+        """Do nothing: drives have no processes of their own."""
 
 
 # ---------------------------------------------------------------------- verification

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_library
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from stlc.assurance.campaign import Campaign, Progress, Subject, Verification
     from stlc.assurance.drives import PolicyDrives
     from stlc.controller.guard.candidates import Mode
-    from stlc.plants.plant import Plant
 
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 FILE = "eval/certificate.json"
@@ -300,7 +299,7 @@ def _observed(order: Campaign, path: Path) -> Certificate | DrawnCertificate:
     from stlc.jsontext import dumps
 
     document: Any = None
-    with _closing(order.subject), PULSE.doing("driving" if hasattr(order.subject, "guard") else "simulating"):
+    with closing(order.subject), PULSE.doing(order.subject.doing):
         for progress in campaign(order):
             document = certificate(order, progress)
             write_atomic(path, dumps(document, indent=2) + "\n")
@@ -308,12 +307,6 @@ def _observed(order: Campaign, path: Path) -> Certificate | DrawnCertificate:
                 say(_progress_text(progress))
     made: Certificate | DrawnCertificate = document
     return made
-
-
-def _closing(subject: Subject) -> AbstractContextManager[Plant | None]:
-    """The plant of a subject, whose processes end afterwards; nothing for other subjects."""
-    judge = getattr(subject, "judge", None)
-    return nullcontext() if judge is None else judge.plant
 
 
 def _progress_text(progress: Progress) -> str:
