@@ -50,29 +50,31 @@ def test_an_fmu_is_simulated_falsified_and_certified(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     version, sections, spec = FMUS[name]
+    halves = "true" if name == "oscillator" else "false"
     build(tmp_path, name, version)
     Path("plant.yaml").write_text(
         f"plant: 1\nname: {name}\nfmu: {{file: {name}.fmu, interface: model exchange, tolerance: 1e-8}}\n"
-        f"time: {{dt: 20 ms, duration: 2 s, halves: true}}\n{sections}"
+        f"time: {{dt: 20 ms, duration: 2 s, halves: {halves}}}\n{sections}"
     )
     Path("spec.stl").write_text(spec)
     judge = PlantJudge.load("spec.stl", "plant.yaml", {})
     searcher = PlantSimulator(judge)
     draws = PlantDraws(judge, Path("spec.stl"))
     first, second = searcher.requirements
-    runs = list(judge.runs(judge.random_points(range(10)), range(10)))
-    budget = SearchBudget(20)
+    runs = list(judge.runs(judge.random_points(range(4)), range(4)))
+    budget = SearchBudget(12)
     open_, found = (falsify(searcher, index, budget=budget, seed=0, shrinks=False) for index in range(2))
-    (last,) = campaign(Campaign(draws, Claim(0.3), seeds=tuple(range(30))))
+    (last,) = campaign(Campaign(draws, Claim(0.3), seeds=tuple(range(20))))
     searcher.close()
     assert all(run.finding is None for run in runs)
     held = [all(each.status == "satisfied" for each in run.requirements) for run in runs]
     assert open_.found is None
-    assert open_.simulations == 20
+    assert open_.simulations == 12
     assert found.found is not None
-    assert found.found.half_step == pytest.approx(found.found.margin, abs=0.05)
+    if name == "oscillator":
+        assert found.found.half_step == pytest.approx(found.found.margin, abs=0.05)
     overall, (kept, broken) = last.assessment.overall, last.assessment.requirements
-    assert (kept.name, kept.satisfied, kept.units) == (first, 30, 30)
+    assert (kept.name, kept.satisfied, kept.units) == (first, 20, 20)
     assert (broken.name, overall.satisfied) == (second, broken.satisfied)
-    assert np.sum(held) <= broken.satisfied < 30
+    assert np.sum(held) <= broken.satisfied < 20
     assert last.assessment.answer == "certified"
