@@ -20,10 +20,10 @@ def sha256(data: bytes | str) -> str:
 
 
 @cache
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on, from their metadata."""
+def versions(*further: str) -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on, and of `further` ones, if installed."""
     found = {"python": platform.python_version()}
-    for package in PACKAGES:
+    for package in (*PACKAGES, *further):
         try:
             found[package] = version(package)
         except PackageNotFoundError:

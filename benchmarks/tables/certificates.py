@@ -20,9 +20,10 @@ from benchmarks.options import Output, ResultsOption, RunsArgument
 from benchmarks.store import Key, Result, ResultStore
 from benchmarks.table import Columns, Table, listed, provenance, publish
 from stlc.assurance.bounds import Tally, betting_lower, clopper_pearson_lower, drives_needed
-from stlc.assurance.certificate import Claim, Sample, joined
+from stlc.assurance.campaign import SEED
+from stlc.assurance.certificate import Sample, joined
 from stlc.assurance.conformal import SAME, Shift, lower_bound
-from stlc.assurance.drives import SEED, Campaign, driven
+from stlc.assurance.drives import PolicyDrives
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.simulator import Setting
@@ -181,5 +182,5 @@ def _drives_of(folder: RunDir, drives: int, steps: int | None, store: ResultStor
 
 
 def _recorded(run: Run, setting: Setting, seeds: Sequence[int]) -> Sample:
-    order = Campaign(run, rules_of(run), "none", replace(setting, seeds=()), Claim())
-    return joined([*driven(order, seeds)])
+    drives = PolicyDrives(run, rules_of(run), "none", replace(setting, seeds=()))
+    return joined([*drives.observed(seeds)])

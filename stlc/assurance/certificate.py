@@ -1,8 +1,9 @@
 """Statistical certificates: what judged drives say about future ones, with the assumptions in words.
 
-A drive is one agent in one simulated world, or one recorded trace. The drives of a world may influence each
-other, so the observations that bounds count are independent *units*: worlds, or drives if nothing couples
-them. The observed value of a unit is the share of its drives that satisfy a requirement.
+A drive is one agent in one simulated world, one recorded trace, or one simulation of a plant or system. The
+drives of a world may influence each other, so the observations that bounds count are independent *units*:
+worlds, or drives if nothing couples them. The observed value of a unit is the share of its drives that
+satisfy a requirement.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from stlc.assurance.conformal import (
 
 FORMAT = "stlc-certificate/1"
 ALL = "all requirements"
-Noun: TypeAlias = Literal["world", "drive", "trace"]
+Noun: TypeAlias = Literal["world", "drive", "trace", "simulation"]
 Answer: TypeAlias = Literal["certified", "refuted", "undecided", "measured"]
 _AGREE = 1e-9
 """Largest difference of a recomputed bound that counts as rounding."""
@@ -179,6 +180,7 @@ class Claim:
         calibration: number of first units that calibrate the conformal bounds, fixed in advance; None: all.
         online: whether the bound while driving is calibrated.
         adaptive: whether the drives are in order, and the adaptive bound is computed.
+        further: conditions in words under which the bounds hold, beside those that are always stated.
     """
 
     share: float | None = 0.99
@@ -188,6 +190,7 @@ class Claim:
     calibration: int | None = None
     online: bool = False
     adaptive: bool = False
+    further: tuple[str, ...] = ()
 
     @property
     def target(self) -> float:
@@ -492,31 +495,25 @@ def _online(sample: Sample, claim: Claim) -> OnlineBound | None:
     return calibrate_online(predicted, final, claim.confidence, claim.shift)
 
 
+_SAME: Mapping[Noun, str] = {
+    "world": "future drives come from the same world, scenario, starts and length as these",
+    "drive": "future drives come from the same world, scenario, starts and length as these",
+    "trace": "future drives come from the same source and conditions as these",
+    "simulation": "future simulations are drawn as these: each value independent, as the file declares it",
+}
+"""Condition that there is no shift."""
+
+
 def _assumptions(found: Assessment) -> Iterator[str]:
     claim, noun = found.claim, found.noun
-    most = found.sizes[1]
-    if noun == "trace":
-        yield "the traces are independent of each other, and none was chosen or left out by its result"
-    elif noun == "drive":
-        yield "the agents of a world do not influence each other, so each drive is one observation"
-    elif most == 1:
-        yield "each world has its own seed, and is one observation"
-    else:
-        yield f"the {most} agents of a world may influence each other, so a world is one observation"
-        yield "the robustness of a world is that of its worst drive"
-    if noun != "trace":
-        yield "worlds of different seeds are independent, as the numbers of a pseudo-random generator are"
+    plural = "simulations" if noun == "simulation" else "drives"
+    yield from _units(noun, found.sizes[1])
     if claim.shift == SAME:
-        what = (
-            "the same source and conditions"
-            if noun == "trace"
-            else "the same world, scenario, starts and length"
-        )
-        yield f"future drives come from {what} as these"
+        yield _SAME[noun]
     else:
-        yield f"the distribution of future drives is within {_distance(claim.shift)} of that of these"
+        yield f"the distribution of future {plural} is within {_distance(claim.shift)} of that of these"
     if claim.any_time:
-        yield "the drives were stopped by their results; bounds on shares hold at any stopping time"
+        yield f"the {plural} were stopped by their results; bounds on shares hold at any stopping time"
         yield (
             f"bounds on the next robustness use the first {found.calibration} {noun}s, a number fixed before"
         )
@@ -524,11 +521,32 @@ def _assumptions(found: Assessment) -> Iterator[str]:
         yield f"the number of {noun}s was fixed before their results were known"
     percent = f"{100 * claim.confidence:g} %"
     yield f"each bound holds by itself with {percent} confidence, not all of them together"
-    yield "a bound on the next robustness holds on average over such samples, not given these drives"
+    yield f"a bound on the next robustness holds on average over such samples, not given these {plural}"
     if found.overall.undecided:
-        yield f"{found.overall.undecided} drives without a verdict count as not satisfied in lower bounds"
-    if noun != "trace":
+        yield f"{found.overall.undecided} {plural} without a verdict count as not satisfied in lower bounds"
+    yield from claim.further
+    if noun in ("world", "drive"):
         yield "nothing is said about what the simulated world leaves out"
+
+
+def _units(noun: Noun, most: int) -> Iterator[str]:
+    """Conditions on what one observation is."""
+    match noun:
+        case "trace":
+            yield "the traces are independent of each other, and none was chosen or left out by its result"
+            return
+        case "simulation":
+            yield "each simulation has its own seed, and is one observation"
+            yield "simulations of different seeds are independent, as the numbers of a generator are"
+            return
+        case "drive":
+            yield "the agents of a world do not influence each other, so each drive is one observation"
+        case "world" if most == 1:
+            yield "each world has its own seed, and is one observation"
+        case "world":
+            yield f"the {most} agents of a world may influence each other, so a world is one observation"
+            yield "the robustness of a world is that of its worst drive"
+    yield "worlds of different seeds are independent, as the numbers of a pseudo-random generator are"
 
 
 def _distance(shift: Shift) -> str:

@@ -1,30 +1,15 @@
-"""Sequential deployment: drives of a trained, guarded policy in batches, until a claim is decided.
-
-The certificate names everything that the drives depend on by hashes and versions, so that it can be compared
-with a run later.
-"""
+"""Drives of a trained, guarded policy in its world, as the subject of a certificate."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from stlc.assurance.certificate import (
-    FORMAT,
-    Assessment,
-    Claim,
-    Judged,
-    Noun,
-    Sample,
-    assess,
-    joined,
-    together,
-    wrong_numbers,
-)
+from stlc.assurance.campaign import Verification, compared, seed_ranges
+from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
@@ -36,22 +21,15 @@ from stlc.controller.training.checkpoint import FOLDER, POINTER
 from stlc.controller.training.run import CONFIG, spec_hash, system_hash, task_of_run
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.robots.functions import function_files
-from stlc.jsontext import plain
 from stlc.monitor.judgement import unknown_requirement
-from stlc.provenance import hardware, sha256, versions
-from stlc.rundir import RunDir, now
+from stlc.provenance import sha256
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording, Watch
     from stlc.controller.problem.task import Task
     from stlc.controller.training.run import Run
 
-SEED = 1 << 41
-"""First seed of certificates; those of `simulate` begin at 0, those after a training at 2^40."""
-FIRST = 100
-"""Number of units in the first batch, which calibrates the conformal bounds."""
-BATCH = 50
-"""Number of units in each further batch."""
 ROWS = 1000
 """Largest number of agents that are simulated at once."""
 
@@ -127,154 +105,85 @@ def _judged_by_rules(
 
 
 @dataclass(frozen=True, slots=True)
-class Campaign:
-    """A sequential deployment, as requested.
+class PolicyDrives:
+    """Drives of a policy, as requested.
 
     Attributes:
         run: the run, with its scenario.
         rules: specification of drives; None if that of the plans judges them.
         guard: name of the guard.
         setting: options of each deployment; its seeds are not used.
-        claim: what is asked of the drives.
         require: names of the requirements that count; all if empty.
-        width: width of the interval at which the deployment stops; None: it stops once the claim is decided.
         overrides: values of `--set` in the deployment.
-        most: largest number of units.
-        seeds: seeds fixed in advance, which are all driven; None: seeds from `SEED` on, as many as needed.
+        watch: function that is told about each step; None for none.
     """
 
     run: Run
     rules: Rules | None
     guard: Mode
     setting: Setting
-    claim: Claim
     require: tuple[str, ...] = ()
-    width: float | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
-    most: int = 1000
-    seeds: tuple[int, ...] | None = None
+    watch: Watch | None = None
+
+    doing: ClassVar[str] = "driving"
+    packages: ClassVar[tuple[str, ...]] = ()
+    assumptions: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def per_seed(self) -> int:
+        """Number of independent units that a seed gives: its agents, or the world that couples them."""
+        alone = independent_agents(world_type(self.run.task.system.decl))
+        return self.setting.agents if alone else 1
+
+    def observed(self, seeds: Sequence[int]) -> Iterator[Sample]:
+        """Simulate the worlds of `seeds`, at most about `ROWS` agents at once, and yield the judged drives.
+
+        Raises:
+            SystemFileError: the world fails.
+            RunError: R402, the policy's plan is not a number; R405, there is no start with a plan.
+            UsageError: U101, there is no such requirement.
+        """
+        task, limit = self.run.task, self.setting
+        limits = Limits(seconds=limit.limit, margin=limit.margin, paper=limit.paper_limit)
+        size = max(1, ROWS // limit.agents)
+        for begin in range(0, len(seeds), size):
+            setting = replace(limit, seeds=tuple(seeds[begin : begin + size]))
+            guard = Guard(task, self.run.policy, self.guard, limits=limits)
+            recorder = Recorder(setting.agents, pictured=False)
+            simulate(guard, world_type(task.system.decl), setting, recorder, self.watch)
+            recording = recorder.recording()
+            assert recording is not None
+            yield sample_of(task, recording, self.rules, self.require)
+
+    def record(self, seeds: Sequence[int]) -> dict[str, Any]:
+        """Entries of the certificate on the run, and on how its policy was deployed."""
+        run, setting = self.run, self.setting
+        scenario = run.task.system.decl.scenario
+        return {
+            "run": run.dir.shown,
+            "spec": run.task.compiled.name,
+            "system": run.task.system.decl.name,
+            "inputs": inputs_of(run.dir, run.task, self.rules),
+            "conditions": {
+                "guard": self.guard,
+                "scenario": None if scenario is None else scenario.name,
+                "overrides": dict(self.overrides),
+                "require": list(self.require),
+                "margin": dict(setting.margin),
+                "time_limit": setting.limit if self.guard == "full" else setting.paper_limit,
+                "agents": setting.agents,
+                "steps": setting.steps,
+                "replan": setting.replan,
+                "seeds": seed_ranges(seeds),
+            },
+        }
+
+    def close(self) -> None:
+        """Do nothing: drives have no processes of their own."""
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """State of a sequential deployment after a batch.
-
-    Attributes:
-        assessment: what the drives so far say.
-        seeds: seeds so far.
-        batches: number of batches so far.
-        done: whether no further batch follows.
-    """
-
-    assessment: Assessment
-    seeds: tuple[int, ...]
-    batches: int
-    done: bool
-
-
-def campaign(order: Campaign, watch: Watch | None = None) -> Iterator[Progress]:
-    """Deploy batch by batch, and yield what is known after each.
-
-    Without fixed seeds, the deployment stops once the claim is answered, or the interval is as narrow as
-    asked, or there are `order.most` units; only bounds that are valid at any stopping time are then used.
-
-    Raises:
-        SystemFileError: the world fails.
-        RunError: R402, the policy's plan is not a number; R405, there is no start with a plan.
-        UsageError: U101, there is no such requirement.
-    """
-    fixed, each = order.seeds is not None, _units_per_seed(order)
-    first = min(FIRST, order.most)
-    claim = replace(order.claim, any_time=not fixed, calibration=None if fixed else first)
-    every = order.seeds or tuple(range(SEED, SEED + max(1, order.most // each)))
-    parts: list[Sample] = []
-    known, batches = 0, 0
-    while known < len(every):
-        count = len(every) if fixed else math.ceil((BATCH if known else first) / each)
-        seeds = every[known : known + count]
-        parts += driven(order, seeds, watch)
-        known, batches = known + len(seeds), batches + 1
-        assessment = assess(joined(parts), claim)
-        done = known == len(every) or _answered(assessment, order.width)
-        yield Progress(assessment, every[:known], batches, done)
-        if done:
-            return
-
-
-def _answered(found: Assessment, width: float | None) -> bool:
-    return found.width <= width if width is not None else found.answer in ("certified", "refuted")
-
-
-def _units_per_seed(order: Campaign) -> int:
-    alone = independent_agents(world_type(order.run.task.system.decl))
-    return order.setting.agents if alone else 1
-
-
-def driven(order: Campaign, seeds: Sequence[int], watch: Watch | None = None) -> Iterator[Sample]:
-    """Simulate the worlds of `seeds`, at most about `ROWS` agents at once, and yield the judged drives.
-
-    Raises:
-        SystemFileError, RunError, UsageError: see `campaign`.
-    """
-    task, limit = order.run.task, order.setting
-    limits = Limits(seconds=limit.limit, margin=limit.margin, paper=limit.paper_limit)
-    size = max(1, ROWS // limit.agents)
-    for begin in range(0, len(seeds), size):
-        setting = replace(limit, seeds=tuple(seeds[begin : begin + size]))
-        guard = Guard(task, order.run.policy, order.guard, limits=limits)
-        recorder = Recorder(setting.agents, pictured=False)
-        simulate(guard, world_type(task.system.decl), setting, recorder, watch)
-        recording = recorder.recording()
-        assert recording is not None
-        yield sample_of(task, recording, order.rules, order.require)
-
-
-# ---------------------------------------------------------------------- certificates
-
-
-def certificate(order: Campaign, progress: Progress) -> dict[str, Any]:
-    """Content of a certificate file: answer, bounds, assumptions, and everything that they depend on."""
-    run, setting = order.run, order.setting
-    document = {
-        "certificate": FORMAT,
-        "made": now(),
-        "run": run.dir.shown,
-        "spec": run.task.compiled.name,
-        "system": run.task.system.decl.name,
-        **progress.assessment.summary(),
-        "width": order.width,
-        "finished": progress.done,
-        "batches": progress.batches,
-        "inputs": inputs_of(run.dir, run.task, order.rules),
-        "conditions": {
-            "guard": order.guard,
-            "scenario": None if run.task.system.decl.scenario is None else run.task.system.decl.scenario.name,
-            "overrides": dict(order.overrides),
-            "require": list(order.require),
-            "margin": dict(setting.margin),
-            "time_limit": setting.limit if order.guard == "full" else setting.paper_limit,
-            "agents": setting.agents,
-            "steps": setting.steps,
-            "replan": setting.replan,
-            "seeds": _ranges(progress.seeds),
-        },
-        "versions": versions(),
-        "hardware": hardware(),
-    }
-    found: Any = plain(document)
-    result: dict[str, Any] = found
-    return result
-
-
-def _ranges(seeds: Sequence[int]) -> list[list[int]]:
-    """Seeds as ranges [first, last], in order."""
-    found: list[list[int]] = []
-    for seed in seeds:
-        if found and seed == found[-1][1] + 1:
-            found[-1][1] = seed
-        else:
-            found.append([seed, seed])
-    return found
+# ---------------------------------------------------------------------- verification
 
 
 def inputs_of(folder: RunDir, task: Task, rules: Rules | None) -> dict[str, str | int | None]:
@@ -301,35 +210,6 @@ def inputs_of(folder: RunDir, task: Task, rules: Rules | None) -> dict[str, str 
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """An entry of a certificate that differs now."""
-
-    name: str
-    certificate: str
-    present: str
-
-
-@dataclass(frozen=True, slots=True)
-class Verification:
-    """Comparison of a certificate with a run.
-
-    Attributes:
-        inputs: hashes and versions of inputs that differ; the certificate is then not about this run.
-        numbers: bounds that do not follow from the counts in the certificate.
-        software: versions of packages that differ.
-    """
-
-    inputs: tuple[Difference, ...]
-    numbers: tuple[str, ...]
-    software: tuple[Difference, ...]
-
-    @property
-    def same(self) -> bool:
-        """True if the certificate is about this run, and its numbers are consistent."""
-        return not self.inputs and not self.numbers
-
-
 def verify(document: Mapping[str, Any], folder: RunDir) -> Verification:
     """Compare a certificate with the present state of a run's folder and of the software.
 
@@ -344,17 +224,7 @@ def verify(document: Mapping[str, Any], folder: RunDir) -> Verification:
     scenario = conditions["scenario"]
     task = task_of_run(folder, changed, None if scenario is None else str(scenario))
     present = inputs_of(folder, task, rules_for(folder, task.system.decl))
-    return Verification(
-        _different(document["inputs"], present),
-        tuple(wrong_numbers(document)),
-        _different(document["versions"], versions()),
-    )
-
-
-def _different(then: Mapping[str, Any], present: Mapping[str, Any]) -> tuple[Difference, ...]:
-    names = dict.fromkeys((*present, *then))
-    pairs = ((str(name), str(then.get(name)), str(present.get(name))) for name in names)
-    return tuple(Difference(*each) for each in pairs if each[1] != each[2])
+    return compared(document, present)
 
 
 def _policy(folder: RunDir) -> str:

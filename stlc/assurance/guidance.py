@@ -55,6 +55,10 @@ class ScaledRobustness:
             found[:, index] = np.quantile(np.abs(values), 0.9, axis=0) if np.ndim(values) else 0.0
         return found
 
+    def scaled(self, scales: tuple[float, ...] | None) -> ir.Formula:
+        """The formula, each predicate multiplied by its factor; None: all 1."""
+        return _scaled(self._formula, self.predicates, scales)
+
     def __call__(self, columns: Columns, scales: tuple[float, ...] | None) -> NDArray[np.float64]:
         """Guidance values of simulations, (batch,): negative exactly where the formula is violated.
 
@@ -63,9 +67,7 @@ class ScaledRobustness:
             scales: factor of each predicate; None: all 1.
         """
         count = next(iter(columns.values())).shape[1]
-        found: NDArray[np.float64] = evaluate(
-            [_scaled(self._formula, self.predicates, scales)], columns, ops=NUMPY
-        )[0][0]
+        found: NDArray[np.float64] = evaluate([self.scaled(scales)], columns, ops=NUMPY)[0][0]
         return np.broadcast_to(found, (count,))
 
 

@@ -202,6 +202,10 @@ class ModelSimulator:
         result = PlanResult(states, plans, torch.from_numpy(rho), nothing.bool(), nothing, nothing.long())
         return trace_of(self.task, result, seed)
 
+    def columns_from(self, states: Tensor) -> Columns:
+        """Signals of simulations from initial states (count, n): name -> (time, count)."""
+        return self._moved(self.task, states)
+
     @staticmethod
     def _moved(task: Task, states: Tensor) -> Columns:
         """Simulate from initial states (count, n): signal -> (time, count), by the fastest kernel there is.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,47 +11,145 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.assurance.guidance import ScaledRobustness
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
-from stlc.diagnostics import Diagnostic, RunError
-from stlc.files import find_spec, read_source
-from stlc.grammar.parse.parser import parse
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import nodes
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.monitor.instants import rule_bounds, starts_of
+from stlc.monitor.signals import arrange, needs_of
+from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
-from stlc.plants.plant import Plant, PlantFinding, load_plant
-from stlc.trace import Trace
+from stlc.plants.judge import PlantJudge
+from stlc.plants.plant import Plant, PlantFinding, PlantRun
 
 if TYPE_CHECKING:
-    from stlc.plants.plant import PlantRun
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.dynamics.declaration.inputs import InputDecl
+    from stlc.trace import Trace
+
+_AHEAD = {"hold": 0, "linear": 1, "pchip": 2}
+"""Pieces by which a value of an input signal affects the signal before its own time, by interpolation."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailedSimulation:
+    """A point at which a plant gave no trace.
+
+    Attributes:
+        point: the point of the unit cube, (dim,).
+        finding: the failure.
+    """
+
+    point: Point
+    finding: PlantFinding
+
+
+@dataclass(frozen=True, slots=True)
+class _JudgedTrace:
+    """One simulation under one requirement.
+
+    Attributes:
+        margin: exact robustness; +inf if the simulation failed.
+        guidance: robustness with scaled predicates.
+        sizes: sizes of the margins of the predicates, (predicates,); empty if they are not wanted.
+        inside: whether the assumptions of the specification hold.
+        failed: whether there is no trace.
+    """
+
+    margin: float
+    guidance: float
+    sizes: NDArray[np.float64]
+    inside: bool = True
+    failed: bool = False
+
+
+@dataclass(frozen=True)
+class _Judging:
+    """Judgement of simulations by the requirements of a monitor, with scaled guidance."""
+
+    monitor: Monitor
+
+    @cached_property
+    def _guides(self) -> tuple[ScaledRobustness, ...]:
+        return tuple(ScaledRobustness(rule.formula) for rule in self.monitor.compiled.requirements)
+
+    def __call__(self, run: PlantRun, focus: Focus) -> _JudgedTrace:
+        """Judge one simulation."""
+        guide, compiled = self._guides[focus.requirement], self.monitor.compiled
+        sizes = np.zeros(len(guide.predicates) if focus.sized else 0)
+        if isinstance(run.outcome, PlantFinding):
+            return _JudgedTrace(np.inf, np.inf, sizes, failed=True)
+        rule = compiled.requirements[focus.requirement]
+        verdict = self.monitor.check(run.outcome, require=(rule.name,))
+        margin = float(verdict.requirements[0].high.min())
+        inside = verdict.statuses[0] != "out of scope"
+        if not guide.predicates:
+            return _JudgedTrace(margin, margin, sizes, inside)
+        signals = arrange(run.outcome, needs_of(compiled, [rule]), plain=True)
+        if focus.sized:
+            (sizes,) = guide.sizes(signals.env)
+        if focus.scales is None:
+            return _JudgedTrace(margin, margin, sizes, inside)
+        scaled = guide.scaled(focus.scales)
+        rule = replace(rule, formula=scaled, lowered=scaled)
+        starts = starts_of(rule, signals.samples, compiled.grid.horizon, None)
+        record = Record.of(signals.env, signals.ops)
+        _, high = rule_bounds(rule, record, starts, compiled.grid.horizon, "open")
+        return _JudgedTrace(margin, float(high.min()), sizes, inside)
+
+
+def _together(found: Sequence[_JudgedTrace]) -> Simulations:
+    """Outcomes of several simulations; the sizes of failed ones are taken to be typical of the others."""
+    sizes = np.stack([each.sizes for each in found])
+    failed = np.array([each.failed for each in found], dtype=np.bool_)
+    if failed.any() and not failed.all():
+        sizes[failed] = np.median(sizes[~failed], axis=0)
+    return Simulations(
+        np.array([each.margin for each in found]),
+        np.array([each.guidance for each in found]),
+        np.array([each.inside for each in found], dtype=np.bool_),
+        sizes,
+    )
 
 
 @dataclass(frozen=True)
 class PlantSimulator:
     """Simulator of a plant file.
 
-    A simulation that fails has no margin: it counts as inadmissible, and is kept among the findings.
+    A simulation that fails gives no trace, so that it violates no requirement: its robustness is +inf, and it
+    is kept among the findings. A simulation in which the assumptions of the specification do not hold is not
+    admissible.
 
     Attributes:
-        plant: the black box, which the caller closes.
-        monitor: the specification of its signals.
+        judge: the black box, which the caller closes, and the specification of its signals.
         jobs: number of processes that simulate side by side.
-        findings: failed simulations until now.
+        findings: failed simulations until now, one for each point.
     """
 
-    plant: Plant
-    monitor: Monitor
+    judge: PlantJudge
     jobs: int = 1
-    findings: list[PlantFinding] = field(default_factory=list)
+    findings: list[FailedSimulation] = field(default_factory=list)
 
     @classmethod
     def load(cls, spec: str, plant: Path, overrides: Mapping[str, str], jobs: int = 1) -> PlantSimulator:
         """Load a plant file and the specification of its signals.
 
         Raises:
-            UsageError, SpecError, SystemFileError: a file is missing or invalid.
+            UsageError, SpecError, SystemFileError, TraceError: see `PlantJudge.load`.
         """
-        found = load_plant(plant)
-        text = parse(read_source(find_spec(Path(spec))))
-        return cls(found, Monitor(text, dt=found.decl.dt, overrides=overrides), jobs)
+        return cls(PlantJudge.load(spec, plant, overrides), jobs)
+
+    @property
+    def plant(self) -> Plant:
+        """The black box."""
+        return self.judge.plant
+
+    @property
+    def monitor(self) -> Monitor:
+        """The specification of its signals."""
+        return self.judge.monitor
 
     @property
     def batch(self) -> int:
@@ -76,48 +174,96 @@ class PlantSimulator:
         """Names of the requirements."""
         return self.monitor.requirements
 
-    def seen(self, requirement: int) -> float:  # noqa: ARG002
-        """1: the whole simulation may matter."""
-        return 1.0
+    @cached_property
+    def _judging(self) -> _Judging:
+        return _Judging(self.judge.monitor)
+
+    def seen(self, requirement: int) -> float:
+        """Share of the duration, at most 1, after which values of inputs no longer affect a requirement.
+
+        An input may affect outputs at the same time, so the last sample that the requirement reads counts. An
+        interpolated signal depends on values that lie ahead.
+        """
+        decl = self.plant.decl
+        compiled = self.monitor.compiled
+        read_by = (compiled.requirements[requirement], *compiled.assumptions)
+        if not decl.free or any(_reads_everything(rule) for rule in read_by):
+            return 1.0
+        read = (max(rule.reach for rule in read_by) + 1) * float(decl.dt) / float(decl.duration)
+        return min(read + max(_ahead(signal) for signal in decl.free), 1.0)
 
     def graded(self, requirement: int) -> bool:  # noqa: ARG002
         """True: the outputs of a plant are real numbers."""
         return True
 
+    # ------------------------------------------------------------------------ simulation
+
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
-        margins = np.stack([self._margins(run) for run in runs])
-        whole = np.array([not np.isnan(each).any() for each in margins], dtype=np.bool_)
-        return Simulations.unscaled(margins[:, focus.requirement], whole)
+        for point, run in zip(points, runs, strict=True):
+            known = any(np.array_equal(each.point, point) for each in self.findings)
+            if isinstance(run.outcome, PlantFinding) and not known:
+                self.findings.append(FailedSimulation(point, run.outcome))
+        return _together([self._judging(run, focus) for run in runs])
 
-    def at_half_step(
-        self,
-        points: NDArray[np.float64],  # noqa: ARG002
-        focus: Focus,  # noqa: ARG002
-    ) -> Simulations | None:
-        """None: a black box has the time step of its file."""
-        return None
+    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+        """Outcomes at half the time step; None if the plant file does not allow it.
+
+        The margin of a simulation that fails is NaN there: it neither confirms a violation nor refutes it.
+        """
+        if self._finer is None:
+            return None
+        plant = self._finer.plant
+        found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]
+        return _together([replace(each, margin=np.nan) if each.failed else each for each in found])
 
     def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
         """None: a black box has no gradient."""
         return None
 
-    def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002
-        """Simulate one point, (1, dim), and return its trace.
+    @cached_property
+    def _finer_judging(self) -> _Judging:
+        assert self._finer is not None
+        return _Judging(self._finer.monitor)
 
-        Raises:
-            RunError: R402, the simulation fails, as it did not before.
-        """
-        (run,) = self.plant.simulate(self.plant.points_of(points))
-        if isinstance(run.outcome, PlantFinding):
-            raise RunError(Diagnostic("R402", f"`{self.plant.decl.name}` failed: {run.outcome.message}"))
+    @cached_property
+    def _finer(self) -> PlantJudge | None:
+        return self.judge.at_half_step()
+
+    def close(self) -> None:
+        """End all processes of the plant."""
+        self.plant.close()
+        finer = self.__dict__.get("_finer")
+        if finer is not None:
+            finer.plant.close()
+
+    def outcome(self, point: Point) -> Trace | PlantFinding:
+        """Simulate one point, (dim,); return its trace, or the failure."""
+        (run,) = self.plant.simulate(self.plant.points_of(point[None]))
         return run.outcome
 
-    def _margins(self, run: PlantRun) -> NDArray[np.float64]:
-        """Robustness of each requirement, (requirements,); NaN if the simulation failed."""
-        if isinstance(run.outcome, PlantFinding):
-            self.findings.append(run.outcome)
-            return np.full(len(self.requirements), np.nan)
-        judgements: Sequence[float] = [float(each.high.min()) for each in self.monitor.check(run.outcome)]
-        return np.array(judgements)
+    def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002
+        """Simulate one point, (1, dim), and return its trace, with the specification.
+
+        Raises:
+            SystemFileError: S401, the simulation fails, as it did not before.
+        """
+        found = self.outcome(points[0])
+        if isinstance(found, PlantFinding):
+            decl = self.plant.decl
+            message = f"`{decl.name}` gave a trace, and fails when it is simulated again at the same point"
+            note = (f"{found.reason}: {found.message}",)
+            raise SystemFileError(Diagnostic("S401", message, decl.places.get(decl.kind), note=note))
+        return self.judge.stored([found])
+
+
+def _reads_everything(rule: CompiledRequirement) -> bool:
+    """Whether a requirement reads a simulation to its end, whatever its length."""
+    ahead = (node for node in nodes(rule.formula) if isinstance(node, ir.Windowed) and not node.back)
+    return rule.windowed or rule.uses_end or any(node.window.hi is None for node in ahead)
+
+
+def _ahead(signal: InputDecl) -> float:
+    """Share of the duration by which a value of an input signal affects the signal before its own time."""
+    return _AHEAD[signal.interpolate] / signal.pieces

@@ -19,7 +19,7 @@ from stlc.assurance.simulation import Focus, Simulations, Simulator, SimulatorSo
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall, results
 
 if TYPE_CHECKING:
-    from stlc.plants.plant import PlantFinding
+    from stlc.assurance.plant_simulator import FailedSimulation
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -48,7 +48,7 @@ class SimulatorWorkers:
         """
         self._source, self._calls, self._files = source, calls, files
         self.count = 1
-        self.findings: list[PlantFinding] = []
+        self.findings: list[FailedSimulation] = []
         self.lost = 0
         self.reasons: dict[str, None] = {}
 
@@ -97,7 +97,7 @@ class _Found:
     """Value of a task, and the simulations of a black box that failed meanwhile."""
 
     value: Any
-    findings: tuple[PlantFinding, ...]
+    findings: tuple[FailedSimulation, ...]
 
 
 _loaded: list[tuple[SimulatorSource, Simulator]] = []
@@ -111,7 +111,7 @@ def _call(order: _Order) -> _Found:
         if (torch := sys.modules.get("torch")) is not None:
             torch.set_num_threads(1)
     simulator = _loaded[0][1]
-    findings: list[PlantFinding] = getattr(simulator, "findings", [])
+    findings: list[FailedSimulation] = getattr(simulator, "findings", [])
     findings.clear()
     return _Found(order.task(simulator, order.argument), tuple(findings))
 

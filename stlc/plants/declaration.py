@@ -69,6 +69,7 @@ class TimeKeys:
     duration: Fraction = key(
         SECONDS, "length of a simulation, a multiple of `dt`", Fraction(1), required=True
     )
+    halves: bool = key(FLAG, "`falsify` may simulate at half of `dt`, to confirm counterexamples", False)
 
 
 @dataclass(repr=False, eq=False)
@@ -237,6 +238,7 @@ class PlantDecl:
         options: what the file says about the plant itself.
         dt: time step in seconds.
         steps: time steps of a simulation.
+        halves: whether the plant may also be simulated at half the time step.
         initial: start values.
         param: parameters.
         inputs: input signals; those that the controller writes come last.
@@ -254,6 +256,7 @@ class PlantDecl:
     options: Mapping[str, Any]
     dt: Fraction
     steps: int
+    halves: bool
     initial: tuple[VariableDecl, ...]
     param: tuple[VariableDecl, ...]
     inputs: tuple[PlantInput, ...]
@@ -272,6 +275,32 @@ class PlantDecl:
         """The input signals that no controller writes."""
         return tuple(each.signal for each in self.inputs if each.signal is not None)
 
+    def at_half_step(self) -> PlantDecl:
+        """Return the same plant at half the time step, with twice as many samples.
+
+        Inputs are the same functions of time, sampled twice as often. The period of the controller stays.
+        """
+        controller = self.controller
+        if controller is not None:
+            controller = replace(controller, period=2 * controller.period)
+        return replace(self, dt=self.dt / 2, steps=2 * self.steps, controller=controller)
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Files of which the plant consists, with its controller: name -> path. Nothing is run for that."""
+        kind: PlantKind = KINDS.get(self.kind)
+        folder = self.path.parent.resolve()
+        found = dict(kind.files(self.options, folder))
+        if self.controller is not None:
+            found[self.controller.path] = folder / self.controller.path
+        return found
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that simulate the plant."""
+        kind: PlantKind = KINDS.get(self.kind)
+        return (*kind.packages, *(() if self.controller is None else ("onnxruntime",)))
+
     def layout(self, scratch: str) -> Layout:
         """Return what the process of the plant is told; `scratch` is its folder for temporary files."""
         return Layout(
@@ -282,6 +311,7 @@ class PlantDecl:
             dt=float(self.dt),
             duration=float(self.duration),
             memory=self.limits.memory * _MEGABYTE,
+            halves=self.halves,
             initial=tuple(_port(each) for each in self.initial),
             param=tuple(_port(each) for each in self.param),
             inputs=tuple(Port(each.name, each.source, each.low, each.high) for each in self.inputs),
@@ -337,6 +367,9 @@ class _Reading:
         steps = duration / dt
         if steps.denominator != 1 or not 1 <= steps <= MOST_STEPS:
             self._complain("S103", "`duration` must be a multiple of `dt`, and not too many", "time.duration")
+        if self.keys.time.halves and KINDS.get(self.kind).own_step:
+            message = f"a plant of the kind `{self.kind}` has a time step of its own"
+            self._complain("S103", message, "time.halves", "leave `halves` out")
         controller = self._controller(dt)
         written = () if controller is None else controller.writes
         initial = self._variables(self.keys.initial, "initial")
@@ -358,6 +391,7 @@ class _Reading:
             options=self.options,
             dt=dt,
             steps=int(steps),
+            halves=self.keys.time.halves,
             initial=initial,
             param=param,
             inputs=inputs,

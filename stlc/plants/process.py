@@ -29,10 +29,12 @@ from stlc.units import parse_unit, same_dims
 Floats: TypeAlias = NDArray[np.float64]
 TAIL = 4000
 """Kept bytes of the standard error of a plant, the last ones."""
-OPENING = 60.0
-"""Seconds that a plant has to open, if a simulation may not take longer."""
+OPENING = 180.0
+"""Seconds that a plant has to open, if a simulation may not take longer: imports on a busy machine."""
 _LAST_WORDS = 1.0
-"""Seconds to wait for the standard error of a process that has ended."""
+"""Seconds to wait for the standard error of a process that has ended; a child may hold it open."""
+_LEAVING = 10.0
+"""Seconds that a process which has closed its output has to end by itself, on a busy machine."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -233,7 +235,7 @@ class PlantProcess:
     def _end_in_words(self) -> str:
         """Describe in one line how the process ended."""
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_LAST_WORDS)
+            self._process.wait(_LEAVING)
         code = self._process.returncode
         if code is None:
             return "the process of the plant closed its output"

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from stlc.assurance.campaign import FIRST, SEED, Campaign, campaign
 from stlc.assurance.certificate import Claim
-from stlc.assurance.drives import FIRST, SEED, Campaign, campaign, sample_of
+from stlc.assurance.drives import PolicyDrives, sample_of
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
@@ -65,7 +66,8 @@ def test_drives_are_judged_as_deployments_are(run: Run) -> None:
 
 
 def test_a_campaign_is_repeatable_and_counts_its_seeds(run: Run) -> None:
-    order = Campaign(run, rules_of(run), "none", Setting((), 4, 2, 1), Claim(0.999), most=FIRST + 20)
+    drives = PolicyDrives(run, rules_of(run), "none", Setting((), 4, 2, 1))
+    order = Campaign(drives, Claim(0.999), most=FIRST + 20)
     first, again = list(campaign(order)), next(campaign(order))
     assert plain(first[0].assessment.summary()) == plain(again.assessment.summary())
     last = first[-1]

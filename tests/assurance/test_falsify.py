@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.documents import misfits
 
 from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify, falsify_each
 from stlc.assurance.guidance import ScaledRobustness, scales_of
@@ -15,6 +17,7 @@ from stlc.assurance.model_simulator import ModelSimulator
 from stlc.assurance.plant_simulator import PlantSimulator
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus
+from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.trace import load_trace
@@ -189,17 +192,62 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     with simulator.plant:
         assert [block.name for block in simulator.space.blocks] == ["lift"]
         outcome = simulator.simulate(np.stack([np.ones(5), np.zeros(5)]), Focus(0))
-    assert outcome.admissible.tolist() == [True, False]
-    assert "below the ground" in simulator.findings[0].message
+    assert outcome.admissible.tolist() == [True, True]
+    assert outcome.margins[1] == np.inf
+    assert "below the ground" in simulator.findings[0].finding.message
     assert main(["falsify", "fall.stl", "--plant", "fall.yaml", "--simulations", "20"]) == 1
     text = capsys.readouterr().out
     assert "up: violated, robustness -" in text
     assert "deep: no violation in 20 simulations" in text
-    assert "the plant failed: " in text
+    assert "failed, error at t = 0.9 s: RuntimeError: below the ground" in text
     replay = ["--plant", "fall.yaml", "--replay", "counterexamples/up.json"]
     assert main(["falsify", "fall.stl", *replay]) == 1
     assert "bit for bit" in capsys.readouterr().out
     assert main(["falsify", "latest", "--plant", "fall.yaml"]) == 2
+
+
+@pytest.mark.usefixtures("fall")
+def test_a_failure_is_a_file_that_replays(capsys):
+    command = ["falsify", "fall.stl", "--plant", "fall.yaml"]
+    assert main([*command, "--require", "deep", "--simulations", "8", "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert not misfits(document, load_schema("falsify/1"))
+    result = document["result"]
+    assert result["requirements"][0]["verdict"] == "open"
+    (finding,) = result["findings"]
+    assert (finding["reason"], finding["time"]) == ("error", pytest.approx(0.9))
+    assert finding["simulations"] == len(result["failures"])
+    assert "Traceback" in finding["stderr"]
+    replay = shlex.split(finding["replay"])[1:]
+    assert main([*replay, "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert not misfits(document, load_schema("falsify/1"))
+    assert document["result"]["identical"] is True
+    Path("fall.py").write_text(FALL.replace("< -3", "< -100"))
+    assert main(replay) == 0
+    assert "gives a trace; before: error" in capsys.readouterr().out
+    assert main([*replay, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["reason"] is None
+    stored = json.loads(Path(finding["file"]).read_text())
+    Path("torn.json").write_text(json.dumps({**stored, "point": stored["point"][1:]}))
+    for words in (
+        [*command, "--replay", "torn.json"],
+        ["falsify", "oscillator.stl", "--replay", finding["file"]],
+    ):
+        assert main(words) == 2
+
+
+@pytest.mark.usefixtures("fall")
+def test_a_counterexample_whose_plant_fails_now(capsys):
+    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
+    assert main(command) == 1
+    trace = load_trace("counterexamples/up.npz")
+    assert (trace.meta.spec_name, trace.meta.dt) == ("fall", 0.05)
+    assert main(["check", "counterexamples/up.npz"]) == 1
+    Path("fall.py").write_text(FALL.replace("< -3", "< 99"))
+    capsys.readouterr()
+    assert main(["falsify", "fall.stl", "--plant", "fall.yaml", "--replay", "counterexamples/up.json"]) == 1
+    assert "the simulation fails, before: a violation of up; error at t = 0 s" in capsys.readouterr().out
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,51 @@ def test_a_controller_writes_the_last_inputs(tmp_path):
     assert decl.layout("x").free == 1
 
 
+def test_half_the_time_step_keeps_the_duration_and_the_period(tmp_path):
+    text = changed(
+        FILE,
+        time="{dt: 10 ms, duration: 1 s, halves: true}",
+        input="{torque: {range: [-2, 2]}}",
+        controller="{onnx: net.onnx, reads: [rate], writes: [torque], period: 0.1 s}",
+    )
+    decl = read(text, tmp_path)
+    finer = decl.at_half_step()
+    assert (finer.dt, finer.steps, finer.duration) == (Fraction(1, 200), 200, decl.duration)
+    assert finer.controller is not None
+    assert finer.controller.period * finer.dt == Fraction(1, 10)
+    assert finer.layout("x").halves
+
+
+def test_the_files_of_a_plant_are_found_without_running_them(tmp_path):
+    (tmp_path / "models").mkdir()
+    for name, code in {
+        "pendulum.py": "import json, deep.missing\nfrom models import rod\nimport models.rod\n",
+        "models/__init__.py": "from .bob import mass\n",
+        "models/rod.py": "from ..pendulum import x\nfrom . import bob\nraise SystemExit\n",
+        "models/bob.py": "import loop\n",
+        "loop.py": "import loop, pendulum\n",
+        "other.py": "never imported",
+    }.items():
+        (tmp_path / name).write_text(code)
+    controller = "{onnx: net.onnx, reads: [rate], writes: [torque]}"
+    decl = read(changed(FILE, input="{torque: {}}", controller=controller), tmp_path)
+    found = ["loop.py", "models/__init__.py", "models/bob.py", "models/rod.py", "net.onnx", "pendulum.py"]
+    assert sorted(decl.files) == found
+    assert decl.packages == ("scipy", "onnxruntime")
+    named = read(changed(FILE, python="'models.rod:f'"), tmp_path)
+    assert "models/rod.py" in named.files
+    elsewhere = read(changed(FILE, python="'email.message:Message'"), tmp_path)
+    assert [path.name for path in elsewhere.files.values()] == ["message.py"]
+    assert list(elsewhere.files) == ["email.message"]
+    assert read(changed(FILE, python="'no.such.module:f'"), tmp_path).files == {}
+    gym = read(changed(FILE, python="", gym="other:Swing-v0"), tmp_path)
+    assert list(gym.files) == ["other.py"]
+    fmu = read(changed(FILE, python="", fmu="{file: parts/a.fmu}"), tmp_path)
+    assert fmu.files == {"parts/a.fmu": tmp_path.resolve() / "parts/a.fmu"}
+    (tmp_path / "pendulum.py").write_bytes(b"\xff\x00 no python (")
+    assert list(read(FILE, tmp_path).files) == ["pendulum.py"]
+
+
 def test_the_process_is_told_everything(tmp_path):
     text = changed(
         FILE, input="{torque: {unit: N}}", controller="{onnx: net.onnx, reads: [rate], writes: [torque]}"
@@ -98,6 +143,8 @@ WRONG = [
     ({"time": "{dt: 10 ms, duration: 25 ms}"}, "S103", "25 ms"),
     ({"time": "{dt: 1 ns, duration: 10 s}"}, "S103", "10 s"),
     ({"time": "{dt: 10 ms}"}, "S102", "{dt: 10 ms}"),
+    ({"python": "", "gym": "P-v1", "time": "{dt: 1 s, duration: 2 s, halves: true}"}, "S103", "true"),
+    ({"time": "{dt: 1 s, duration: 2 s, halves: 2}"}, "S103", "2"),
     ({"initial": "{angle: {range: [1, -1]}}"}, "S204", "[1, -1]"),
     ({"initial": "{angle: {range: [1]}}"}, "S103", "[1]"),
     ({"initial": "{angle: {unit: rad}}"}, "S102", "{unit: rad}"),

@@ -77,7 +77,7 @@ def bounds_lines(record: Mapping[str, Any]) -> Iterator[str]:
 
 def answer(record: Mapping[str, Any]) -> str:
     """Sentence that answers the claim, such as `certified: at least 99 % of drives satisfy everything …`."""
-    noun = "traces" if record["unit"] == "trace" else "drives"
+    noun = {"trace": "traces", "simulation": "simulations"}.get(record["unit"], "drives")
     overall, sure = record["overall"], f"with {percent(record['confidence'])} confidence"
     if record["answer"] == "measured":
         low, high = overall["interval"]

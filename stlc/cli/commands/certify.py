@@ -1,17 +1,25 @@
-"""`stlc certify`: statistical certificates of trained, guarded policies."""
+"""`stlc certify`: statistical certificates of trained, guarded policies, and of plants and systems."""
 
 from __future__ import annotations
 
 import json as json_library
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stlc.cli.certify.text import bounds_lines, checked_share, floored, raised
-from stlc.cli.framework.assured import Certificate, CertificateCheck, DifferentEntry
+from stlc.cli.framework.assured import (
+    Certificate,
+    CertificateCheck,
+    CertifiedFinding,
+    CertifyResult,
+    DifferentEntry,
+    DrawnCertificate,
+)
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
     RequireOption,
@@ -21,19 +29,23 @@ from stlc.cli.framework.options import (
     parse_overrides,
     parse_seeds,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, say
+from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
-from stlc.escape import operand, shell, visible
-from stlc.files import read_source, write_atomic
+from stlc.escape import file_part, operand, shell, visible
+from stlc.files import find_spec, read_source, write_atomic
 
 if TYPE_CHECKING:
-    from stlc.assurance.drives import Campaign, Progress
+    from stlc.assurance.campaign import Campaign, Progress, Subject, Verification
+    from stlc.assurance.drives import PolicyDrives
     from stlc.controller.guard.candidates import Mode
 
 GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 FILE = "eval/certificate.json"
+DRAWN_FOLDER = "certificates"
 DEFAULT_SHARE = 0.99
+MOST_SHOWN = 5
+"""Failed simulations that are printed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,18 +79,42 @@ class Driving:
 DRIVING = Driving()
 
 
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """Options on what is simulated instead of a policy."""
+
+    plant: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A plant file, for a specification: a black box (docs/plants.md)."),
+    ] = None
+    system: Annotated[
+        str | None,
+        typer.Option(
+            "--system", "-s", metavar="FILE", help="A system without controls, for a specification."
+        ),
+    ] = None
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", min=1, metavar="N", help="With --plant: number of processes.")
+    ] = 1
+
+
+DRAWING = Drawing()
+
+
 @command(
     "stlc certify latest --guard full",
     "stlc certify latest --guard full --share .999 --confidence .99 --max-drives 20000",
     "stlc certify latest --scenario mismatch-10 --width .02 --agents 1",
+    "stlc certify fall.stl --plant ball.yaml --share .9",
     "stlc certify --verify runs/latest/eval/certificate.json",
 )
 def certify(
     run: Annotated[
         str | None,
         typer.Argument(
-            metavar="RUN",
-            help="A run's folder, number, words, spec (its name or file), or latest.",
+            metavar="RUN|SPEC",
+            help="A run's folder, number, words, spec (its name or file), or latest; a specification with "
+            "--plant or --system.",
             autocompletion=run_names,
         ),
     ] = None,
@@ -99,6 +135,7 @@ def certify(
         ),
     ] = None,
     how: Driving = DRIVING,
+    what: Drawing = DRAWING,
     seeds: Annotated[
         str | None,
         typer.Option(
@@ -108,31 +145,41 @@ def certify(
     ] = None,
     max_drives: Annotated[
         int,
-        typer.Option(min=1, metavar="N", help="Independent drives at most: worlds, where agents share one."),
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Independent drives or simulations at most; worlds, where agents share one.",
+        ),
     ] = 1000,
     require: RequireOption = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="File of the certificate; eval/certificate.json of the run."),
+        typer.Option(
+            metavar="FILE",
+            help="File of the certificate; eval/certificate.json of the run, or certificates/NAME.json.",
+        ),
     ] = None,
     verify: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Compare a certificate with the run it names, or with RUN."),
+        typer.Option(metavar="FILE", help="Compare a certificate with what it names, or with what is given."),
     ] = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
-) -> Answer[Certificate | CertificateCheck]:
+) -> Answer[CertifyResult]:
     """Certify that a share of all drives satisfies the requirements.
 
     The policy is deployed world by world until the share is certified or refuted with the given confidence,
     and a certificate is written. A drive is the closed-loop run of one agent in one simulated world. Drives
     of a world count as one observation, unless the world says that its agents are independent. Without
     --seeds, the bounds are betting bounds, which hold at any stopping time. With --seeds, all of them are
-    driven, and the bounds are exact (Clopper-Pearson) where each observation is satisfied or not. Exit code:
-    0 certified, 1 refuted, 4 undecided; with --verify 1 if something differs.
+    driven, and the bounds are exact (Clopper-Pearson) where each observation is satisfied or not. With
+    --plant or --system, the share is that of simulations whose start values, parameters and input signals are
+    drawn as the file declares. A simulation that fails is not satisfied. Exit code: 0 certified, 1 refuted, 4
+    undecided; with --verify 1 if something differs.
     """
     if verify is not None:
-        return _verified(verify, run, runs)
+        return _verified(verify, run, what, runs)
+    from stlc.assurance.campaign import Campaign
     from stlc.assurance.certificate import Claim
     from stlc.assurance.conformal import SAME, Shift
 
@@ -145,59 +192,120 @@ def certify(
     )
     if width is not None:
         checked_share("--width", width)
-    overrides = parse_overrides(set_)
-    order = _campaign(run or "latest", how, overrides, runs)
     fixed = None if seeds is None else parse_seeds(seeds)
-    order = replace(
-        order, claim=claim, require=tuple(require or ()), width=width, most=max_drives, seeds=fixed
-    )
-    path = out or order.run.dir.path / FILE
-    result = _driven(order, path)
-    shown = f"{order.run.dir.shown}/{FILE}" if out is None else str(out)
+    chosen = _Chosen(run, how, what, tuple(require or ()), parse_overrides(set_), runs)
+    subject, home, shown = chosen.subject()
+    order = Campaign(subject, claim, width, max_drives, fixed)
+    result = _observed(order, out or home)
+    name = shown if out is None else str(out)
 
     def show() -> None:
-        for line in _lines(result, shown):
+        for line in _lines(result, name):
             emit(line)
 
     return Answer(result, show, _exit_code(result))
 
 
-def _campaign(name: str, how: Driving, overrides: Mapping[str, str], runs: Path) -> Campaign:
-    """Deployment of the run called `name` below the folder `runs`; `overrides` are the values of `--set`."""
-    from stlc.assurance.certificate import Claim
-    from stlc.assurance.drives import Campaign
-    from stlc.controller.deployment.simulator import Setting
-    from stlc.controller.evaluation.rules import rules_of
-    from stlc.controller.guard.margins import parse_margins
-    from stlc.controller.training.run import Run
+@dataclass(frozen=True, slots=True)
+class _Chosen:
+    """What is to be certified, as given on the command line."""
 
-    modes = [mode for mode in GUARDS if mode == how.guard]
-    if not modes:
-        raise usage(f"there is no guard `{how.guard}`", "--guard none, paper or full")
-    opened = Run.open(name, root=runs, overrides=overrides, scenario=how.scenario)
-    test = opened.task.system.decl.test
-    setting = Setting((), how.agents or test.agents, how.steps or test.steps, test.replan)
-    if how.time_limit is not None:
-        seconds = parse_limit(how.time_limit)
-        setting = replace(setting, limit=seconds, paper_limit=seconds)
-    margin = parse_margins(how.margin or ()).of(opened.task, opened.policy, modes[0], test.replan)
-    setting = replace(setting, margin=margin)
-    return Campaign(opened, rules_of(opened), modes[0], setting, Claim(), overrides=overrides)
+    name: str | None
+    how: Driving
+    what: Drawing
+    require: tuple[str, ...]
+    overrides: Mapping[str, str]
+    runs: Path
+
+    def subject(self) -> tuple[Subject, Path, str]:
+        """Return the subject, the path of its certificate, and this path as it is shown.
+
+        Raises:
+            UsageError: U101, an option does not suit what is certified.
+        """
+        what = self.what
+        if what.plant is None and what.system is None:
+            if what.jobs != 1:
+                raise usage("`--jobs` is for plants", "stlc certify SPEC --plant FILE --jobs 2")
+            drives = self._policy()
+            return drives, drives.run.dir.path / FILE, f"{drives.run.dir.shown}/{FILE}"
+        require_drawn(self.name, self.how, what)
+        subject = self._plant() if what.plant is not None else self._system()
+        record = subject.record(())
+        parts = (file_part(str(record[key]), empty="certificate") for key in ("spec", "system"))
+        path = Path(DRAWN_FOLDER, f"{'-on-'.join(parts)}.json")
+        return subject, path, str(path)
+
+    def _policy(self) -> PolicyDrives:
+        """Drives of the policy of a run below the folder of runs."""
+        from stlc.assurance.drives import PolicyDrives
+        from stlc.controller.deployment.simulator import Setting
+        from stlc.controller.evaluation.rules import rules_of
+        from stlc.controller.guard.margins import parse_margins
+        from stlc.controller.training.run import Run
+
+        how = self.how
+        modes = [mode for mode in GUARDS if mode == how.guard]
+        if not modes:
+            raise usage(f"there is no guard `{how.guard}`", "--guard none, paper or full")
+        opened = Run.open(
+            self.name or "latest", root=self.runs, overrides=self.overrides, scenario=how.scenario
+        )
+        test = opened.task.system.decl.test
+        setting = Setting((), how.agents or test.agents, how.steps or test.steps, test.replan)
+        if how.time_limit is not None:
+            seconds = parse_limit(how.time_limit)
+            setting = replace(setting, limit=seconds, paper_limit=seconds)
+        margin = parse_margins(how.margin or ()).of(opened.task, opened.policy, modes[0], test.replan)
+        setting = replace(setting, margin=margin)
+        return PolicyDrives(opened, rules_of(opened), modes[0], setting, self.require, self.overrides)
+
+    def _plant(self) -> Subject:
+        from stlc.assurance.draws import PlantDraws
+        from stlc.plants.judge import PlantJudge
+
+        assert self.name is not None
+        assert self.what.plant is not None
+        judge = PlantJudge.load(self.name, self.what.plant, self.overrides)
+        show_diagnostics(judge.monitor.compiled.warnings)
+        return PlantDraws(judge, find_spec(self.name), self.require, self.overrides, self.what.jobs)
+
+    def _system(self) -> Subject:
+        from stlc.assurance.draws import ModelDraws
+        from stlc.assurance.model_simulator import ModelSimulator
+
+        assert self.name is not None
+        simulator = ModelSimulator.load(self.name, self.what.system, self.overrides)
+        return ModelDraws(simulator, find_spec(self.name), self.require, self.overrides)
 
 
-def _driven(order: Campaign, path: Path) -> Certificate:
-    """Deploy, write the certificate after each batch, and return the last one."""
-    from stlc.assurance.drives import campaign, certificate
+def require_drawn(name: str | None, how: Driving, what: Drawing) -> None:
+    """Raise UsageError (U101) if an option does not suit the certificate of a plant or system."""
+    option = "--plant" if what.plant is not None else "--system"
+    if what.plant is not None and what.system is not None:
+        raise usage("`--plant` and `--system` contradict each other")
+    if name is None:
+        raise usage(f"`{option}` needs a specification", f"stlc certify SPEC {option} FILE")
+    if what.plant is None and what.jobs != 1:
+        raise usage("`--jobs` is for plants", "stlc certify SPEC --plant FILE --jobs 2")
+    for each in fields(Driving):
+        if getattr(how, each.name) != each.default:
+            raise usage(f"`--{each.name.replace('_', '-')}` is for a policy, and `{option}` has none")
+
+
+def _observed(order: Campaign, path: Path) -> Certificate | DrawnCertificate:
+    """Observe, write the certificate after each batch, and return the last one."""
+    from stlc.assurance.campaign import campaign, certificate
     from stlc.jsontext import dumps
 
     document: Any = None
-    with PULSE.doing(f"driving, {order.guard}"):
+    with closing(order.subject), PULSE.doing(order.subject.doing):
         for progress in campaign(order):
             document = certificate(order, progress)
             write_atomic(path, dumps(document, indent=2) + "\n")
             if not progress.done:
                 say(_progress_text(progress))
-    made: Certificate = document
+    made: Certificate | DrawnCertificate = document
     return made
 
 
@@ -207,7 +315,7 @@ def _progress_text(progress: Progress) -> str:
     return f"{found.units:,} {progress.assessment.noun}s: share from {floored(low)} to {raised(high)}"
 
 
-def _exit_code(result: Certificate) -> int:
+def _exit_code(result: Certificate | DrawnCertificate) -> int:
     """0 certified or as narrow as asked, 1 refuted, 4 undecided or too wide."""
     codes = {"certified": 0, "refuted": 1, "undecided": 4, "measured": 0}
     low, high = result["overall"]["interval"]
@@ -215,10 +323,24 @@ def _exit_code(result: Certificate) -> int:
     return codes[result["answer"]] or (4 if wide else 0)
 
 
-def _lines(result: Certificate, path: str) -> Iterator[str]:
+def _lines(result: Certificate | DrawnCertificate, path: str) -> Iterator[str]:
+    yield visible(_title(result))
+    yield ""
+    yield from bounds_lines(result)
+    if "kind" in result:
+        yield from _finding_lines(result)
+    yield ""
+    yield f"  certificate  {visible(path)}"
+    yield f"  next         {shell(('stlc', 'certify', '--verify', operand(path)))}"
+
+
+def _title(result: Certificate | DrawnCertificate) -> str:
     from stlc.view.words import guard_words
 
-    conditions, overall = result["conditions"], result["overall"]
+    overall = result["overall"]
+    if "kind" in result:
+        return f"{result['spec']} on {result['system']} · {overall['drives']:,} simulations"
+    conditions = result["conditions"]
     scenario = [f"scenario {conditions['scenario']}"] if conditions["scenario"] else []
     agents, steps = conditions["agents"], conditions["steps"]
     per_seed = agents if result["unit"] == "world" else 1
@@ -226,49 +348,76 @@ def _lines(result: Certificate, path: str) -> Iterator[str]:
     if result["unit"] == "drive":
         size = f"{overall['drives']} drives x {steps} steps"
     title = guard_words(conditions["guard"]).title
-    yield visible(" · ".join((result["spec"], f"run {Path(result['run']).name}", title, *scenario, size)))
-    yield ""
-    yield from bounds_lines(result)
-    yield ""
-    yield f"  certificate  {visible(path)}"
-    yield f"  next         {shell(('stlc', 'certify', '--verify', operand(path)))}"
+    return " · ".join((result["spec"], f"run {Path(result['run']).name}", title, *scenario, size))
+
+
+def _finding_lines(result: DrawnCertificate) -> Iterator[str]:
+    findings = result["findings"]
+    shown = findings["first"][:MOST_SHOWN]
+    if not shown:
+        return
+    yield f"  {findings['count']:,} simulation{'s' * (findings['count'] > 1)} failed:"
+    yield from (f"    - {_finding_text(each)}" for each in shown)
+    if findings["count"] > len(shown):
+        yield f"    - and {findings['count'] - len(shown):,} more"
+    where = ("--plant", operand(result["system_file"]), "--seeds", str(shown[0]["seed"]))
+    yield f"  again        {shell(('stlc', 'simulate', operand(result['spec_file']), *where))}"
+
+
+def _finding_text(each: CertifiedFinding) -> str:
+    at = "" if each["time"] is None else f" at t = {each['time']:.10g} s"
+    return f"seed {each['seed']}: {each['reason']}{at}: {visible(each['message'])}"
 
 
 # ------------------------------------------------------------------------- verification
 
 
-def _verified(path: Path, run: str | None, runs: Path) -> Answer[Certificate | CertificateCheck]:
-    """Compare the certificate in a file with the run that it names, or with `run`."""
-    from stlc.assurance.drives import verify
+def _verified(path: Path, name: str | None, what: Drawing, runs: Path) -> Answer[CertifyResult]:
+    """Compare the certificate in a file with what it names, or with what is given instead."""
     from stlc.jsontext import plain
-    from stlc.rundir import RunDir
 
     document = _read(path)
     try:
-        folder = RunDir.open(run or str(document["run"]), runs)
-        found = verify(document, folder)
+        shown, found = _compared(document, name, what, runs)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, ArithmeticError) as error:
         raise _damaged(path, str(error) or type(error).__name__) from error
-    fields: Any = plain(found)
-    made: Any = {"file": str(path), "run": folder.shown, "same": found.same, **fields}
+    fields_: Any = plain(found)
+    made: Any = {"file": str(path), "run": shown, "same": found.same, **fields_}
     result: CertificateCheck = made
+    noun = str(document.get("kind", "run"))
 
     def show() -> None:
-        for line in _compared(result, str(document.get("made", ""))):
+        for line in _compared_lines(result, str(document.get("made", "")), noun):
             emit(line)
 
     return Answer(result, show, int(not found.same))
 
 
-def _compared(result: CertificateCheck, made: str) -> Iterator[str]:
+def _compared(
+    document: Mapping[str, Any], name: str | None, what: Drawing, runs: Path
+) -> tuple[str, Verification]:
+    """Return what a certificate is compared with, as it is shown, and the comparison."""
+    if "kind" in document:
+        from stlc.assurance.draws import verify_draws
+
+        given = str(what.plant) if what.plant is not None else what.system
+        return given or str(document["system_file"]), verify_draws(document, name, given)
+    from stlc.assurance.drives import verify
+    from stlc.rundir import RunDir
+
+    folder = RunDir.open(name or str(document["run"]), runs)
+    return folder.shown, verify(document, folder)
+
+
+def _compared_lines(result: CertificateCheck, made: str, noun: str) -> Iterator[str]:
     for each in result["inputs"]:
         yield f"  {_difference(each)}"
     for name in result["numbers"]:
         yield f"  {visible(name)} does not follow from the counts"
     for each in result["software"]:
         yield f"  {_difference(each)} (software, only a remark)"
-    changed = "is not about this run as it is now" if result["inputs"] else "has been changed"
-    told = "is about this run" if result["same"] else changed
+    changed = f"is not about this {noun} as it is now" if result["inputs"] else "has been changed"
+    told = f"is about this {noun}" if result["same"] else changed
     yield f"the certificate of {visible(made)} {told}: {visible(result['run'])}"
 
 

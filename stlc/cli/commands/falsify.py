@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import json as json_text
+import math
 import shlex
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from stlc.cli.framework.assured import FalsifiedRequirement, FalsifiedSystem, ReplayedCounterexample
+from stlc.cli.falsify import findings
+from stlc.cli.framework.assured import (
+    FalsifiedRequirement,
+    FalsifiedSystem,
+    FalsifyResult,
+    ReplayedCounterexample,
+)
 from stlc.cli.framework.options import (
     ClusterOption,
     RequireOption,
@@ -25,7 +33,6 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, MissingError, UsageError, usage
-from stlc.escape import visible
 from stlc.registry import closest
 
 if TYPE_CHECKING:
@@ -95,17 +102,18 @@ def falsify(
     ] = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
-) -> Answer[FalsifiedSystem | ReplayedCounterexample]:
+) -> Answer[FalsifyResult]:
     """Search for simulations that violate requirements.
 
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
     the random numbers of the world in which its policy drives. Inputs that are constant at the ends of their
     ranges come first, and inputs of few pieces. Then random points, hill climbing, CMA-ES (if the package
     `cma` is installed), gradients and periodic inputs take turns. A violation counts only if it remains at
-    half the time step. It is written as a trace, in a simpler form where one violates the requirement too,
-    with a file for --replay. If nothing is found, that is no proof. The same --seed and --batch give the same
-    simulations, whatever processes there are. Exit code: 1 if a requirement is violated; else 5 if
-    simulations were lost with their processes, three times each; else 0.
+    half the time step. It is written as a trace, simplified as far as it still violates the requirement, with
+    a file for --replay. If nothing is found, that is no proof. The same --seed and --batch give the same
+    simulations, whatever processes there are. Of a plant, simulations that fail are written, too. Exit code:
+    1 if a requirement is violated or a simulation fails; else 5 if simulations were lost with their
+    processes, three times each; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 
@@ -126,25 +134,27 @@ def falsify(
             with PULSE.doing(f"searching for a violation of {simulator.requirements[index]}"):
                 result = next(results)
             found.append(_written(made, simulator, result, output))
+    failed = [*getattr(simulator, "findings", ()), *(() if workers is None else workers.findings)]
     document: FalsifiedSystem = {
         "target": target,
         "simulations": simulations,
         "seed": seed,
         "coordinates": simulator.space.dim,
-        "failures": _failures(simulator, workers),
+        "failures": list(dict.fromkeys(f"{each.finding.reason}: {each.finding.message}" for each in failed)),
+        "findings": findings.written(failed, output, made.settings(), partial(_command, made)),
         "requirements": found,
         "lost": 0 if workers is None else workers.lost,
     }
-    findings = () if workers is None or not workers.lost else (_lost(workers),)
-    code = MissingError.exit_code if findings else 0
+    lost = () if workers is None or not workers.lost else (_lost(workers),)
+    code = MissingError.exit_code if lost else 0
     if document["failures"] or any(each["verdict"] == "violated" for each in found):
         code = 1
 
     def show() -> None:
-        show_diagnostics(findings)
+        show_diagnostics(lost)
         emit("\n".join(_lines(document)))
 
-    return Answer(document, show, code, findings)
+    return Answer(document, show, code, lost)
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,14 +266,19 @@ class _Source:
         return SimulatorWorkers(sent, calls, sent.files())
 
     def files(self) -> CallFiles:
-        """Files that loading the simulator reads. A black box's own files are not among them."""
+        """Files that the simulator reads, those of a black box among them."""
         from stlc.controller.parallel.bundle import input_files
         from stlc.controller.parallel.workers import CallFiles
 
         target = self.target
         if not target.model:
             return CallFiles((Path(target.name),))
-        plant = () if target.plant is None else (target.plant,)
+        plant: tuple[Path, ...] = ()
+        if target.plant is not None:
+            from stlc.plants.declaration import load_plant_decl
+
+            named = (target.plant.parent / name for name in load_plant_decl(target.plant).files)
+            plant = (target.plant, *(path for path in named if path.is_file()))
         return CallFiles((*input_files(Path(target.name), target.system, self.overrides), *plant))
 
 
@@ -294,12 +309,6 @@ def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:
             advice = f"did you mean `{near}`?" if near else f"requirements: {', '.join(names)}"
             raise usage(f"there is no requirement `{each}`", advice)
     return [index for index, name in enumerate(names) if not require or name in require]
-
-
-def _failures(simulator: _Simulator, workers: SimulatorWorkers | None) -> list[str]:
-    """Reasons of the failed simulations of a black box, each once."""
-    found = [*getattr(simulator, "findings", ()), *(() if workers is None else workers.findings)]
-    return list(dict.fromkeys(f"{each.reason}: {each.message}" for each in found))
 
 
 # ------------------------------------------------------------------------ counterexamples
@@ -365,9 +374,7 @@ def _command(target: _Target, path: Path) -> str:
     return shlex.join([*words, "--replay", str(path)])
 
 
-def _replayed(
-    target: _Target, path: Path, overrides: Mapping[str, str], runs: Path
-) -> Answer[FalsifiedSystem | ReplayedCounterexample]:
+def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: Path) -> Answer[FalsifyResult]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
     from stlc.assurance.simulation import Focus
     from stlc.trace import load_trace
@@ -381,9 +388,15 @@ def _replayed(
         _optional(given.get("seed")) or 0,
     )
     simulator = again.simulator(overrides, runs)
+    if stored["format"] == findings.FORMAT:
+        point = _point(stored, simulator.space.dim, path)
+        return findings.replayed(_plant_of(simulator, path), point, stored)
     index = _wanted(simulator.requirements, [stored["requirement"]])[0]
     point = _point(stored, simulator.space.dim, path)
     margin = float(simulator.simulate(point[None], Focus(index)).margins[0])
+    if getattr(simulator, "findings", ()):
+        before = {"reason": f"a violation of {stored['requirement']}"}
+        return findings.replayed(_plant_of(simulator, path), point, before)
     different = _different(
         load_trace(path.parent / Path(str(stored["trace"])).name), simulator.trace(point[None])
     )
@@ -401,6 +414,17 @@ def _replayed(
         emit(f"{document['requirement']}: {verdict}, robustness {margin:.6g}; {same}")
 
     return Answer(document, show, int(margin < 0.0))
+
+
+def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:
+    """The simulator of the plant whose failure the file `path` holds. Raises UsageError (U101) for others."""
+    from stlc.assurance.plant_simulator import PlantSimulator
+
+    if not isinstance(simulator, PlantSimulator):
+        raise usage(
+            f"`{path}` is a failed simulation of a plant", "stlc falsify SPEC --plant FILE --replay FILE"
+        )
+    return simulator
 
 
 def _optional(value: object) -> int | None:
@@ -426,8 +450,11 @@ def _stored(path: Path) -> dict[str, Any]:
         "settings": dict,
         "point": list,
     }
-    whole = isinstance(found, dict) and found.get("format") == FORMAT
-    if not whole or not all(isinstance(found.get(key), kind) for key, kind in keys.items()):
+    kind = found.get("format") if isinstance(found, dict) else None
+    keys = dict(findings.KEYS) if kind == findings.FORMAT else keys
+    if kind not in (FORMAT, findings.FORMAT) or not all(
+        isinstance(found.get(key), kind) for key, kind in keys.items()
+    ):
         raise usage(f"`{path}` is not a counterexample", "a file that `stlc falsify` wrote")
     return dict(found)
 
@@ -470,7 +497,7 @@ def _lines(document: FalsifiedSystem) -> list[str]:
     lines = []
     for each in document["requirements"]:
         lines.extend(_of_requirement(each))
-    return [*lines, *(f"the plant failed: {visible(each)}" for each in document["failures"])]
+    return [*lines, *findings.lines(document["findings"])]
 
 
 def _of_requirement(each: FalsifiedRequirement) -> list[str]:
@@ -480,12 +507,14 @@ def _of_requirement(each: FalsifiedRequirement) -> list[str]:
     lost = len(each["spurious"])
     spurious = f"; {lost} violations vanish at half the time step" if lost else ""
     if found is None:
+        least = float(each["least"])
+        told = f"least robustness {least:.4g}" if least < math.inf else "and no trace"
         return [
-            f"{name}: no violation in {each['simulations']:,} simulations, least robustness "
-            f"{float(each['least']):.4g}{spurious}",
+            f"{name}: no violation in {each['simulations']:,} simulations, {told}{spurious}",
             f"  pairwise coverage of the search space {share(each['coverage'])}; this is no proof",
         ]
     half = "" if found["half_step"] is None else f", {float(found['half_step']):.4g} at half the time step"
+    half = half.replace("nan at", "but no trace at")
     lines = [
         f"{name}: violated, robustness {float(found['margin']):.4g}{half}; simulation "
         f"{found['simulation']:,}, {found['strategy']}{spurious}"

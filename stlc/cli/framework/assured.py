@@ -1,6 +1,6 @@
 """Records of statistical bounds, certificates and counterexamples, as `--json` prints them."""
 
-from typing import Annotated, Any, Literal, TypeAlias, TypedDict
+from typing import Annotated, Any, Literal, TypeAlias, TypedDict, final
 
 Num: TypeAlias = float | str
 Count = Annotated[int, 0]
@@ -65,7 +65,7 @@ class Assurance(TypedDict):
     confidence: float
     shift: str | None
     sequential: bool
-    unit: Literal["world", "drive", "trace"]
+    unit: Literal["world", "drive", "trace", "simulation"]
     calibration: Count
     needed: NeededUnits
     overall: ShareStatement
@@ -102,6 +102,7 @@ class CertifiedConditions(TypedDict):
     seeds: list[list[int]]
 
 
+@final
 class Certificate(Assurance):
     """Content of a certificate file."""
 
@@ -119,6 +120,55 @@ class Certificate(Assurance):
     hardware: dict[str, Any]
 
 
+class DrawnConditions(TypedDict):
+    """Options of the simulations of a plant or system; seeds are ranges [first, last]."""
+
+    overrides: dict[str, str]
+    require: list[str]
+    seeds: list[list[int]]
+
+
+class CertifiedFinding(TypedDict):
+    """Simulation of a plant that failed; see `stlc.plants.plant.PlantFinding`."""
+
+    seed: int
+    reason: str
+    message: str
+    time: float | None
+    point: dict[str, float]
+
+
+class CertifiedFindings(TypedDict):
+    """Number of failed simulations, and the first of them."""
+
+    count: Count
+    first: list[CertifiedFinding]
+
+
+@final
+class DrawnCertificate(Assurance):
+    """Content of the certificate file of a plant, or of a system without controls.
+
+    The inputs are hashes: of the specification, of the plant or system file, and of the files that it names.
+    """
+
+    certificate: str
+    made: str
+    kind: Literal["plant", "system"]
+    spec: str
+    spec_file: str
+    system: str
+    system_file: str
+    width: float | None
+    finished: bool
+    batches: Count
+    inputs: dict[str, str]
+    conditions: DrawnConditions
+    findings: CertifiedFindings
+    versions: dict[str, str]
+    hardware: dict[str, Any]
+
+
 class DifferentEntry(TypedDict):
     """Entry of a certificate that differs now."""
 
@@ -128,7 +178,7 @@ class DifferentEntry(TypedDict):
 
 
 class CertificateCheck(TypedDict):
-    """Comparison of a certificate with a run."""
+    """Comparison of a certificate with a run, or with a plant or system, whose file is then `run`."""
 
     file: str
     run: str
@@ -136,6 +186,10 @@ class CertificateCheck(TypedDict):
     inputs: list[DifferentEntry]
     numbers: list[str]
     software: list[DifferentEntry]
+
+
+CertifyResult: TypeAlias = Certificate | DrawnCertificate | CertificateCheck
+"""Result of `stlc certify`."""
 
 
 class Violation(TypedDict):
@@ -165,14 +219,28 @@ class FalsifiedRequirement(TypedDict):
     replay: str | None
 
 
+class FalsifiedFinding(TypedDict):
+    """Failed simulations of a plant of one kind: how many, and the first of them."""
+
+    reason: str
+    message: str
+    time: float | None
+    stderr: str
+    simulations: int
+    point: dict[str, float]
+    file: str
+    replay: str
+
+
 class FalsifiedSystem(TypedDict):
-    """Searches for violations of the requirements of a system or run."""
+    """Searches for violations of the requirements of a system or run; failures are those of a plant."""
 
     target: str
     simulations: int
     seed: int
     coordinates: int
     failures: list[str]
+    findings: list[FalsifiedFinding]
     lost: int
     requirements: list[FalsifiedRequirement]
 
@@ -185,6 +253,20 @@ class ReplayedCounterexample(TypedDict):
     stored_margin: Num
     identical: bool
     different: list[str]
+
+
+class ReplayedFinding(TypedDict):
+    """Failed simulation of a plant that was simulated again; without a reason if it gives a trace now."""
+
+    reason: str | None
+    message: str | None
+    time: float | None
+    stored_reason: str
+    identical: bool
+
+
+FalsifyResult: TypeAlias = FalsifiedSystem | ReplayedCounterexample | ReplayedFinding
+"""Result of `stlc falsify`."""
 
 
 class UncertainSignal(TypedDict):

@@ -22,10 +22,8 @@ from typing import (
 
 from stlc.cli.framework.assured import (
     Assurance,
-    Certificate,
-    CertificateCheck,
-    FalsifiedSystem,
-    ReplayedCounterexample,
+    CertifyResult,
+    FalsifyResult,
     UncertainSignal,
     Verified,
 )
@@ -723,13 +721,13 @@ CompileResult: TypeAlias = CompiledSpec | ParsedFile | ParsedFiles
 ExplainResult: TypeAlias = CodeList | ManualPage | SpecInWords | Explanation | Guarantee
 
 RESULTS: dict[str, Any] = {
-    "certify": Certificate | CertificateCheck,
+    "certify": CertifyResult,
     "check": CheckResult,
     "compile": CompileResult,
     "doctor": InstallationReport,
     "explain": ExplainResult,
     "export": ExportedRun,
-    "falsify": FalsifiedSystem | ReplayedCounterexample,
+    "falsify": FalsifyResult,
     "fmt": FormattedFiles,
     "init": CreatedFiles,
     "lint": LintedFiles,

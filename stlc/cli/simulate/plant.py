@@ -26,14 +26,14 @@ from stlc.registry import did_you_mean
 from stlc.units import parse_unit
 
 if TYPE_CHECKING:
-    from stlc.compile.pipeline import CompiledRequirement
     from stlc.monitor.judgement import Status
     from stlc.monitor.verdict import Monitor
-    from stlc.plants.plant import Plant, PlantFinding, PlantRun, PlantVariable
+    from stlc.plants.judge import JudgedRun
+    from stlc.plants.plant import Plant, PlantVariable
     from stlc.trace import Trace
 
-STREAMED = 1_000_000
-"""Steps from which simulations are judged while they run, in constant memory."""
+CARRYING = (".npz", ".mcap")
+"""Suffixes of recorded traces that carry their specification."""
 MOST_SHOWN = 5
 """Findings that are printed in full."""
 _VALUE = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>\D.*)?")
@@ -66,51 +66,6 @@ class PlantOrder:
     fail_under: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """Result of one requirement on one simulation.
-
-    Attributes:
-        rule: the requirement.
-        status: its verdict.
-        low: least robustness over all continuations.
-        high: greatest robustness over all continuations.
-        robustness: the robustness; NaN if it is not known.
-    """
-
-    rule: CompiledRequirement
-    status: Status
-    low: float
-    high: float
-    robustness: float
-
-    @property
-    def share(self) -> float:
-        """Robustness in units of the requirement's scale, by which requirements are compared."""
-        return self.low * self.rule.weight / self.rule.scale
-
-
-@dataclass(frozen=True, slots=True)
-class JudgedRun:
-    """One judged simulation.
-
-    Attributes:
-        seed: seed of the simulation.
-        point: value of each variable.
-        samples: number of samples; 0 for a finding.
-        status: verdict over all requirements; None for a finding.
-        requirements: results of the requirements.
-        finding: why there is no trace, or None.
-    """
-
-    seed: int
-    point: Mapping[str, float]
-    samples: int
-    status: Status | None
-    requirements: tuple[Judged, ...] = ()
-    finding: PlantFinding | None = None
-
-
 def simulate_plant(order: PlantOrder) -> Answer[PlantSimulation]:
     """Simulate a plant at one point or at random ones, and judge each trace.
 
@@ -118,50 +73,31 @@ def simulate_plant(order: PlantOrder) -> Answer[PlantSimulation]:
         StlcError: the plant file, the specification or an option is invalid, or the two files do not fit
             together.
     """
-    from stlc.files import find_spec, read_source
-    from stlc.grammar.parse.parser import parse
-    from stlc.monitor.verdict import Monitor
-    from stlc.plants.plant import load_plant
-    from stlc.trace import check_writable
+    from stlc.plants.judge import PlantJudge
+    from stlc.trace import check_writable, save_trace
 
     if order.record is not None:
         check_writable(order.record)
-    with load_plant(order.plant) as plant:
-        monitor = Monitor(
-            parse(read_source(find_spec(order.spec))), dt=plant.decl.dt, overrides=order.overrides
-        )
-        show_diagnostics(monitor.compiled.warnings)
-        _require_signals(monitor, plant)
+    judge = PlantJudge.load(order.spec, order.plant, order.overrides)
+    plant, monitor = judge.plant, judge.monitor
+    show_diagnostics(monitor.compiled.warnings)
+    with plant:
         points, seeds = _points(plant, order)
-        stream = order.stream or plant.decl.steps >= STREAMED
+        stream = order.stream or judge.long
         if stream and order.record is not None:
             raise usage("`--record` needs whole traces, and long simulations are judged while they run")
-        runner = _streamed if stream else _simulated
+        runs: list[JudgedRun] = []
+        traces: list[Trace] = []
         with PULSE.doing(f"simulating {plant.decl.name}"):
-            traces: list[Trace] = []
-            runs = list(runner(plant, monitor, points, seeds, order, traces))
+            for run in judge.runs(points, seeds, jobs=order.jobs, stream=stream):
+                if order.record is not None and run.trace is not None:
+                    traces.append(run.trace)
+                runs.append(replace(run, trace=None))
+                PULSE.now(f"simulating {plant.decl.name}, {len(runs)} of {len(points)}")
     if order.record is not None and traces:
-        _save(order.record, traces, monitor)
+        save_trace(order.record, judge.stored(traces))
     document = _document(plant, monitor, runs, order, stream=stream)
     return Answer(document, lambda: _show(plant, monitor, runs, order), _code(runs, order.fail_under))
-
-
-def _require_signals(monitor: Monitor, plant: Plant) -> None:
-    """Check, before any simulation, that the traces have the signals that the requirements read.
-
-    Raises TraceError (E601, E605).
-    """
-    from stlc.monitor.signals import arrange, needs_of
-    from stlc.trace import Trace
-
-    compiled, signature = monitor.compiled, plant.signature
-    sample = Trace(
-        signature,
-        float(plant.decl.dt),
-        {name: np.zeros((1, 1)) for name in signature.names},
-        name=plant.decl.name,
-    )
-    arrange(sample, needs_of(compiled, [*compiled.requirements, *compiled.assumptions]), plain=True)
 
 
 # ---------------------------------------------------------------------------------- points
@@ -218,107 +154,6 @@ def _value(variable: PlantVariable, part: str, text: str) -> float:
         span = in_unit(f"[{variable.low:g}, {variable.high:g}]", variable.unit.text)
         raise usage(f"`{part}` is outside the range of `{variable.name}`, {span}")
     return found
-
-
-# ----------------------------------------------------------------------------- simulations
-
-
-def _simulated(
-    plant: Plant,
-    monitor: Monitor,
-    points: np.ndarray,
-    seeds: Sequence[int],
-    order: PlantOrder,
-    traces: list[Trace],
-) -> Iterator[JudgedRun]:
-    """Simulate and judge in batches, one simulation per process; keep the traces to be recorded."""
-    for first in range(0, len(points), order.jobs):
-        PULSE.now(f"simulating {plant.decl.name}, {first} of {len(points)}")
-        chosen = range(first, min(first + order.jobs, len(points)))
-        for run in plant.simulate(points[chosen], seeds=[seeds[row] for row in chosen], jobs=order.jobs):
-            yield _judged(plant, monitor, run)
-            if order.record is not None and not _failed(run):
-                traces.append(run.outcome)  # type: ignore[arg-type]
-
-
-def _failed(run: PlantRun) -> bool:
-    from stlc.plants.plant import PlantFinding
-
-    return isinstance(run.outcome, PlantFinding)
-
-
-def _judged(plant: Plant, monitor: Monitor, run: PlantRun) -> JudgedRun:
-    from stlc.plants.plant import PlantFinding
-
-    point = _named(plant, run.point)
-    if isinstance(run.outcome, PlantFinding):
-        return JudgedRun(run.seed, point, 0, None, finding=run.outcome)
-    verdict = monitor.check(run.outcome)
-    rows = []
-    for each in verdict:
-        low, high = (float(end.min()) for end in each.margins)
-        rows.append(Judged(each.rule, each.statuses[0], low, high, float(each.least[0])))
-    return JudgedRun(run.seed, point, run.outcome.samples, verdict.statuses[0], tuple(rows))
-
-
-def _streamed(
-    plant: Plant,
-    monitor: Monitor,
-    points: np.ndarray,
-    seeds: Sequence[int],
-    order: PlantOrder,  # noqa: ARG001
-    traces: list[Trace],  # noqa: ARG001
-) -> Iterator[JudgedRun]:
-    """Simulate one after the other, and judge while a simulation runs; nothing of a trace is kept."""
-    for index, (point, seed) in enumerate(zip(points, seeds, strict=True)):
-        PULSE.now(f"simulating {plant.decl.name}, {index} of {len(points)}")
-        online = monitor.online(dt=plant.decl.dt)
-        finding = plant.watch(point, online, seed=seed)
-        named = _named(plant, point)
-        if finding is not None:
-            yield JudgedRun(seed, named, 0, None, finding=finding)
-            continue
-        rows = [
-            Judged(online.rule(name), tally.status, tally.low, tally.high, tally.robustness)
-            for name, tally in online.finish().items()
-        ]
-        found = {each.status for each in rows}
-        status: Status = "violated" if "violated" in found else "inconclusive"
-        status = "satisfied" if found == {"satisfied"} else status
-        if online.in_scope is False:
-            status, rows = "out of scope", [replace(each, status="out of scope") for each in rows]
-        yield JudgedRun(seed, named, online.samples, status, tuple(rows))
-
-
-def _named(plant: Plant, point: np.ndarray) -> dict[str, float]:
-    return {each.name: float(value) for each, value in zip(plant.variables, point, strict=True)}
-
-
-def _save(path: Path, traces: Sequence[Trace], monitor: Monitor) -> None:
-    """Write the traces to one file, with the specification; shorter ones end in unknown samples (NaN)."""
-    from stlc.compile.frontend.modules import library_of, spec_sha256
-    from stlc.trace import save_trace
-    from stlc.version import __version__
-
-    longest = max(trace.samples for trace in traces)
-    data = {}
-    for name in traces[0].signature.names:
-        data[name] = np.full((len(traces), longest), np.nan)
-        for row, trace in enumerate(traces):
-            data[name][row, : trace.samples] = trace.data[name][0]
-    spec = monitor.spec
-    library = library_of(spec)
-    meta = replace(
-        traces[0].meta,
-        spec_name=monitor.compiled.name,
-        spec_path=spec.source.name,
-        spec_text=spec.source.text,
-        spec_library=library,
-        spec_hash=spec_sha256(spec.source.text, library),
-        seed=None,
-        stlc_version=__version__,
-    )
-    save_trace(path, replace(traces[0], data=data, meta=meta))
 
 
 # --------------------------------------------------------------------------------- results
@@ -402,7 +237,15 @@ def _show(plant: Plant, monitor: Monitor, runs: Sequence[JudgedRun], order: Plan
     emit(_summary(runs))
     if order.record is not None:
         say(f"the traces are in {order.record}")
-        emit(f"next: {shell(('stlc', 'check', operand(str(order.record))))}")
+        emit(f"next: {shell(('stlc', 'check', *_judging(order), operand(str(order.record))))}")
+
+
+def _judging(order: PlantOrder) -> tuple[str, ...]:
+    """Words that name the specification for `stlc check`; none if the file of `--record` carries it."""
+    if order.record is not None and order.record.suffix in CARRYING:
+        return ()
+    changed = (word for name, value in order.overrides.items() for word in ("--set", f"{name}={value}"))
+    return (*changed, operand(order.spec))
 
 
 def _rows(plant: Plant, runs: Sequence[JudgedRun]) -> Iterator[tuple[str, ...]]:

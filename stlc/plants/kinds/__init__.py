@@ -77,6 +77,7 @@ class Layout:
         dt: time step in seconds.
         duration: length of a simulation in seconds.
         memory: most bytes of address space.
+        halves: whether the plant must accept another time step than that of its file.
         initial: start values.
         param: parameters.
         inputs: input signals; those that the controller writes come last.
@@ -91,6 +92,7 @@ class Layout:
     dt: float
     duration: float
     memory: int
+    halves: bool
     initial: tuple[Port, ...]
     param: tuple[Port, ...]
     inputs: tuple[Port, ...]
@@ -159,12 +161,21 @@ class PlantKind:
             layout names.
         sources: function that returns the name in the plant of the i-th port of a section, if the plant file
             does not give it. By default, it is the name of the port.
+        files: function of the options and the folder of the plant file that returns the files of which the
+            plant consists, by name. It runs nothing.
+        packages: packages that simulate plants of this kind.
+        own_step: whether the plant itself fixes the time step.
     """
 
     record: type
     main: str
     open: Callable[[Layout], BlackBox]
     sources: Callable[[str, int, str], str] = field(default=lambda _section, _index, name: name)
+    files: Callable[[Mapping[str, Any], Path], Mapping[str, Path]] = field(
+        default=lambda _options, _folder: {}
+    )
+    packages: tuple[str, ...] = ()
+    own_step: bool = False
 
 
 class UnfitError(Exception):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, final
 
 from stlc.dynamics.schema.record import TEXT, key, number, word
@@ -37,6 +38,8 @@ def open_fmu(layout: Layout) -> Fmu:
     """Unpack the FMU and load its library. Raises UnfitError if it cannot be used."""
     try:
         import fmpy
+        import fmpy.simulation
+        import fmpy.sundials  # now, so that the time limit of the first simulation does not count it
     except ImportError:
         raise AbsentError("fmpy", "fmu") from None
     path = layout.path(str(layout.options["file"]))
@@ -312,4 +315,9 @@ class _Integrator:
         return bool(ends)
 
 
-KIND = PlantKind(FmuKeys, "file", open_fmu)
+def _files(options: Mapping[str, Any], folder: Path) -> dict[str, Path]:
+    name = str(options["file"])
+    return {name: folder / name}
+
+
+KIND = PlantKind(FmuKeys, "file", open_fmu, files=_files, packages=("fmpy",))

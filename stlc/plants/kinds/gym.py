@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -162,4 +163,11 @@ def _source(section: str, index: int, name: str) -> str:
     return _FIRST[section].format(index) if section in _FIRST else name
 
 
-KIND = PlantKind(GymKeys, "id", open_gym, _source)
+def _files(options: Mapping[str, Any], folder: Path) -> dict[str, Path]:
+    """Return the file of the module that registers the environment, if it is beside the plant file."""
+    module, colon, _ = str(options["id"]).partition(":")
+    path = folder / f"{module}.py"
+    return {path.name: path} if colon and path.is_file() else {}
+
+
+KIND = PlantKind(GymKeys, "id", open_gym, _source, files=_files, packages=("gymnasium",), own_step=True)

@@ -11,13 +11,15 @@ those of the section `initial`. A function with a fourth argument gets the param
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
 import inspect
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any, final
@@ -128,6 +130,8 @@ class PythonObject:
         self.ended = False
         self._make, self._layout = make, layout
         self._options = {"dt": layout.dt} if "dt" in _parameters(make) else {}
+        if layout.halves and not self._options:
+            raise UnfitError("the constructor has no argument `dt`, so its time step is fixed", "time.halves")
         self._object: Any = None
 
     def start(self, initial: Floats, param: Floats, inputs: Floats, seed: int) -> Floats:  # noqa: ARG002
@@ -237,4 +241,71 @@ class PythonFunction:
         return advance
 
 
-KIND = PlantKind(PythonKeys, "target", open_python)
+# ------------------------------------------------------------------------------------ files
+
+
+def _files(options: Mapping[str, Any], folder: Path) -> dict[str, Path]:
+    """Return the file of the target, and the modules in the folder of the plant file that it imports.
+
+    Imports are read from the text: nothing is imported. A target in another place is its file alone.
+    """
+    match = TARGET.fullmatch(str(options["target"]))
+    if match is None:
+        return {}
+    named = match["module"]
+    first = folder / named if named.endswith(".py") else _located(named, folder)
+    found: dict[str, Path] = {} if first is None else {_shown(first, folder, named): first}
+    waiting = list(found.values()) if first is not None and first.is_relative_to(folder) else []
+    while waiting:
+        for name in _imports(waiting.pop(), folder):
+            path = _beside(name, folder)
+            if path is not None and path not in found.values():
+                found[_shown(path, folder, name)] = path
+                waiting.append(path)
+    return found
+
+
+def _shown(path: Path, folder: Path, otherwise: str) -> str:
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else otherwise
+
+
+def _beside(module: str, folder: Path) -> Path | None:
+    """Return the file of a module in a folder; None if there is none."""
+    base = folder.joinpath(*module.split("."))
+    return next((each for each in (base.with_suffix(".py"), base / "__init__.py") if each.is_file()), None)
+
+
+def _located(module: str, folder: Path) -> Path | None:
+    """Return the file of a module that is not imported: in a folder, or where Python would find it."""
+    places: Sequence[str] | None = [str(folder), *sys.path]
+    found = None
+    parts = module.split(".")
+    for count in range(1, len(parts) + 1):
+        found = PathFinder.find_spec(".".join(parts[:count]), places)
+        if found is None:
+            return None
+        places = found.submodule_search_locations
+    return None if found is None or not found.has_location or found.origin is None else Path(found.origin)
+
+
+def _imports(path: Path, folder: Path) -> Iterator[str]:
+    """Yield the names of modules that a Python file below `folder` may import; of `a.b` also `a`."""
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (OSError, SyntaxError, ValueError, RecursionError):
+        return
+    for node in ast.walk(tree):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [each.name for each in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            package = path.relative_to(folder).parent.parts
+            above = package[: max(len(package) - node.level + 1, 0)] if node.level else ()
+            base = (*above, *filter(None, [node.module]))
+            names = [".".join(base), *(".".join((*base, each.name)) for each in node.names)]
+        for name in names:
+            parts = name.split(".") if name else []
+            yield from (".".join(parts[:count]) for count in range(1, len(parts) + 1))
+
+
+KIND = PlantKind(PythonKeys, "target", open_python, files=_files, packages=("scipy",))

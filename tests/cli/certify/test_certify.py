@@ -15,7 +15,7 @@ import pytest
 from helpers.documents import misfits
 
 from stlc.assurance.bounds import Tally, betting_lower, clopper_pearson_lower
-from stlc.assurance.drives import BATCH, FIRST, SEED
+from stlc.assurance.campaign import BATCH, FIRST, SEED
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.rundir import RunDir

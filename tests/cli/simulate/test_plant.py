@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from helpers.documents import misfits
 
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
-from stlc.cli.simulate import plant as module
+from stlc.plants import judge as module
 from stlc.trace import load_trace
 
 CODE = """
@@ -105,6 +106,49 @@ def test_points_are_drawn_by_seed_and_recorded(capsys):
     assert len(np.unique(trace.data["leak"][:, 0])) == 4
     assert main(["check", "trace.npz"]) == 0
     assert "4 of 4 traces satisfy every requirement" in capsys.readouterr().out
+
+
+CENTIMETRES = """\
+spec drier
+signal level: real [cm]
+signal inflow: real [mm/s]
+param leak: real [Hz] in [0, 5]
+const most = 150 cm
+require calm: always[0 s, 2 s] level <= most
+require small: always[0 s, 2 s] inflow <= 500 mm/s
+require tight: leak <= 0.9 Hz
+"""
+
+
+def test_recorded_traces_are_checked_and_plotted(home, capsys):
+    """Traces of a plant carry specification, constants and units, and are judged as the plant was."""
+    (home / "drier.stl").write_text(CENTIMETRES)
+    options = ["--plant", "tank.yaml", "--seeds", "0..5", "--set", "most=1.2 m", "--record", "trace.npz"]
+    assert main(["simulate", "drier.stl", *options, "--json"]) == 1
+    runs = json.loads(capsys.readouterr().out)["result"]["runs"]
+    found = [run for run in runs if run["verdict"] != "finding"]
+    assert len(found) > 0
+    assert main(["check", "trace.npz", "--json"]) == 1
+    checked = json.loads(capsys.readouterr().out)["result"]
+    assert (checked["traces"], checked["verdict"]) == (len(found), "violated")
+    assert checked["satisfied_traces"] == [run["verdict"] for run in found].count("satisfied")
+    trace = load_trace("trace.npz")
+    assert trace.meta.spec_set == {"most": "1.2 m"}
+    assert [column.unit.text for column in trace.signature.columns] == ["m", "m/s", "Hz"]
+    for row, run in enumerate(found):
+        calm = next(each for each in run["requirements"] if each["name"] == "calm")
+        wanted = 100 * (1.2 - trace.data["level"][row].max())
+        assert (calm["robustness"], calm["unit"]) == (pytest.approx(wanted), "cm")
+    assert main(["check", "drier.stl", "trace.npz", "--certify", ".5", "--json"]) in (0, 1, 4)
+    assert json.loads(capsys.readouterr().out)["result"]["assurance"]["overall"]["units"] == len(found)
+    assert main(["plot", "trace.npz", "--output", "levels.svg"]) == 0
+    assert "level" in (home / "levels.svg").read_text()
+    assert main(["simulate", "drier.stl", *options[:-1], "trace.csv"]) == 1
+    (following,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
+    assert main(shlex.split(following)[2:]) == 1
+    assert "drier.stl on trace.csv" in capsys.readouterr().out
+    (home / "wrong.stl").write_text(CENTIMETRES.replace("real [cm]", "real [s]").replace("150 cm", "150 s"))
+    assert main(["check", "wrong.stl", "trace.npz"]) == 3
 
 
 def test_a_stream_has_the_same_verdicts(monkeypatch, capsys):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers.plants import read, simulated
 from scipy.integrate import solve_ivp
 
+from stlc.monitor.verdict import Monitor
 from stlc.plants.kinds import UnfitError
+from stlc.plants.plant import Plant
 from stlc.plants.worker import Simulator
 from stlc.toolchain import compiler
 
@@ -153,3 +157,38 @@ def test_what_the_fmu_lacks_is_refused(folder, tmp_path, old, new, place, said):
     with pytest.raises(UnfitError, match=said) as caught:
         ran(text, folder, tmp_path, "co-simulation", {})
     assert caught.value.place == place
+
+
+@pytest.mark.bench
+@both
+def test_memory_does_not_grow_with_a_simulation(folder, interface):
+    """A million steps take as much memory as a hundred thousand, in the plant's process and in this one."""
+    peaks = []
+    for seconds in (10_000, 100_000):
+        text = OSCILLATOR.format(interface=interface).replace("duration: 10 s", f"duration: {seconds} s")
+        spec = "signal x0\nrequire low: always x0 <= 3\nrequire returns: always eventually[0 s, 20 s] x0 <= 0"
+        with Plant(read(text + "limit: {time: 1 h}\n", folder)) as plant:
+            online = Monitor(spec, dt=0.1).online()
+            assert plant.watch(np.array([1.0]), online) is None
+            worker = plant._processes[0]._process.pid
+            peaks.append((_peak(worker), _resident()))
+        assert online.samples == 10 * seconds + 1
+        assert online.finish()["low"].status == "satisfied"
+    (plant_before, here_before), (plant_after, here_after) = peaks
+    assert plant_after - plant_before < 2_000  # kilobytes; a million samples of two signals are 16,000
+    assert here_after - here_before < 4_000
+
+
+def _peak(pid: int) -> int:
+    """Greatest resident memory of a process until now, in kilobytes."""
+    return _status(pid, "VmHWM")
+
+
+def _resident() -> int:
+    """Resident memory of this process, in kilobytes."""
+    return _status("self", "VmRSS")
+
+
+def _status(pid: int | str, name: str) -> int:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(name)).split()[1])

@@ -1,0 +1,273 @@
+"""Simulations drawn as a file declares, as the subject of a certificate: of a plant, or of a system.
+
+Start values, parameters and input signals are drawn for each seed. A simulation is one observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from stlc.assurance.campaign import Verification, compared, seed_ranges
+from stlc.assurance.certificate import Judged, Sample, together
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.frontend.modules import library_of, spec_sha256
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.files import find_spec, find_system, read_source
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.judgement import unknown_requirement
+from stlc.plants.declaration import load_plant_decl
+from stlc.provenance import sha256
+
+if TYPE_CHECKING:
+    from stlc.assurance.model_simulator import ModelSimulator
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.grammar import ast
+    from stlc.plants.declaration import PlantDecl
+    from stlc.plants.judge import JudgedRun, PlantJudge
+    from stlc.plants.plant import PlantFinding
+
+MOST_FINDINGS = 20
+"""Findings that a certificate describes; all are counted."""
+MISSING = "missing"
+"""Entry of the certificate for a file that does not exist."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlantDraws:
+    """Simulations of a plant at random points.
+
+    Attributes:
+        judge: the plant, which the caller closes, and the specification of its signals.
+        spec: path of the specification.
+        require: names of the requirements that count; all if empty.
+        overrides: constants of the specification with new values.
+        jobs: number of processes that simulate side by side.
+        findings: failed simulations until now.
+    """
+
+    judge: PlantJudge
+    spec: Path
+    require: tuple[str, ...] = ()
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    jobs: int = 1
+    findings: list[PlantFinding] = field(default_factory=list)
+
+    doing: ClassVar[str] = "simulating"
+    per_seed: ClassVar[int] = 1
+    assumptions: ClassVar[tuple[str, ...]] = (
+        "a simulation does not depend on those before it in the same process (`fresh: true` makes sure)",
+        "a failed simulation counts as not satisfied; time limits depend on the speed of the machine",
+        "nothing is said about how far the simulated plant is from a real one",
+    )
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Packages that simulate the plant."""
+        return self.judge.plant.decl.packages
+
+    def observed(self, seeds: Sequence[int]) -> Iterator[Sample]:
+        """Simulate the plant at the random point of each seed, and yield the judged simulations.
+
+        A simulation in which the assumptions of the specification do not hold is left out.
+
+        Raises:
+            SystemFileError: S401, the plant cannot be opened, or lacks what its file names.
+            MissingError: R301, a package is not installed.
+            UsageError: U101, there is no such requirement.
+        """
+        rules = _chosen(self.judge.monitor.compiled.requirements, self.require)
+        points = self.judge.random_points(seeds)
+        for run in self.judge.runs(points, seeds, jobs=self.jobs, stream=self.judge.long):
+            if run.finding is not None:
+                self.findings.append(run.finding)
+            if run.status != "out of scope":
+                yield _sample(rules, [_judged(run, rule.name) for rule in rules])
+
+    def record(self, seeds: Sequence[int]) -> dict[str, Any]:
+        """Entries of the certificate on the plant, its files, its failures, and the conditions."""
+        decl, monitor = self.judge.plant.decl, self.judge.monitor
+        found = [
+            {
+                "seed": each.seed,
+                "reason": each.reason,
+                "message": each.message,
+                "time": each.time,
+                "point": dict(each.point),
+            }
+            for each in self.findings[:MOST_FINDINGS]
+        ]
+        return {
+            "kind": "plant",
+            "spec": monitor.compiled.name,
+            "spec_file": str(self.spec),
+            "system": decl.name,
+            "system_file": str(decl.path),
+            "inputs": plant_inputs(monitor.spec, decl),
+            "conditions": _conditions(self.overrides, self.require, seeds),
+            "findings": {"count": len(self.findings), "first": found},
+        }
+
+    def close(self) -> None:
+        """End the processes of the plant."""
+        self.judge.plant.close()
+
+
+@dataclass(frozen=True, slots=True)
+class ModelDraws:
+    """Simulations of a system without controls from random initial states.
+
+    Attributes:
+        simulator: the system, with its specification.
+        spec: path of the specification.
+        require: names of the requirements that count; all if empty.
+        overrides: values of `--set`.
+    """
+
+    simulator: ModelSimulator
+    spec: Path
+    require: tuple[str, ...] = ()
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+    doing: ClassVar[str] = "simulating"
+    per_seed: ClassVar[int] = 1
+    packages: ClassVar[tuple[str, ...]] = ()
+    assumptions: ClassVar[tuple[str, ...]] = (
+        "a simulation whose states are not finite counts as not satisfied",
+        "nothing is said about the error of time steps, nor about how far the model is from a real system",
+    )
+
+    def observed(self, seeds: Sequence[int]) -> Iterator[Sample]:
+        """Simulate the system from the initial state of each seed, and yield the judged simulations.
+
+        Raises:
+            SystemFileError: S301, the conditions `where` reject (nearly) every state.
+            UsageError: U101, there is no such requirement.
+        """
+        import torch
+
+        task = self.simulator.task
+        rules = _chosen(task.rules, self.require)
+        states = [task.system.sample(1, seed=seed, dtype=torch.float64) for seed in seeds]
+        columns = self.simulator.columns_from(torch.cat(states))
+        margins = np.stack([np.broadcast_to(each[0], len(seeds)) for each in self._evaluated(rules, columns)])
+        finite = np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
+        margins = np.where(finite & ~np.isnan(margins), margins, -np.inf)
+        yield _sample(
+            rules,
+            [
+                Judged(rule.name, rule.unit, row >= -TOLERANCE, row < -TOLERANCE, row)
+                for rule, row in zip(rules, margins, strict=True)
+            ],
+        )
+
+    @staticmethod
+    def _evaluated(rules: Sequence[CompiledRequirement], columns: Mapping[str, Any]) -> Sequence[Any]:
+        return evaluate([rule.formula for rule in rules], columns, ops=NUMPY)
+
+    def record(self, seeds: Sequence[int]) -> dict[str, Any]:
+        """Entries of the certificate on the system, its files, and the conditions."""
+        task = self.simulator.task
+        decl = task.system.decl
+        return {
+            "kind": "system",
+            "spec": task.compiled.name,
+            "spec_file": str(self.spec),
+            "system": decl.name,
+            "system_file": str(decl.path),
+            "inputs": system_inputs(task.compiled.spec, decl.path, self.overrides),
+            "conditions": _conditions(self.overrides, self.require, seeds),
+            "findings": {"count": 0, "first": []},
+        }
+
+    def close(self) -> None:
+        """Do nothing: the system is simulated in this process."""
+
+
+def _conditions(overrides: Mapping[str, str], require: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
+    return {"overrides": dict(overrides), "require": list(require), "seeds": seed_ranges(seeds)}
+
+
+def _chosen(rules: Sequence[CompiledRequirement], require: Sequence[str]) -> tuple[CompiledRequirement, ...]:
+    """Return the requirements that count. Raises UsageError (U101) if one of `require` does not exist."""
+    names = [rule.name for rule in rules]
+    for name in require:
+        if name not in names:
+            raise unknown_requirement(name, names)
+    return tuple(rule for rule in rules if rule.name in require or not require)
+
+
+def _sample(rules: Sequence[CompiledRequirement], judged: Sequence[Judged]) -> Sample:
+    weights = {rule.name: rule.weight / rule.scale for rule in rules}
+    units = np.arange(len(judged[0].satisfied))
+    return Sample(together(judged, weights), tuple(judged), units, "simulation")
+
+
+def _judged(run: JudgedRun, name: str) -> Judged:
+    """Verdict on one simulation under one requirement; one without a trace violates it."""
+    found = next((each for each in run.requirements if each.rule.name == name), None)
+    status = "violated" if found is None else found.status
+    low = -np.inf if found is None or np.isnan(found.low) else found.low
+    unit = "" if found is None else found.rule.unit
+    satisfied, violated = np.array([status == "satisfied"]), np.array([status == "violated"])
+    return Judged(name, unit, satisfied, violated, np.array([low]))
+
+
+# ---------------------------------------------------------------------- verification
+
+
+def plant_inputs(spec: ast.Spec, decl: PlantDecl) -> dict[str, str]:
+    """Hashes of what the simulations of a plant depend on.
+
+    `spec`: the specification with its imports. `plant`: the plant file. `file …`: each file that the plant
+    file names, and the modules beside it that a Python file imports. Installed packages are compared by their
+    versions.
+    """
+    files = {f"file {name}": _file_hash(path) for name, path in sorted(decl.files.items())}
+    return {"spec": _spec_hash(spec), "plant": sha256(decl.source.text), **files}
+
+
+def system_inputs(spec: ast.Spec, system: Path, overrides: Mapping[str, str]) -> dict[str, str]:
+    """Hashes of what the simulations of a system depend on: as `plant_inputs`."""
+    from stlc.dynamics.declaration.load import load_system_decl
+    from stlc.dynamics.robots.functions import function_files
+
+    files = function_files(load_system_decl(system, overrides))
+    hashes = {f"file {name}": _file_hash(path) for name, path in sorted(files.items())}
+    return {"spec": _spec_hash(spec), "system": sha256(read_source(system).text), **hashes}
+
+
+def _spec_hash(spec: ast.Spec) -> str:
+    return spec_sha256(spec.source.text, library_of(spec))
+
+
+def _file_hash(path: Path) -> str:
+    return sha256(path.read_bytes()) if path.is_file() else MISSING
+
+
+def verify_draws(document: Mapping[str, Any], spec: str | None, system: str | None) -> Verification:
+    """Compare a certificate with the present files of its specification and of its plant or system.
+
+    Nothing is simulated, and nothing that the files name is run.
+
+    Args:
+        document: content of the certificate.
+        spec: path of the specification; by default the one that the certificate names.
+        system: path of the plant file or system file; by default the one that the certificate names.
+
+    Raises:
+        KeyError, TypeError, ValueError: the document is no certificate.
+        UsageError, SpecError, SystemFileError: a file is missing or invalid.
+    """
+    text = parse(read_source(find_spec(spec or str(document["spec_file"]))))
+    named = Path(system or str(document["system_file"]))
+    if document["kind"] == "plant":
+        decl = load_plant_decl(named)
+        return compared(document, plant_inputs(text, decl), decl.packages)
+    changed = {str(name): str(value) for name, value in document["conditions"]["overrides"].items()}
+    return compared(document, system_inputs(text, find_system(str(named), Path(text.source.name)), changed))

@@ -1,0 +1,211 @@
+"""Simulations of a plant, judged by the specification of its signals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.frontend.modules import library_of, spec_sha256
+from stlc.files import find_spec, read_source
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.signals import arrange, needs_of
+from stlc.monitor.verdict import Monitor
+from stlc.plants.plant import Plant, PlantFinding, PlantRun, load_plant
+from stlc.trace import Trace
+from stlc.version import __version__
+
+if TYPE_CHECKING:
+    from stlc.compile.pipeline import CompiledRequirement
+    from stlc.monitor.judgement import Status
+
+Floats: TypeAlias = NDArray[np.float64]
+STREAMED = 1_000_000
+"""Steps from which simulations are judged while they run, in constant memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedRequirement:
+    """Result of one requirement on one simulation.
+
+    Attributes:
+        rule: the requirement.
+        status: its verdict.
+        low: least robustness over all continuations.
+        high: greatest robustness over all continuations.
+        robustness: the robustness; NaN if it is not known.
+    """
+
+    rule: CompiledRequirement
+    status: Status
+    low: float
+    high: float
+    robustness: float
+
+    @property
+    def share(self) -> float:
+        """Robustness in units of the requirement's scale, by which requirements are compared."""
+        return self.low * self.rule.weight / self.rule.scale
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedRun:
+    """One judged simulation.
+
+    Attributes:
+        seed: seed of the simulation.
+        point: value of each variable.
+        samples: number of samples; 0 for a finding.
+        status: verdict over all requirements; None for a finding.
+        requirements: results of the requirements.
+        finding: why there is no trace, or None.
+        trace: the trace; None for a finding, and if it was judged while the plant ran.
+    """
+
+    seed: int
+    point: Mapping[str, float]
+    samples: int
+    status: Status | None
+    requirements: tuple[JudgedRequirement, ...] = ()
+    finding: PlantFinding | None = None
+    trace: Trace | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PlantJudge:
+    """A plant with the specification of its signals.
+
+    Attributes:
+        plant: the black box, which the caller closes.
+        monitor: the specification, compiled for the time step of the plant.
+        overrides: constants of the specification with new values.
+    """
+
+    plant: Plant
+    monitor: Monitor
+    overrides: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, spec: Path | str, plant: Path | str, overrides: Mapping[str, str]) -> PlantJudge:
+        """Read a plant file and the specification of its signals; nothing is simulated.
+
+        Raises:
+            UsageError: U102, a file does not exist.
+            SpecError, SystemFileError: a file is invalid.
+            TraceError: E601, E605, the plant lacks a signal that the requirements read, or has another unit.
+        """
+        found = load_plant(plant)
+        monitor = Monitor(parse(read_source(find_spec(spec))), dt=found.decl.dt, overrides=overrides)
+        compiled, signature = monitor.compiled, found.signature
+        sample = Trace(
+            signature,
+            float(found.decl.dt),
+            {name: np.zeros((1, 1)) for name in signature.names},
+            name=found.decl.name,
+        )
+        arrange(sample, needs_of(compiled, [*compiled.requirements, *compiled.assumptions]), plain=True)
+        return cls(found, monitor, overrides)
+
+    def at_half_step(self) -> PlantJudge | None:
+        """Return the same at half the time step; None if the plant file does not allow it."""
+        if not self.plant.decl.halves:
+            return None
+        finer = self.plant.decl.at_half_step()
+        return PlantJudge(
+            Plant(finer), Monitor(self.monitor.spec, dt=finer.dt, overrides=self.overrides), self.overrides
+        )
+
+    @property
+    def long(self) -> bool:
+        """Whether a simulation is so long that it is judged while the plant runs."""
+        return self.plant.decl.steps >= STREAMED
+
+    def random_points(self, seeds: Sequence[int]) -> Floats:
+        """Return the random point of each seed, (seeds, dim)."""
+        return np.array([self.plant.random_point(seed) for seed in seeds]).reshape(len(seeds), -1)
+
+    def runs(
+        self, points: Floats, seeds: Sequence[int], *, jobs: int = 1, stream: bool = False
+    ) -> Iterator[JudgedRun]:
+        """Simulate the plant at each point, (batch, dim), and yield the judged simulations in order.
+
+        Args:
+            points: values of the variables.
+            seeds: seed of each simulation, for plants that draw random numbers.
+            jobs: number of processes that simulate side by side; one if `stream`.
+            stream: whether simulations are judged while they run, so that memory does not depend on their
+                length. The runs then have no traces.
+
+        Raises:
+            SystemFileError: S401, the plant cannot be opened, or lacks what its file names.
+            MissingError: R301, a package is not installed.
+        """
+        if stream:
+            for point, seed in zip(points, seeds, strict=True):
+                yield self._streamed(point, seed)
+            return
+        for first in range(0, len(points), jobs):
+            chosen = range(first, min(first + jobs, len(points)))
+            batch = [seeds[row] for row in chosen]
+            for run in self.plant.simulate(points[chosen], seeds=batch, jobs=jobs):
+                yield self._judged(run)
+
+    def stored(self, traces: Sequence[Trace]) -> Trace:
+        """Join traces into one with the specification; shorter ones end in unknown samples (NaN)."""
+        longest = max(trace.samples for trace in traces)
+        data = {}
+        for name in traces[0].signature.names:
+            data[name] = np.full((len(traces), longest), np.nan)
+            for row, trace in enumerate(traces):
+                data[name][row, : trace.samples] = trace.data[name][0]
+        spec = self.monitor.spec
+        library = library_of(spec)
+        meta = replace(
+            traces[0].meta,
+            spec_name=self.monitor.compiled.name,
+            spec_path=spec.source.name,
+            spec_text=spec.source.text,
+            spec_library=library,
+            spec_set=dict(self.overrides),
+            spec_hash=spec_sha256(spec.source.text, library),
+            seed=traces[0].meta.seed if len(traces) == 1 else None,
+            stlc_version=__version__,
+        )
+        return replace(traces[0], data=data, meta=meta)
+
+    def _judged(self, run: PlantRun) -> JudgedRun:
+        point = self._named(run.point)
+        if isinstance(run.outcome, PlantFinding):
+            return JudgedRun(run.seed, point, 0, None, finding=run.outcome)
+        verdict = self.monitor.check(run.outcome)
+        rows = []
+        for each in verdict:
+            low, high = (float(end.min()) for end in each.margins)
+            rows.append(JudgedRequirement(each.rule, each.statuses[0], low, high, float(each.least[0])))
+        status, samples = verdict.statuses[0], run.outcome.samples
+        return JudgedRun(run.seed, point, samples, status, tuple(rows), trace=run.outcome)
+
+    def _streamed(self, point: Floats, seed: int) -> JudgedRun:
+        """Simulate once, and judge while the plant runs; nothing of the trace is kept."""
+        online = self.monitor.online(dt=self.plant.decl.dt)
+        finding = self.plant.watch(point, online, seed=seed)
+        named = self._named(point)
+        if finding is not None:
+            return JudgedRun(seed, named, 0, None, finding=finding)
+        rows = [
+            JudgedRequirement(online.rule(name), tally.status, tally.low, tally.high, tally.robustness)
+            for name, tally in online.finish().items()
+        ]
+        found = {each.status for each in rows}
+        status: Status = "violated" if "violated" in found else "inconclusive"
+        status = "satisfied" if found == {"satisfied"} else status
+        if online.in_scope is False:
+            status, rows = "out of scope", [replace(each, status="out of scope") for each in rows]
+        return JudgedRun(seed, named, online.samples, status, tuple(rows))
+
+    def _named(self, point: Floats) -> dict[str, float]:
+        return {each.name: float(value) for each, value in zip(self.plant.variables, point, strict=True)}

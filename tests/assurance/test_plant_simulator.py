@@ -1,0 +1,155 @@
+"""Simulations of black boxes as a search sees them: visible inputs, guidance, half steps, scope."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stlc.assurance.falsify import SearchBudget, falsify
+from stlc.assurance.plant_simulator import PlantSimulator
+from stlc.assurance.simulation import Focus
+
+CODE = """
+def rates(t, x, u):
+    return [u[0] * 1000.0, u[1]]
+
+
+def leap(state, inputs, dt):
+    return [state[0] + 1.0, dt]
+"""
+PLANT = """\
+plant: 1
+name: pair
+python: "pair.py:rates"
+time: {dt: 0.1 s, duration: 2 s}
+initial: {big: 0, small: 0}
+input: {f: {range: [-1, 1], pieces: 4}, g: {range: [-1, 1], pieces: 2, interpolate: linear}}
+output: {big: {}, small: {}}
+"""
+SPEC = """
+signal big, small
+require early: always[0 s, 0.5 s] big <= 100
+require whole: always[0 s, 2 s] big <= 100
+require endless: always small <= 100
+require mixed: always[0 s, 1 s] (big <= 800 or small <= 0.8)
+require mild: always[0 s, 2 s] (big <= 800 or small <= 0.8)
+"""
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("pair.py").write_text(CODE)
+    Path("pair.yaml").write_text(PLANT)
+    Path("pair.stl").write_text(SPEC)
+    return tmp_path
+
+
+def load(spec: str = "pair.stl", plant: str = "pair.yaml") -> PlantSimulator:
+    return PlantSimulator.load(spec, Path(plant), {})
+
+
+@pytest.mark.usefixtures("home")
+def test_only_inputs_that_a_requirement_sees_are_searched():
+    simulator = load()
+    held = PLANT.replace(", g: {range: [-1, 1], pieces: 2, interpolate: linear}", "")
+    Path("held.yaml").write_text(held.replace("u[1]", "0"))
+    alone = load(plant="held.yaml")
+    assert alone.seen(0) == pytest.approx(0.3)  # five steps and the sample at their end, of twenty steps
+    assert simulator.seen(0) == pytest.approx(0.8)  # a line leads to a value a second later
+    assert [simulator.seen(index) for index in (1, 2)] == [1.0, 1.0]
+    assert alone.space.visible(alone.seen(0)).space.dim == 2
+    assert alone.space.visible(alone.seen(1)).space.dim == 4
+    Path("long.stl").write_text(SPEC + "assume calm: always[0 s, 2 s] small <= 100\n")
+    assert load("long.stl", "held.yaml").seen(0) == 1.0
+
+
+@pytest.mark.usefixtures("home")
+def test_a_requirement_does_not_depend_on_inputs_that_are_left_out():
+    """Inputs of which a requirement is said to see nothing change its robustness by nothing."""
+    simulator = load()
+    rng = np.random.default_rng(0)
+    for requirement in (0, 3):
+        part = simulator.space.visible(simulator.seen(requirement))
+        kept = list(part.coordinates)
+        points = rng.random((4, simulator.space.dim))
+        points[:, kept] = points[0, kept]
+        with simulator.plant:
+            margins = simulator.simulate(points, Focus(requirement)).margins
+        assert len(kept) < simulator.space.dim
+        assert (margins == margins[0]).all()
+
+
+@pytest.mark.usefixtures("home")
+def test_guidance_is_scaled_and_has_the_sign_of_the_robustness():
+    simulator = load()
+    points = np.random.default_rng(1).random((12, simulator.space.dim))
+    with simulator.plant:
+        found = simulator.simulate(points, Focus(4, sized=True))
+        assert found.sizes.shape == (12, 2)
+        assert (found.guidance == found.margins).all()
+        scales = (1e-3, 1.0)
+        scaled = simulator.simulate(points, Focus(4, scales))
+    assert (scaled.margins == found.margins).all()
+    assert (np.sign(scaled.guidance) == np.sign(found.margins)).all()
+    assert np.abs(scaled.guidance).max() < 3 < np.abs(found.margins).max()
+
+
+@pytest.mark.usefixtures("home")
+def test_a_counterexample_must_remain_at_half_the_time_step():
+    counted = PLANT.replace("rates", "leap").replace("duration: 2 s", "duration: 2 s, halves: true")
+    Path("half.yaml").write_text(counted)
+    Path("half.stl").write_text(
+        "signal big, small\n"
+        "require few: always[0 s, 1 s] big <= 15\n"
+        "require coarse: always[0.1 s, 1 s] small <= 0.05\n"
+    )
+    simulator = load("half.stl", "half.yaml")
+    budget = SearchBudget(3)
+    few, coarse = (falsify(simulator, index, budget=budget, seed=0, shrinks=False) for index in range(2))
+    simulator.close()
+    assert few.found is None  # 10 steps in a second are within the limit, 20 half steps are not
+    assert few.least == 5.0
+    assert coarse.found is None
+    assert [each.half_step for each in coarse.spurious] == [pytest.approx(0.0)] * 3
+
+
+@pytest.mark.usefixtures("home")
+def test_a_plant_has_a_half_step_only_if_its_file_says_so():
+    simulator = load()
+    assert simulator.at_half_step(np.full((1, simulator.space.dim), 0.5), Focus(0)) is None
+    Path("half.yaml").write_text(PLANT.replace("duration: 2 s", "duration: 2 s, halves: true"))
+    halved = load(plant="half.yaml")
+    ones = np.ones((1, halved.space.dim))
+    found = halved.at_half_step(ones, Focus(4, (1e-3, 1.0)))
+    outcome = halved.simulate(ones, Focus(4, (1e-3, 1.0)))
+    halved.close()
+    assert found is not None
+    assert found.guidance == pytest.approx(outcome.guidance)
+    assert found.margins == pytest.approx(
+        outcome.margins
+    )  # the right-hand side is integrated exactly at both steps
+
+
+@pytest.mark.usefixtures("home")
+def test_a_failure_at_half_the_time_step_confirms_nothing_and_refutes_nothing():
+    code = "def rates(t, x, u, n=[0]):\n    return [1 / (0.05 - t if t == 0.05 else 1), 0.0]\n"
+    Path("pair.py").write_text(code)
+    Path("half.yaml").write_text(PLANT.replace("duration: 2 s", "duration: 2 s, halves: true"))
+    simulator = load(plant="half.yaml")
+    found = simulator.at_half_step(np.ones((1, simulator.space.dim)), Focus(0))
+    simulator.close()
+    assert found is not None
+    assert np.isnan(found.margins).all()
+    assert simulator.findings == []
+
+
+@pytest.mark.usefixtures("home")
+def test_simulations_out_of_scope_are_not_admissible():
+    Path("scoped.stl").write_text(SPEC + "assume calm: always[0 s, 2 s] big <= 500\n")
+    simulator = load("scoped.stl")
+    points = np.stack([np.ones(simulator.space.dim), np.zeros(simulator.space.dim)])
+    with simulator.plant:
+        assert simulator.simulate(points, Focus(0)).admissible.tolist() == [False, True]
