@@ -228,9 +228,16 @@ class FormOps:
     def _wave(self, name: str, x: Forms, value: Floats, slope: Floats) -> Forms:
         """Tangent of a function whose second derivative is within [-1, 1]; its range if `x` is wide."""
         radius = x.radius
-        if (radius > 1.0).any():
-            return self._by_range(name, x)
-        return x.times(slope).widened(value - slope * x.centre, 0.5 * radius**2 + SLACK)
+        found = x.times(slope).widened(value - slope * x.centre, 0.5 * radius**2 + SLACK)
+        keep = radius <= 1.0
+        if keep.all():
+            return found
+        plain = self._by_range(name, x)
+        return Forms(
+            np.where(keep, found.centre, plain.centre),
+            found.generators * keep,
+            np.where(keep, found.rest, plain.rest),
+        )
 
     def gt(self, a: Operand, b: Operand) -> Belief:
         """`a > b`."""
