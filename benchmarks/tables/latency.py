@@ -17,7 +17,7 @@ import torch
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.deployments import GUARDS, sampled_states
+from benchmarks.deployments import sampled_states
 from benchmarks.options import Output, RunsArgument, opened
 from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import Times, after_warm_up, one_thread
@@ -27,6 +27,7 @@ from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.training.run import Run
+from stlc.registry import GUARDS
 
 TEXT = """## A decision
 

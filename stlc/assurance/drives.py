@@ -252,7 +252,7 @@ def certificate(order: Campaign, progress: Progress) -> dict[str, Any]:
             "overrides": dict(order.overrides),
             "require": list(order.require),
             "margin": dict(setting.margin),
-            "time_limit": setting.limit if order.guard == "full" else setting.paper_limit,
+            "time_limit": setting.paper_limit if order.guard == "paper" else setting.limit,
             "agents": setting.agents,
             "steps": setting.steps,
             "replan": setting.replan,

@@ -14,6 +14,7 @@ from stlc.cli.certify.text import bounds_lines, checked_share, floored, raised
 from stlc.cli.framework.assured import Certificate, CertificateCheck, DifferentEntry
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
+    GuardOption,
     RequireOption,
     RunsOption,
     SetOption,
@@ -23,15 +24,14 @@ from stlc.cli.framework.options import (
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, RunError, usage
+from stlc.diagnostics import Diagnostic, RunError
 from stlc.escape import operand, shell, visible
 from stlc.files import read_source, write_atomic
+from stlc.registry import guard_named
 
 if TYPE_CHECKING:
     from stlc.assurance.drives import Campaign, Progress
-    from stlc.controller.guard.candidates import Mode
 
-GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 FILE = "eval/certificate.json"
 DEFAULT_SHARE = 0.99
 
@@ -40,12 +40,12 @@ DEFAULT_SHARE = 0.99
 class Driving:
     """Options on how the policy is deployed."""
 
-    guard: Annotated[str, typer.Option(metavar="none|paper|full", help="Guard of the policy.")] = "none"
+    guard: GuardOption = "none"
     time_limit: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
-            help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
+            help="Time limit of a guard's decision per agent, or `none`; 100ms unless it is the paper's.",
         ),
     ] = None
     margin: Annotated[
@@ -171,18 +171,16 @@ def _campaign(name: str, how: Driving, overrides: Mapping[str, str], runs: Path)
     from stlc.controller.guard.margins import parse_margins
     from stlc.controller.training.run import Run
 
-    modes = [mode for mode in GUARDS if mode == how.guard]
-    if not modes:
-        raise usage(f"there is no guard `{how.guard}`", "--guard none, paper or full")
+    mode = guard_named(how.guard)
     opened = Run.open(name, root=runs, overrides=overrides, scenario=how.scenario)
     test = opened.task.system.decl.test
     setting = Setting((), how.agents or test.agents, how.steps or test.steps, test.replan)
     if how.time_limit is not None:
         seconds = parse_limit(how.time_limit)
         setting = replace(setting, limit=seconds, paper_limit=seconds)
-    margin = parse_margins(how.margin or ()).of(opened.task, opened.policy, modes[0], test.replan)
+    margin = parse_margins(how.margin or ()).of(opened.task, opened.policy, mode, test.replan)
     setting = replace(setting, margin=margin)
-    return Campaign(opened, rules_of(opened), modes[0], setting, Claim(), overrides=overrides)
+    return Campaign(opened, rules_of(opened), mode, setting, Claim(), overrides=overrides)
 
 
 def _driven(order: Campaign, path: Path) -> Certificate:

@@ -12,6 +12,7 @@ import typer
 
 from stlc.cli.framework.assured import FalsifiedRequirement, FalsifiedSystem, ReplayedCounterexample
 from stlc.cli.framework.options import (
+    GuardOption,
     RequireOption,
     RunsOption,
     SetOption,
@@ -23,7 +24,7 @@ from stlc.cli.framework.output import PULSE, Answer, emit
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import visible
-from stlc.registry import closest
+from stlc.registry import closest, guard_named
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,13 +35,11 @@ if TYPE_CHECKING:
     from stlc.assurance.falsify import Counterexample, Falsification
     from stlc.assurance.model_simulator import ModelSimulator
     from stlc.assurance.plant_simulator import PlantSimulator
-    from stlc.controller.guard.candidates import Mode
     from stlc.trace import Trace
 
     _Simulator: TypeAlias = ModelSimulator | DriveSimulator | PlantSimulator
 
 FORMAT = "stlc-counterexample/1"
-GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 
 
 @command(
@@ -68,7 +67,7 @@ def falsify(
     random: Annotated[
         bool, typer.Option("--random", help="Draw from the declared distributions only, as a baseline.")
     ] = False,
-    guard: Annotated[str, typer.Option(metavar="none|paper|full", help="Guard of a run's policy.")] = "none",
+    guard: GuardOption = "none",
     agents: Annotated[int | None, typer.Option(min=1, help="Agents in each world of a run.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each drive of a run.")] = None,
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="Scenario of a run.")] = None,
@@ -166,7 +165,7 @@ class _Target:
         run = Run.open(self.name, root=runs, overrides=overrides, scenario=self.scenario)
         test = run.task.system.decl.test
         size = self.agents or test.agents, self.steps or test.steps
-        return DriveSimulator(run, _mode(self.guard), Setting((self.seed,), *size, test.replan))
+        return DriveSimulator(run, guard_named(self.guard), Setting((self.seed,), *size, test.replan))
 
     def _black_box(self, plant: Path, overrides: Mapping[str, str]) -> PlantSimulator:
         from stlc.assurance.plant_simulator import PlantSimulator
@@ -187,14 +186,6 @@ class _Target:
             "scenario": self.scenario,
             "seed": self.seed,
         }
-
-
-def _mode(name: str) -> Mode:
-    """Guard called `name`. Raises UsageError (U101) if there is none."""
-    for mode in GUARDS:
-        if mode == name:
-            return mode
-    raise usage(f"there is no guard `{name}`", "--guard none, paper or full")
 
 
 def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:

@@ -30,6 +30,7 @@ from stlc.cli.framework.assured import (
     Verified,
 )
 from stlc.cli.framework.plant_documents import PlantSimulation
+from stlc.registry import GuardName
 
 if TYPE_CHECKING:
     from stlc.view.learning import Learning
@@ -664,7 +665,7 @@ class SystemFacts(TypedDict):
 
 
 class GuardResult(TypedDict):
-    guard: Literal["none", "paper", "full"]
+    guard: GuardName
     drives: int
     satisfied: int
     share: Num
@@ -676,7 +677,7 @@ class GuardResult(TypedDict):
 
 
 class ClosedLoopRecord(TypedDict):
-    recommended: Literal["none", "paper", "full", None]
+    recommended: GuardName | None
     share: Num | None
     interval: list[Num] | None
     guards: list[GuardResult]

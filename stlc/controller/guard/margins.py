@@ -158,7 +158,7 @@ class MarginRequest:
                 )
         found = dict.fromkeys(names, self.every)
         if self.share is not None and mode != "none":
-            steps = 1 if mode == "full" else replan
+            steps = replan if mode == "paper" else 1
             found |= calibrated_margins(task, policy, steps, self.share)
         found |= self.named
         return {name: margin for name, margin in found.items() if margin}

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
     from stlc.compile.augment.timers import Timer
     from stlc.controller.problem.task import Task
     from stlc.dynamics.declaration.decl import SystemDecl
+
+_Env: TypeAlias = dict[str, Forms]
+"""Name of a state, control or intermediate result -> its form, (B,)."""
 
 DEVIATIONS = 3.0
 """Standard deviations at which normal noise is bounded; 99.73 % of the draws are within them."""
@@ -127,14 +130,14 @@ class TubeModel:
         Returns:
             The bounds. A plan that is not finite has the bounds -inf and +inf.
         """
-        parts = [
-            self._tube(*part, self.task.horizon if steps is None else steps)
-            for part in zip(torch.split(x.double(), AT_ONCE), torch.split(plans.double(), AT_ONCE), strict=True)
-        ]
+        steps = self.task.horizon if steps is None else steps
+        states, given = (torch.split(each.double(), AT_ONCE) for each in (x, plans))
+        parts = [self._tube(*each, steps) for each in zip(states, given, strict=True)]
         if len(parts) == 1:
             return parts[0]
-        states = {name: _side_by_side([part.states[name] for part in parts]) for name in self.task.system.names}
-        return Tube(states, torch.cat([part.low for part in parts]), torch.cat([part.high for part in parts]))
+        names = self.task.system.names
+        whole = {name: _side_by_side([part.states[name] for part in parts]) for name in names}
+        return Tube(whole, torch.cat([part.low for part in parts]), torch.cat([part.high for part in parts]))
 
     def safe(self, x: Tensor, plans: Tensor, *, steps: int | None = None) -> Tensor:
         """Lower bound on the robustness of phi_safe (the requirements tagged `@safety`), (B,).
@@ -175,7 +178,7 @@ class TubeModel:
                 history[name].append(form)
         return history
 
-    def _start(self, x: Floats, symbols: _Symbols, *, measured: bool) -> dict[str, Forms]:
+    def _start(self, x: Floats, symbols: _Symbols, *, measured: bool) -> _Env:
         """Forms of the true states, for measured states `x`, (B, n)."""
         env = {name: Forms.point(x[:, i]) for i, name in enumerate(self.task.system.names)}
         if not measured:
@@ -189,7 +192,7 @@ class TubeModel:
             env[noise.name] = FORMS.sub(env[noise.name], off)
         return env
 
-    def _pushed(self, moved: dict[str, Forms], before: dict[str, Forms], symbols: _Symbols) -> dict[str, Forms]:
+    def _pushed(self, moved: _Env, before: _Env, symbols: _Symbols) -> _Env:
         """Add the scenario's disturbance, which reads the states `before` the step."""
         if not self._pushes:
             return moved
@@ -222,12 +225,12 @@ class _Symbols:
         """Form of a normal number with mean 0, within the bounded number of standard deviations."""
         return self.new(self._deviations * deviation)
 
-    def drawn(self, sampler: str, args: list[Forms]) -> Forms:
+    def drawn(self, sampler: str, args: list[Forms]) -> Any:
         """Form of a number drawn from the sampler called `sampler`."""
         match sampler, args:
             case ("uniform" | "randint", [low, high]) | ("truncnorm", [_, _, low, high]):
                 middle = FORMS.add(low, high).times(0.5)
-                half: Forms = FORMS.mul(FORMS.sub(high, low).times(0.5), self.new())
+                half = FORMS.mul(FORMS.sub(high, low).times(0.5), self.new())
                 return FORMS.add(middle, half)
             case "normal", [mean, deviation]:
                 return FORMS.add(mean, FORMS.mul(deviation, self.normal(1.0)))
@@ -280,9 +283,7 @@ class _Motion:
         self._feedback = decl.feedback
         self._commands = ArrayProgram(commands(decl)) if decl.feedback is not None else None
 
-    def step(
-        self, env: dict[str, Forms], plan: Floats, errors: _ErrorForms | None, symbols: _Symbols
-    ) -> dict[str, Forms]:
+    def step(self, env: _Env, plan: Floats, errors: _ErrorForms | None, symbols: _Symbols) -> _Env:
         """States one step later.
 
         Args:
@@ -303,7 +304,7 @@ class _Motion:
         later = {name: _full(moving[f"{name}'"], symbols.batch) for name in self._moved}
         return {**env, **later}
 
-    def _commanded(self, env: dict[str, Forms], plan: list[Forms]) -> list[Forms]:
+    def _commanded(self, env: _Env, plan: list[Forms]) -> list[Forms]:
         """Commands of the actuators for planned controls."""
         if self._commands is None:
             return plan
@@ -311,7 +312,7 @@ class _Motion:
         return [found[name] for name in self._controls]
 
 
-def _computed(program: ArrayProgram, env: Mapping[str, Forms]) -> dict[str, Forms]:
+def _computed(program: ArrayProgram, env: Mapping[str, Forms]) -> _Env:
     """Run a program over forms; by intervals where a root of a number that may be negative is asked for."""
     try:
         return program(env, FORMS)
@@ -366,16 +367,17 @@ class _Judge:
 
 def _margins(program: ArrayProgram, env: Mapping[str, Intervals], forms: Mapping[str, Forms]) -> Intervals:
     """Intervals that contain the values of a program, (T+1, B): those by forms within those by intervals."""
-    plain = program({name: env[name] for name in program.columns}, INTERVALS)["margin"]
+    plain: Intervals = program({name: env[name] for name in program.columns}, INTERVALS)["margin"]
     try:
-        linear = program({name: forms[name] for name in program.columns}, FORMS)["margin"].range
+        form: Forms = program({name: forms[name] for name in program.columns}, FORMS)["margin"]
+        linear = form.range
     except ValueError:
         return plain
-    low = np.maximum(plain.low, linear.low)
+    low: Floats = np.maximum(plain.low, linear.low)
     return Intervals(low, np.maximum(np.minimum(plain.high, linear.high), low))
 
 
-def _stacked(history: Mapping[str, list[Forms]]) -> dict[str, Forms]:
+def _stacked(history: Mapping[str, list[Forms]]) -> _Env:
     """Forms over time as one form each, (T+1, B)."""
     return {name: _over_time(forms) for name, forms in history.items()}
 
@@ -385,7 +387,8 @@ def _over_time(forms: Sequence[Forms]) -> Forms:
     generators = np.zeros((count, len(forms), *forms[0].shape))
     for time, form in enumerate(forms):
         generators[: len(form.generators), time] = form.generators
-    return Forms(np.stack([form.centre for form in forms]), generators, np.stack([form.rest for form in forms]))
+    centre, rest = (np.stack([getattr(form, name) for form in forms]) for name in ("centre", "rest"))
+    return Forms(centre, generators, rest)
 
 
 def _side_by_side(parts: Sequence[Intervals]) -> Intervals:

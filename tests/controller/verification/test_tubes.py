@@ -48,7 +48,8 @@ scenario:
     noise: {p: "truncnorm(0, 1, -0.1, 0.1) * (1 m)"}
     model_mismatch: {k: 0.6}
     errors: {actuator_gain: 0.1, parameters: 0.1, actuator_noise: 0.05, sensor_noise: 0.01}
-  choices: {disturb: {v: "choice(-0.3, 0.1, 0.5) * (1 m/s^2) + ind(bernoulli(0.5)) * (0.2 m/s^2) + randint(0, 2) * 0.01 m/s^2"}}
+  choices:
+    disturb: {v: "(choice(-0.3, 0.1, 0.5) + 0.2 * ind(bernoulli(0.5)) + 0.01 * randint(0, 2)) * (1 m/s^2)"}
   gusts: {disturb: {v: "if t > 1 s then 0.4 m/s^2 * sin(t / (1 s)) else 0"}}
   dependent: {noise: {p: "normal(0, 0.1) * p"}}
 """
@@ -139,7 +140,8 @@ class Sampled:
                 acted = self.task.system.commanded(x, plans[:, step]) * self.gain + self.offset
                 acted = acted + DEVIATIONS * self.sizes.push * self.share(len(self.sizes.push))
                 moved = self.truth.step(known, self.task.system.planned(x, acted)).clone()
-                for name, value in self.drawn(self.pushes, known, self.time + step * self.task.plain.dt).items():
+                pushes = self.drawn(self.pushes, known, self.time + step * self.task.plain.dt)
+                for name, value in pushes.items():
                     column = self.task.plain.names.index(name)
                     moved[:, column] += scale * value
                     if name in decl.clamps:
@@ -156,6 +158,12 @@ def plans_of(task: Task, count: int, generator: torch.Generator) -> Tensor:
     low, high = task.system.control_low.double(), task.system.control_high.double()
     pieces = low + (high - low) * torch.rand(count, 3, len(low), generator=generator, dtype=torch.float64)
     return pieces.repeat_interleave(-(-task.horizon // 3), 1)[:, : task.horizon]
+
+
+def planned(task: Task, count: int) -> tuple[Tensor, Tensor]:
+    """States and plans."""
+    x = task.sample(count, seed=2, dtype=torch.float64)
+    return x, plans_of(task, count, torch.Generator().manual_seed(2))
 
 
 def check(task: Task, samples: int, *, steps: int | None = None, seed: int = 0, plans: int = 20) -> None:
@@ -214,7 +222,9 @@ def test_tubes_of_the_benchmarks(spec: str, system: str, scenario: str) -> None:
 @pytest.mark.bench
 @pytest.mark.parametrize(("spec", "system", "scenario"), BENCHMARKS)
 @pytest.mark.parametrize("steps", [None, 2])
-def test_ten_thousand_samples_stay_within_the_tube(spec: str, system: str, scenario: str, steps: int | None) -> None:
+def test_ten_thousand_samples_stay_within_the_tube(
+    spec: str, system: str, scenario: str, steps: int | None
+) -> None:
     check(task_of(spec, system, scenario), 10_000, steps=steps, plans=100)
 
 
@@ -230,8 +240,7 @@ def test_without_errors_the_tube_is_the_prediction() -> None:
     model = TubeModel(task)
     assert model.exact
     assert not TubeModel(cart("gusts")).exact
-    x, generator = task.sample(30, seed=1, dtype=torch.float64), torch.Generator().manual_seed(1)
-    plans = plans_of(task, 30, generator)
+    x, plans = planned(task, 30)
     found, rho = model.tube(x, plans), task.requirement_robustness(task.system.rollout(x, plans))
     torch.testing.assert_close(found.low, rho, atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(found.high, rho, atol=1e-6, rtol=1e-6)
@@ -243,7 +252,7 @@ def test_larger_errors_give_wider_tubes() -> None:
     widths = []
     for scenario in ("mismatch-5", "mismatch-10", "mismatch-20"):
         task = cart(scenario)
-        x, plans = task.sample(50, seed=2, dtype=torch.float64), plans_of(task, 50, torch.Generator().manual_seed(2))
+        x, plans = planned(task, 50)
         found = tube(task, x, plans)
         rho = task.requirement_robustness(task.system.rollout(x, plans))
         assert bool(((found.low <= rho + 1e-9) & (rho <= found.high + 1e-9)).all())
@@ -253,7 +262,7 @@ def test_larger_errors_give_wider_tubes() -> None:
 
 def test_many_plans_are_bounded_as_few_are() -> None:
     task = cart("all")
-    x, plans = task.sample(300, seed=4, dtype=torch.float64), plans_of(task, 300, torch.Generator().manual_seed(4))
+    x, plans = planned(task, 300)
     whole, part = tube(task, x, plans), tube(task, x[290:], plans[290:])
     torch.testing.assert_close(whole.low[290:], part.low, atol=1e-12, rtol=0)
     np.testing.assert_allclose(whole.states["p"].high[:, 290:], part.states["p"].high, atol=1e-12)

@@ -1,0 +1,168 @@
+"""Search of the guard "certified": plans that are safe for all errors within the bounds of the scenario.
+
+A plan is certified if two conditions hold for every error within the bounds (`stlc.controller.verification.
+tubes`) until the next decision: the states until then are safe, and the rest of the plan is safe on the model
+from whichever state is reached. The second condition is what the guard of Meng and Fan (2023) asks of a plan,
+so at the next decision at least one plan is known that this guard accepts: the rest of the present one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, Limits, best, finite, rank
+from stlc.controller.guard.search import RelaxedSearch, StagedSearch
+from stlc.controller.streams import seeded
+from stlc.controller.verification.tubes import TubeModel
+from stlc.diagnostics import usage
+
+if TYPE_CHECKING:
+    from stlc.controller.guard.candidates import RobustnessMargins
+    from stlc.controller.policies.policy import Policy
+    from stlc.controller.problem.task import Task
+    from stlc.runtime.prefixes import PrefixGrid
+
+STARTS = 500
+"""States from which the margins of a search are measured."""
+SHARE = 0.9
+"""Share of the plans whose loss of robustness in the tube is at most the margin of the search."""
+SEED = 20_261
+
+
+class Certifier:
+    """Check of plans by their tubes.
+
+    Args:
+        task: specification and system, with the scenario whose errors are assumed.
+
+    Raises:
+        UsageError: U101, there is no requirement tagged `@safety`, or there are no tubes (see `TubeModel`).
+    """
+
+    def __init__(self, task: Task) -> None:
+        if not task.compiled.safety:
+            advice = "write `@safety` above what has to hold in spite of errors"
+            raise usage("the guard `certified` needs a requirement tagged `@safety`", advice)
+        self.task, self.steps = task, task.system.decl.test.replan
+        self._tubes = TubeModel(task)
+
+    @torch.no_grad()
+    def guaranteed(self, x: Tensor, plans: Tensor) -> Tensor:
+        """Least robustness of phi_safe that is guaranteed for plans, (B,).
+
+        The errors of the scenario act until the next decision; from then on the model is followed.
+
+        Args:
+            x: measured states, (B, n).
+            plans: plans in physical units, (B, T, m).
+        """
+        return self._tubes.safe(x, plans, steps=self.steps)
+
+    @torch.no_grad()
+    def margins(self, policy: Policy, least: RobustnessMargins) -> RobustnessMargins:
+        """Return margins of safety requirements, with which a search on the model finds certified plans.
+
+        The margin of a requirement is a quantile of the robustness that plans of the policy lose in their
+        tubes, and at least its entry in `least`. Whether a plan is accepted depends on its own tube only.
+        """
+        x = self.task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
+        plans = finite(policy.plan(x).to(x.dtype), self.task)
+        judged = self.task.judge(x, plans, states=False)
+        lost = judged.requirements - self._tubes.tube(x, plans, steps=self.steps).low
+        safe, found = judged.safe >= 0.0, dict(least)
+        for index, rule in enumerate(self.task.rules):
+            if rule in self.task.compiled.safety and bool(safe.any()):
+                loss = float(lost[safe, index].nan_to_num(0.0, 0.0, 0.0).quantile(SHARE))
+                found[rule.name] = max(found.get(rule.name, 0.0), loss)
+        return {name: margin for name, margin in found.items() if margin > TOLERANCE}
+
+
+class CertifiedSearch:
+    """Search of the guard "certified": other proposals of the policy, then the stages of the guard "full".
+
+    If no certified plan is found, the plan that is safe on the model with the greatest guaranteed robustness
+    is taken; without such a plan, the one that the guard "full" would take.
+
+    Args:
+        task: specification that accepted plans satisfy on the model, and system.
+        sought: the task with margins, for which the stages search.
+        policy: policy that proposes and completes plans.
+        certifier: check of plans.
+        grid: control values and lengths of prefixes; by default those of the system file.
+        limits: computational limits of a decision.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        sought: Task,
+        policy: Policy,
+        certifier: Certifier,
+        *,
+        grid: PrefixGrid | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.task, self.limits = task, limits or Limits()
+        self._policy, self._certifier = policy, certifier
+        self._stages: StagedSearch | RelaxedSearch
+        if sought is task:
+            self._stages = StagedSearch(task, policy, "full", grid=grid, limits=self.limits)
+        else:
+            self._stages = RelaxedSearch(task, sought, policy, grid=grid, limits=self.limits)
+
+    @torch.no_grad()
+    def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
+        """Search for better plans in states whose plan was rejected.
+
+        Args:
+            x: states, (agents, n) float64.
+            plan: (agents, T, m), the policy's plan; entries that are not finite are replaced.
+            previous: (agents, T, m), remainders of the previous plans.
+
+        Returns:
+            The plan that ranks highest, one per agent.
+        """
+        plan = finite(plan.to(x.dtype), self.task)
+        previous = None if previous is None else finite(previous.to(x.dtype), self.task)
+        others = finite(self._policy.candidates(x).to(x.dtype).flatten(0, 1), self.task)
+        others = others.view(len(x), -1, *plan.shape[1:])
+        pool = [plan[:, None], others] if previous is None else [plan[:, None], others, previous[:, None]]
+        found, tier = self._best(x, torch.cat(pool, 1))
+        found.source[(found.plans == plan).flatten(1).all(1)] = POLICY
+        rows = (tier < _CERTIFIED).nonzero()[:, 0]
+        if len(rows):
+            searched = self._stages.search(x[rows], plan[rows], None if previous is None else previous[rows])
+            both = torch.stack((found.plans[rows], searched.plans), 1)
+            better, _ = self._best(x[rows], both)
+            new = (better.plans == searched.plans).flatten(1).all(1)
+            source, length = (getattr(searched, name)[new] for name in ("source", "prefix_length"))
+            taken = replace(better.of(new), source=source, prefix_length=length)
+            found.put(rows[new], taken)
+        return found
+
+    def _best(self, x: Tensor, plans: Tensor) -> tuple[Candidates, Tensor]:
+        """Choose among several plans of each agent, (agents, choices, T, m).
+
+        Returns:
+            The chosen plans, (agents,), and their tiers: see `_CERTIFIED`.
+        """
+        agents, choices = plans.shape[:2]
+        judged = Candidates.judged(self.task, x, plans, REPAIRED, cost=True)
+        starts = x.repeat_interleave(choices, 0)
+        low = self._certifier.guaranteed(starts, plans.flatten(0, 1)).view(agents, choices)
+        sure, usual = (low >= -TOLERANCE) & judged.is_safe, rank(judged)
+        safe = torch.where(judged.is_safe, 1, 0)
+        tier = torch.where(sure, torch.where(judged.satisfies, _CERTIFIED, 2), safe)
+        value = torch.where(tier == _CERTIFIED, -judged.cost, torch.where(tier == 1, low, usual))
+        choice = best(torch.ones_like(sure), (tier.to(x.dtype), value))
+        return judged.pick(choice), tier.gather(1, choice[:, None])[:, 0]
+
+
+_CERTIFIED = 3
+"""Tier of a certified plan that satisfies the specification. The others are 2: certified; 1: safe on the
+model, but not certified; 0: unsafe."""
