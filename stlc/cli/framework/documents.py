@@ -389,6 +389,24 @@ class PlanSeconds(TypedDict):
     most: float
 
 
+class GuaranteedRobustness(TypedDict):
+    """Bounds on the robustness of a requirement over all initial states, and the plans that satisfy it."""
+
+    low: float | str
+    high: float | str
+    guaranteed: int
+
+
+class PlanTubes(TypedDict):
+    """Bounds for all errors of a scenario; normal noise is bounded at a number of standard deviations."""
+
+    scenario: str
+    deviations: float | None
+    guaranteed: int
+    robustness: list[float | str]
+    requirements: dict[str, GuaranteedRobustness]
+
+
 class Plans(TypedDict):
     spec: str
     system: str
@@ -400,6 +418,7 @@ class Plans(TypedDict):
     robustness: PlanRobustness
     seconds: PlanSeconds
     evaluations: float
+    tube: NotRequired[PlanTubes]
     trace: str
 
 

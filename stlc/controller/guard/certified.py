@@ -11,20 +11,26 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, Limits, best, finite, rank
+from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
 from stlc.controller.streams import seeded
 from stlc.controller.verification.tubes import TubeModel
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from stlc.controller.guard.candidates import RobustnessMargins
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
+    from stlc.controller.verification.tubes import Tube
     from stlc.runtime.prefixes import PrefixGrid
 
 STARTS = 500
@@ -64,22 +70,44 @@ class Certifier:
         return self._tubes.safe(x, plans, steps=self.steps)
 
     @torch.no_grad()
-    def margins(self, policy: Policy, least: RobustnessMargins) -> RobustnessMargins:
-        """Return margins of safety requirements, with which a search on the model finds certified plans.
+    def sought(self, policy: Policy, least: RobustnessMargins) -> Task:
+        """Return the task with margins of safety, for which a search on the model finds certified plans.
 
-        The margin of a requirement is a quantile of the robustness that plans of the policy lose in their
-        tubes, and at least its entry in `least`. Whether a plan is accepted depends on its own tube only.
+        The margin of a requirement at the end of a plan is a quantile of the robustness that plans of the
+        policy lose in their tubes, and at least its entry in `least`. It grows along a plan as the tubes do.
+        Whether a plan is accepted depends on its own tube only.
         """
         x = self.task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
         plans = finite(policy.plan(x).to(x.dtype), self.task)
         judged = self.task.judge(x, plans, states=False)
-        lost = judged.requirements - self._tubes.tube(x, plans, steps=self.steps).low
-        safe, found = judged.safe >= 0.0, dict(least)
+        tube = self._tubes.tube(x, plans, steps=self.steps)
+        lost, safe = judged.requirements - tube.low, judged.safe >= 0.0
+        margin, ramp = dict(least), {}
         for index, rule in enumerate(self.task.rules):
-            if rule in self.task.compiled.safety and bool(safe.any()):
-                loss = float(lost[safe, index].nan_to_num(0.0, 0.0, 0.0).quantile(SHARE))
-                found[rule.name] = max(found.get(rule.name, 0.0), loss)
-        return {name: margin for name, margin in found.items() if margin > TOLERANCE}
+            if rule not in self.task.compiled.safety or not bool(safe.any()):
+                continue
+            loss = float(lost[safe, index].nan_to_num(0.0, 0.0, 0.0).quantile(SHARE))
+            if loss > max(least.get(rule.name, 0.0), TOLERANCE):
+                margin[rule.name] = loss
+            if rule.name not in least:
+                ramp[rule.name] = _growth(tube, columns(rule.formula))
+        return with_margins(self.task, margin, ramp)
+
+
+def _growth(tube: Tube, names: Iterable[str]) -> float:
+    """Steps in which tubes become as wide as they are at the end, if they grew evenly.
+
+    `names`: states whose widths count.
+    """
+    widths = [
+        (tube.states[name].high - tube.states[name].low).mean(1) for name in names if name in tube.states
+    ]
+    shares = [width / width[-1] for width in widths if np.isfinite(width).all() and width[-1] > TOLERANCE]
+    if not shares:
+        return 1.0
+    share = np.clip(np.max(shares, axis=0), 0.0, 1.0)
+    wide = int(np.argmax(share >= SHARE))
+    return max(wide / float(share[wide]), 1.0)
 
 
 class CertifiedSearch:
@@ -158,11 +186,16 @@ class CertifiedSearch:
         sure, usual = (low >= -TOLERANCE) & judged.is_safe, rank(judged)
         safe = torch.where(judged.is_safe, 1, 0)
         tier = torch.where(sure, torch.where(judged.satisfies, _CERTIFIED, 2), safe)
+        if DEEP:
+            deep = self._certifier._tubes.safe(starts, plans.flatten(0, 1)).view(agents, choices)
+            tier = torch.where((tier == _CERTIFIED) & (deep >= -TOLERANCE), 4, tier)
+            low = deep
         value = torch.where(tier == _CERTIFIED, -judged.cost, torch.where(tier == 1, low, usual))
         choice = best(torch.ones_like(sure), (tier.to(x.dtype), value))
         return judged.pick(choice), tier.gather(1, choice[:, None])[:, 0]
 
 
+DEEP = False
 _CERTIFIED = 3
 """Tier of a certified plan that satisfies the specification. The others are 2: certified; 1: safe on the
 model, but not certified; 0: unsafe."""

@@ -114,7 +114,7 @@ class Guard:
         self.backup: StagedSearch | RelaxedSearch | CertifiedSearch | None = None
         if mode == "certified":
             self.certifier = Certifier(task)
-            sought = with_margins(task, self.certifier.margins(policy, margin))
+            sought = self.certifier.sought(policy, margin)
         self.policy = policy.for_task(sought)  # it selects among its plans with the margin
         if self.certifier is not None:
             given = self.strict, sought, self.policy, self.certifier

@@ -118,6 +118,12 @@ class TubeModel:
             or self.task.plain.truth is not self.task.plain
         )
 
+    @property
+    def truncated(self) -> bool:
+        """True if the scenario has normal noise, which is bounded at a number of standard deviations."""
+        drawn = any("normal" in each.samplers for each in (*self._pushes, *self._noises))
+        return drawn or bool(self._sizes.push.any() | self._sizes.blur.any())
+
     def tube(self, x: Tensor, plans: Tensor, *, steps: int | None = None) -> Tube:
         """Bounds on states and robustness under plans.
 

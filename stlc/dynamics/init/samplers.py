@@ -139,6 +139,11 @@ class Drawing:
         return self._program(env, ops, _HARD)[self.name]
 
     @property
+    def samplers(self) -> frozenset[str]:
+        """Names of the samplers in the value, such as `uniform`."""
+        return frozenset(call.sampler for call in self._calls)
+
+    @property
     def reads(self) -> frozenset[str]:
         """Names of the columns that the assignment reads, in the arguments of its samplers, too."""
         programs = (self._program, *(call.args for call in self._calls))
