@@ -1,9 +1,12 @@
 """Search of the guard "certified": plans that are safe for all errors within the bounds of the scenario.
 
-A plan is certified if two conditions hold for every error within the bounds (`stlc.controller.verification.
-tubes`) until the next decision: the states until then are safe, and the rest of the plan is safe on the model
-from whichever state is reached. The second condition is what the guard of Meng and Fan (2023) asks of a plan,
-so at the next decision at least one plan is known that this guard accepts: the rest of the present one.
+A plan is certified if all states that it can lead to under errors within the bounds are safe, over the whole
+plan (`stlc.controller.verification.tubes`). Then the rest of the plan is certified at the next decision, too,
+whatever the errors were: the guard keeps a certified plan until its end, unless an exogenous event occurs.
+
+Where no certified plan is found, a weaker condition counts: errors act until the next decision only, and the
+rest of the plan is safe on the model, from whichever state is reached. At the next decision, a plan is then
+known that the guard of Meng and Fan (2023) accepts.
 """
 
 from __future__ import annotations
@@ -54,20 +57,23 @@ class Certifier:
         if not task.compiled.safety:
             advice = "write `@safety` above what has to hold in spite of errors"
             raise usage("the guard `certified` needs a requirement tagged `@safety`", advice)
-        self.task, self.steps = task, task.system.decl.test.replan
+        self.task = task
         self._tubes = TubeModel(task)
 
     @torch.no_grad()
     def guaranteed(self, x: Tensor, plans: Tensor) -> Tensor:
-        """Least robustness of phi_safe that is guaranteed for plans, (B,).
-
-        The errors of the scenario act until the next decision; from then on the model is followed.
+        """Least robustness of phi_safe that is guaranteed for plans under errors at all steps, (B,).
 
         Args:
             x: measured states, (B, n).
             plans: plans in physical units, (B, T, m).
         """
-        return self._tubes.safe(x, plans, steps=self.steps)
+        return self._tubes.safe(x, plans)
+
+    @torch.no_grad()
+    def until_next(self, x: Tensor, plans: Tensor) -> Tensor:
+        """The same for errors until the next decision; from then on the model is followed, (B,)."""
+        return self._tubes.safe(x, plans, steps=self.task.system.decl.test.replan)
 
     @torch.no_grad()
     def sought(self, policy: Policy, least: RobustnessMargins) -> Task:
@@ -80,7 +86,7 @@ class Certifier:
         x = self.task.sample(STARTS, generator=seeded(SEED, 0), dtype=torch.float64)
         plans = finite(policy.plan(x).to(x.dtype), self.task)
         judged = self.task.judge(x, plans, states=False)
-        tube = self._tubes.tube(x, plans, steps=self.steps)
+        tube = self._tubes.tube(x, plans)
         lost, safe = judged.requirements - tube.low, judged.safe >= 0.0
         margin, ramp = dict(least), {}
         for index, rule in enumerate(self.task.rules):
@@ -113,8 +119,9 @@ def _growth(tube: Tube, names: Iterable[str]) -> float:
 class CertifiedSearch:
     """Search of the guard "certified": other proposals of the policy, then the stages of the guard "full".
 
-    If no certified plan is found, the plan that is safe on the model with the greatest guaranteed robustness
-    is taken; without such a plan, the one that the guard "full" would take.
+    If no certified plan is found, a plan is taken that is certified until the next decision, else one that is
+    safe on the model; of several, the one with the greatest guaranteed robustness. Without such a plan, the
+    one of the guard "full" is taken.
 
     Args:
         task: specification that accepted plans satisfy on the model, and system.
@@ -184,18 +191,19 @@ class CertifiedSearch:
         starts = x.repeat_interleave(choices, 0)
         low = self._certifier.guaranteed(starts, plans.flatten(0, 1)).view(agents, choices)
         sure, usual = (low >= -TOLERANCE) & judged.is_safe, rank(judged)
-        safe = torch.where(judged.is_safe, 1, 0)
-        tier = torch.where(sure, torch.where(judged.satisfies, _CERTIFIED, 2), safe)
-        if DEEP:
-            deep = self._certifier._tubes.safe(starts, plans.flatten(0, 1)).view(agents, choices)
-            tier = torch.where((tier == _CERTIFIED) & (deep >= -TOLERANCE), 4, tier)
-            low = deep
-        value = torch.where(tier == _CERTIFIED, -judged.cost, torch.where(tier == 1, low, usual))
+        tier = torch.where(judged.is_safe, 1, 0)
+        tier = torch.where(sure, torch.where(judged.satisfies, _CERTIFIED, 3), tier)
+        rows = (tier < 3).all(1).nonzero()[:, 0]
+        if len(rows):
+            again = x[rows].repeat_interleave(choices, 0), plans[rows].flatten(0, 1)
+            kept = self._certifier.until_next(*again).view(-1, choices) >= -TOLERANCE
+            tier[rows] = torch.where((tier[rows] == 1) & kept, 2, tier[rows])
+        bounded = (tier == 1) | (tier == 2)
+        value = torch.where(tier == _CERTIFIED, -judged.cost, torch.where(bounded, low, usual))
         choice = best(torch.ones_like(sure), (tier.to(x.dtype), value))
         return judged.pick(choice), tier.gather(1, choice[:, None])[:, 0]
 
 
-DEEP = False
-_CERTIFIED = 3
-"""Tier of a certified plan that satisfies the specification. The others are 2: certified; 1: safe on the
-model, but not certified; 0: unsafe."""
+_CERTIFIED = 4
+"""Tier of a certified plan that satisfies the specification. The others are 3: certified; 2: certified until
+the next decision, and safe on the model; 1: safe on the model; 0: unsafe."""
