@@ -120,8 +120,8 @@ class CertifiedSearch:
     """Search of the guard "certified": other proposals of the policy, then the stages of the guard "full".
 
     If no certified plan is found, a plan is taken that is certified until the next decision, else one that is
-    safe on the model; of several, the one with the greatest guaranteed robustness. Without such a plan, the
-    one of the guard "full" is taken.
+    safe on the model; of several, the one with the greatest robustness that is guaranteed in this weaker
+    sense. Without such a plan, the one of the guard "full" is taken.
 
     Args:
         task: specification that accepted plans satisfy on the model, and system.
@@ -196,8 +196,8 @@ class CertifiedSearch:
         rows = (tier < 3).all(1).nonzero()[:, 0]
         if len(rows):
             again = x[rows].repeat_interleave(choices, 0), plans[rows].flatten(0, 1)
-            kept = self._certifier.until_next(*again).view(-1, choices) >= -TOLERANCE
-            tier[rows] = torch.where((tier[rows] == 1) & kept, 2, tier[rows])
+            low[rows] = self._certifier.until_next(*again).view(-1, choices)
+            tier[rows] = torch.where((tier[rows] == 1) & (low[rows] >= -TOLERANCE), 2, tier[rows])
         bounded = (tier == 1) | (tier == 2)
         value = torch.where(tier == _CERTIFIED, -judged.cost, torch.where(bounded, low, usual))
         choice = best(torch.ones_like(sure), (tier.to(x.dtype), value))
