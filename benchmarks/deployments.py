@@ -33,7 +33,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.scenarios.scenario import DISTURBED
 from stlc.provenance import sha256
-from stlc.registry import closest
+from stlc.registry import guard_named
 from stlc.rundir import SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
@@ -45,8 +45,7 @@ NOMINAL = "as it is"
 AGENTS = 5
 """Maximum number of agents in the deployments whose states are sampled."""
 SCENARIOS = (NOMINAL, *DISTURBED)
-GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
-USUAL = (*GUARDS, "full+auto")
+USUAL = ("none", "paper", "full", "full+auto")
 """Default guards. The text after a `+` is the safety margin that the guard requests; see `guard_of`."""
 
 
@@ -144,12 +143,7 @@ def guard_of(name: str) -> tuple[Mode, MarginRequest]:
         UsageError: U101, there is no such guard.
     """
     mode, _, margin = name.partition("+")
-    for known in GUARDS:
-        if mode == known:
-            return known, parse_margins([margin] if margin else [])
-    near = closest(name, USUAL)
-    help_ = (f"did you mean `{near}`?",) if near else (", ".join(USUAL),)
-    raise UsageError(Diagnostic("U101", f"there is no guard `{name}`", help=help_))
+    return guard_named(mode), parse_margins([margin] if margin else [])
 
 
 @dataclass(slots=True)
@@ -252,7 +246,7 @@ def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
             **{"guard": guard, "guard_version": GUARD_VERSION, "margin_share": asked.share},
             **{"scenario": scenario, "errors": None if errors is None else str(errors)},
             **{"seeds": list(setting.seeds), "agents": setting.agents, "steps": setting.steps},
-            **{"replan": setting.replan, "time_limit": setting.limit if mode == "full" else None},
+            **{"replan": setting.replan, "time_limit": None if mode in ("none", "paper") else setting.limit},
             "ceiling": setting.ceiling,
         },
     )

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
     from stlc.controller.training.launch import train_here as train
     from stlc.controller.training.run import Run
+    from stlc.controller.verification.tubes import tube
     from stlc.diagnostics import SpecError, StlcError
     from stlc.dynamics.model.system import System
     from stlc.grammar import ast
@@ -54,6 +55,7 @@ __all__ = [
     "parse",
     "plan",
     "train",
+    "tube",
 ]
 
 _HOMES = {
@@ -67,6 +69,7 @@ _HOMES = {
     "Trace": "stlc.trace:Trace",
     "plan": "stlc.controller.planning.planner:plan",
     "train": "stlc.controller.training.launch:train_here",
+    "tube": "stlc.controller.verification.tubes:tube",
 }
 
 

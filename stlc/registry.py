@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeAlias, TypeVar, get_args
 
 from stlc.diagnostics import Diagnostic, UsageError
 
@@ -168,6 +168,25 @@ class PackageRegistry(Registry[T]):
         package = find_spec(root)
         roots = (package.submodule_search_locations if package is not None else None) or ()
         return [str(Path(folder, *inner)) for folder in roots]
+
+
+GuardName: TypeAlias = Literal["none", "paper", "full", "certified"]
+
+GUARDS: tuple[GuardName, ...] = get_args(GuardName)
+"""Guards (`stlc.controller.guard.guard.Guard`) of `--guard`, by increasing cost of a decision."""
+
+
+def guard_named(name: str) -> GuardName:
+    """Return the guard called `name`.
+
+    Raises:
+        UsageError: U101, there is none; the message lists all names, and the most similar one.
+    """
+    for guard in GUARDS:
+        if guard == name:
+            return guard
+    advice = *did_you_mean(name, GUARDS), f"--guard {', '.join(GUARDS[:-1])} or {GUARDS[-1]}"
+    raise UsageError(Diagnostic("U101", f"there is no guard `{name}`", help=advice))
 
 
 METHODS: PackageRegistry[Any] = PackageRegistry(

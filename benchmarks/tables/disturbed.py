@@ -27,6 +27,7 @@ from benchmarks.store import Result, ResultStore
 from benchmarks.table import Columns, Table, listed, provenance
 from stlc.cli.framework.program import command
 from stlc.controller.guard.margins import AUTO
+from stlc.registry import GUARDS
 
 TEXT = """\
 Written by `python -m benchmarks disturbed` from `benchmarks/results/disturbed.json`. Each policy is simulated
@@ -45,7 +46,7 @@ MOST = 0.95
 """Share of safe starts below which unsafe drives are attributed to the world if the model is exact."""
 METRICS = {"safe agents": "saved", "safe starts": "saved_starts", "satisfied": "executed_starts"}
 """Columns of the table for each guard: title -> name of the metric."""
-TITLES = {"none": "no guard", "paper": "paper's", "full": "full"}
+TITLES = {"none": "no guard", "paper": "paper's", "full": "full", "certified": "certified"}
 _OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
 
@@ -132,7 +133,7 @@ def disturbed(
         typer.Option(
             "--guards",
             metavar="NAMES",
-            help="Of none,paper,full; +0.2 or +auto behind one asks for a margin.",
+            help=f"Of {','.join(GUARDS)}; +0.2 or +auto behind one asks for a margin.",
         ),
     ] = ",".join(USUAL),
     options: DeploymentOptions = _OPTIONS,

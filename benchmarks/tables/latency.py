@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from time import perf_counter
+from time import process_time
 from typing import Annotated
 
 import numpy as np
@@ -17,7 +17,7 @@ import torch
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.deployments import GUARDS, sampled_states
+from benchmarks.deployments import sampled_states
 from benchmarks.options import Output, RunsArgument, opened
 from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import Times, after_warm_up, one_thread
@@ -27,6 +27,7 @@ from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.training.run import Run
+from stlc.registry import GUARDS
 
 TEXT = """## A decision
 
@@ -103,9 +104,9 @@ def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
 
     def plan(index: NDArray[np.int64]) -> float:
         x = torch.from_numpy(recording.states[tuple(index)])[None]
-        begin = perf_counter()
+        begin = process_time()
         run.plan_judged(x)
-        return perf_counter() - begin
+        return process_time() - begin
 
     names = run.task.compiled.name, run.dir.name
     yield Row(*names, POLICY, Times.of(after_warm_up(plan, [*even])), None)
@@ -128,10 +129,10 @@ def _timed(
         row, step = index
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
         previous = guard.decide(before).later()
-        begin = perf_counter()
+        begin = process_time()
         if recording.options is not None:
             guard.prefer(torch.from_numpy(recording.options[row, step])[None], previous)
         decision = guard.decide(now, previous)
-        return perf_counter() - begin, int(decision.source)
+        return process_time() - begin, int(decision.source)
 
     return after_warm_up(decide, [*indices])

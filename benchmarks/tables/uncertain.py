@@ -16,10 +16,10 @@ import numpy as np
 import typer
 
 from benchmarks.formulas import CASES, Case, width_of
+from benchmarks.options import Output
 from benchmarks.store import BENCHMARKS, spec_path
-from benchmarks.table import Columns, Table, show
+from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import interleaved, one_thread, ratio
-from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.program import command
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.interval import Intervals
@@ -66,18 +66,31 @@ COLUMNS: Columns[Overhead] = {
 }
 
 
-@command("python -m benchmarks uncertain", "python -m benchmarks uncertain --samples 1000 --traces 100")
+TEXT = """## Bounds over uncertain signals
+
+Written by `python -m benchmarks uncertain`. Processor time of robustness at every sample on one thread: of
+exact signals, and of signals in which every sample is an interval, as a multiple. Formulas are evaluated by
+the array back end, specifications are judged by the monitor, instant by instant.
+"""
+_OUTPUT = Output()
+
+
+@command(
+    "python -m benchmarks uncertain --samples 1000 --traces 100",
+    "python -m benchmarks uncertain --page docs/benchmarks.md",
+)
 def uncertain(
     samples: Annotated[int, typer.Option("--samples", metavar="N", min=2, help="Samples of a trace.")] = 1000,
     traces: Annotated[int, typer.Option("--traces", metavar="N", min=1, help="How many.")] = 100,
     seconds: Annotated[
         float, typer.Option("--seconds", metavar="S", min=0.0, help="Seconds of measurement for a row.")
     ] = 0.3,
-    as_json: JsonOption = False,
+    output: Output = _OUTPUT,
 ) -> None:
     """Time bounds over uncertain signals, as a multiple of the time for exact ones."""
+    table = overheads(samples, traces, seconds)
     with one_thread():
-        show("uncertain", {"rows": overheads(samples, traces, seconds)}, as_json=as_json)
+        publish("uncertain", output, lambda: [TEXT, *table.markdown(), "", measured_here()], {"rows": table})
 
 
 def overheads(samples: int = 1000, traces: int = 100, seconds: float = 0.3) -> Table[Case | str, Overhead]:

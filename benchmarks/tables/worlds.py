@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from benchmarks.deployments import (
-    GUARDS,
     NOMINAL,
     DeploymentOptions,
     Deployments,
@@ -26,6 +25,7 @@ from benchmarks.store import Result, ResultStore
 from benchmarks.table import WIDTH, Columns, Table, listed, provenance
 from stlc.cli.framework.program import command
 from stlc.controller.training.run import Run
+from stlc.registry import GUARDS
 
 TEXT = """\
 Written by `python -m benchmarks worlds` from `benchmarks/results/worlds.json`: one policy for each
@@ -117,7 +117,7 @@ def worlds(
         list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the best of `paper` if none.")
     ] = None,
     guards: Annotated[
-        str, typer.Option("--guards", metavar="NAMES", help="Some of none,paper,full.")
+        str, typer.Option("--guards", metavar="NAMES", help=f"Some of {','.join(GUARDS)}.")
     ] = "none,paper,full",
     ceiling: Annotated[
         int,

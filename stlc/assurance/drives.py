@@ -171,7 +171,7 @@ class PolicyDrives:
                 "overrides": dict(self.overrides),
                 "require": list(self.require),
                 "margin": dict(setting.margin),
-                "time_limit": setting.limit if self.guard == "full" else setting.paper_limit,
+                "time_limit": setting.paper_limit if self.guard == "paper" else setting.limit,
                 "agents": setting.agents,
                 "steps": setting.steps,
                 "replan": setting.replan,

@@ -110,7 +110,7 @@ class Commands:
             run: name of the run.
             newest: whether it is the newest run. The command `simulate` then omits its name.
             start: program that the training command begins with.
-            guard: the recommended guard: `none`, `paper` or `full`.
+            guard: the recommended guard, such as `paper`.
         """
         run = shell((operand(run),))
         simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, GUARDS[guard].option)))

@@ -83,6 +83,7 @@ GUARDS = {
     "none": GuardWords("no guard", ""),
     "paper": GuardWords("paper's guard", "--backup"),
     "full": GuardWords("full guard", "--guard full"),
+    "certified": GuardWords("certified guard", "--guard certified"),
 }
 
 

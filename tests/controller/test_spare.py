@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.compile.ir.nodes import Predicate, Signal
+from stlc.compile.ir.nodes import Const, Predicate, Signal
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.guard import Guard
@@ -83,7 +83,7 @@ def test_robustness_is_less_by_the_margin(car_task: Task) -> None:
 
 def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
     guard = Predicate(Signal("t"), guard=True)
-    assert tightened(guard, 1.0) is guard
+    assert tightened(guard, Const(1.0)) is guard
     task = Task.of(parse(Source("a.stl", SPEC.replace("p <= 2", "not (p > 2)"))), task_of().plain)
     x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
     still = torch.zeros((1, 6, 1), dtype=torch.float64)
@@ -198,3 +198,12 @@ def test_robustness_until_a_sample_is_that_of_the_prefix() -> None:
     every = prefix_robustness(formulas, columns)
     for last in range(task.horizon + 1):
         torch.testing.assert_close(robustness_until(formulas, columns, last), every[last])
+
+
+def test_a_margin_may_grow_along_a_plan() -> None:
+    task = task_of()
+    x0, still = torch.tensor([[1.0, 0.0]], dtype=torch.float64), torch.zeros((1, 6, 1), dtype=torch.float64)
+    least = float(task.judge(x0, still).requirements[0, 0])
+    grown = with_margins(task, {"clear": 0.6}, {"clear": 12.0})
+    assert float(grown.judge(x0, still).requirements[0, 0]) == pytest.approx(least - 0.3)
+    assert float(grown.requirement_robustness(task.rollout(x0, still))[0, 0]) == pytest.approx(least - 0.3)

@@ -22,6 +22,7 @@ from stlc.cli.framework.assured import (
 )
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
+    GuardOption,
     RequireOption,
     RunsOption,
     SetOption,
@@ -34,13 +35,12 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.escape import file_part, operand, shell, visible
 from stlc.files import find_spec, read_source, write_atomic
+from stlc.registry import guard_named
 
 if TYPE_CHECKING:
     from stlc.assurance.campaign import Campaign, Progress, Subject, Verification
     from stlc.assurance.drives import PolicyDrives
-    from stlc.controller.guard.candidates import Mode
 
-GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 FILE = "eval/certificate.json"
 DRAWN_FOLDER = "certificates"
 DEFAULT_SHARE = 0.99
@@ -52,12 +52,12 @@ MOST_SHOWN = 5
 class Driving:
     """Options on how the policy is deployed."""
 
-    guard: Annotated[str, typer.Option(metavar="none|paper|full", help="Guard of the policy.")] = "none"
+    guard: GuardOption = "none"
     time_limit: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
-            help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
+            help="Time limit of a guard's decision per agent, or `none`; 100ms unless it is the paper's.",
         ),
     ] = None
     margin: Annotated[
@@ -245,9 +245,7 @@ class _Chosen:
         from stlc.controller.training.run import Run
 
         how = self.how
-        modes = [mode for mode in GUARDS if mode == how.guard]
-        if not modes:
-            raise usage(f"there is no guard `{how.guard}`", "--guard none, paper or full")
+        mode = guard_named(how.guard)
         opened = Run.open(
             self.name or "latest", root=self.runs, overrides=self.overrides, scenario=how.scenario
         )
@@ -256,9 +254,9 @@ class _Chosen:
         if how.time_limit is not None:
             seconds = parse_limit(how.time_limit)
             setting = replace(setting, limit=seconds, paper_limit=seconds)
-        margin = parse_margins(how.margin or ()).of(opened.task, opened.policy, modes[0], test.replan)
+        margin = parse_margins(how.margin or ()).of(opened.task, opened.policy, mode, test.replan)
         setting = replace(setting, margin=margin)
-        return PolicyDrives(opened, rules_of(opened), modes[0], setting, self.require, self.overrides)
+        return PolicyDrives(opened, rules_of(opened), mode, setting, self.require, self.overrides)
 
     def _plant(self) -> Subject:
         from stlc.assurance.draws import PlantDraws

@@ -22,6 +22,7 @@ from stlc.cli.framework.assured import (
 )
 from stlc.cli.framework.options import (
     ClusterOption,
+    GuardOption,
     RequireOption,
     RunsOption,
     SetOption,
@@ -33,7 +34,7 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, MissingError, UsageError, usage
-from stlc.registry import closest
+from stlc.registry import closest, guard_named
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -45,14 +46,12 @@ if TYPE_CHECKING:
     from stlc.assurance.model_simulator import ModelSimulator
     from stlc.assurance.plant_simulator import PlantSimulator
     from stlc.assurance.sharing import SimulatorWorkers
-    from stlc.controller.guard.candidates import Mode
     from stlc.controller.parallel.workers import CallFiles
     from stlc.trace import Trace
 
     _Simulator: TypeAlias = ModelSimulator | DriveSimulator | PlantSimulator
 
 FORMAT = "stlc-counterexample/1"
-GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
 
 
 @command(
@@ -90,7 +89,7 @@ def falsify(
     random: Annotated[
         bool, typer.Option("--random", help="Draw from the declared distributions only, as a baseline.")
     ] = False,
-    guard: Annotated[str, typer.Option(metavar="none|paper|full", help="Guard of a run's policy.")] = "none",
+    guard: GuardOption = "none",
     agents: Annotated[int | None, typer.Option(min=1, help="Agents in each world of a run.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each drive of a run.")] = None,
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="Scenario of a run.")] = None,
@@ -205,7 +204,7 @@ class _Target:
         run = Run.open(self.name, root=runs, overrides=overrides, scenario=self.scenario)
         test = run.task.system.decl.test
         size = self.agents or test.agents, self.steps or test.steps
-        return DriveSimulator(run, _mode(self.guard), Setting((self.seed,), *size, test.replan))
+        return DriveSimulator(run, guard_named(self.guard), Setting((self.seed,), *size, test.replan))
 
     def _black_box(self, plant: Path, overrides: Mapping[str, str], jobs: int) -> PlantSimulator:
         from stlc.assurance.plant_simulator import PlantSimulator
@@ -287,14 +286,6 @@ def _lost(workers: SimulatorWorkers) -> Diagnostic:
     count = f"{workers.lost:,} simulation{'s were' if workers.lost != 1 else ' was'}"
     message = f"{count} lost with the processes that made them"
     return Diagnostic("R406", message, note=tuple(workers.reasons))
-
-
-def _mode(name: str) -> Mode:
-    """Guard called `name`. Raises UsageError (U101) if there is none."""
-    for mode in GUARDS:
-        if mode == name:
-            return mode
-    raise usage(f"there is no guard `{name}`", "--guard none, paper or full")
 
 
 def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.documents import Plans
+from stlc.cli.framework.documents import Plans, PlanTubes
 from stlc.cli.framework.options import (
     FailUnderOption,
     PlannerOptionsOption,
@@ -26,12 +26,14 @@ if TYPE_CHECKING:
     from stlc.controller.planning.planner import PlanResult
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import PlannerChoice
+    from stlc.controller.verification.tubes import TubeModel
 
 
 @command(
     "stlc plan specs/traffic.stl",
     'stlc plan specs/reach_n_avoid.stl --from "x=1, v=0" --budget 50ms',
     "stlc plan specs/ship_safe.stl --starts 1000 --method cem --option population=500",
+    "stlc plan specs/ship_safe.stl --target max --tube mismatch-10",
 )
 def plan(
     spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],
@@ -55,6 +57,12 @@ def plan(
         str, typer.Option(metavar="RHO|max", help="Robustness at which the search ends.")
     ] = "0",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the planner and of random states.")] = 0,
+    tube: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SCENARIO", help="Bound the robustness of the plans for all errors of this scenario."
+        ),
+    ] = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FILE", help="Trace of the plans (.npz, .csv, .mcap).")
     ] = Path("plan.npz"),
@@ -66,19 +74,23 @@ def plan(
     The best plan from each initial state is written to a trace, which `stlc check` and `stlc plot` can read.
     Every plan is judged exactly in float64. If the search finds no satisfying plan, there may still be one.
     Only the planner milp can prove that there is none. Ctrl-C ends the search and keeps the best plans found.
-    Without --fail-under, the exit code is 1 if a plan violates the specification.
+    With --tube, the states and the robustness that the errors of a scenario can lead to are bounded: wrong
+    parameters, actuators and measurements, and disturbances. A plan then counts as satisfying only if the
+    lower bound does. Without --fail-under, the exit code is 1 if a plan does not satisfy the specification.
     """
     from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.controller.planning.traces import starts_of, trace_of
     from stlc.controller.problem.load import load_task
+    from stlc.controller.verification.tubes import TubeModel
     from stlc.trace import check_writable, save_trace
 
     check_writable(output)
     choice = planner_choice(method, option, budget)
     judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
     planner = planner_named(choice.name, **choice.options)
-    task = load_task(spec, system, parse_overrides(set_))
+    task = load_task(spec, system, parse_overrides(set_), scenario=tube)
     show_diagnostics(task.compiled.warnings)
+    model = None if tube is None else TubeModel(task)
     states = starts_of(task, from_, starts, seed)
     search = PlanSearch(task, states, PlanBudget(choice.seconds, judged, _target(target)), seed=seed)
     with PULSE.doing(f"planning, {method}"):
@@ -90,7 +102,10 @@ def plan(
     result = search.result
     save_trace(output, trace_of(task, result, seed))
     record = _record(task, result, choice, output)
-    missed = record["satisfied"] / record["starts"] < (1.0 if fail_under is None else fail_under)
+    if model is not None:
+        record["tube"] = _bounded(model, result, tube)
+    good = record["tube"]["guaranteed"] if model is not None else record["satisfied"]
+    missed = good / record["starts"] < (1.0 if fail_under is None else fail_under)
     return Answer(record, lambda: emit("\n".join(_lines(record))), int(missed))
 
 
@@ -123,8 +138,56 @@ def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path)
     }
 
 
+def _bounded(model: TubeModel, result: PlanResult, scenario: str | None) -> PlanTubes:
+    """Bounds on the robustness of the plans for all errors of the scenario."""
+    from stlc.controller.problem.task import satisfied
+    from stlc.controller.verification.tubes import DEVIATIONS
+
+    found = model.tube(result.states, result.plans)
+    low, high = (model.task.graph.overall(each) for each in (found.low, found.high))
+    return {
+        "scenario": scenario or "",
+        "deviations": DEVIATIONS if model.truncated else None,
+        "guaranteed": int(satisfied(low).sum()),
+        "robustness": [float(low.min()), float(high.max())],
+        "requirements": {
+            rule.name: {
+                "low": float(found.low[:, index].min()),
+                "high": float(found.high[:, index].max()),
+                "guaranteed": int(satisfied(found.low[:, index]).sum()),
+            }
+            for index, rule in enumerate(model.task.rules)
+        },
+    }
+
+
 def _lines(plans: Plans) -> list[str]:
     """Lines of text that show the result of `stlc plan`."""
+    return [*_found_lines(plans), *_tube_lines(plans), f"trace {plans['trace']}"]
+
+
+def _tube_lines(plans: Plans) -> list[str]:
+    """Lines with the bounds of `--tube`; none without it."""
+    from stlc.view.words import number
+
+    found = plans.get("tube")
+    if found is None:
+        return []
+    within = f", noise within {found['deviations']:g} standard deviations" if found["deviations"] else ""
+    many, good = plans["starts"], found["guaranteed"]
+    said = f"{good:,} of {many:,} plans are guaranteed to satisfy it"
+    if many == 1:
+        said = "the plan is guaranteed to satisfy it" if good else "no guarantee that the plan satisfies it"
+    lines = [f"{found['scenario']}: {said}{within}"]
+    width = max(map(len, found["requirements"]))
+    for name, each in found["requirements"].items():
+        low, high = (number(float(each[end])) for end in ("low", "high"))
+        count = f"   {each['guaranteed']:,} guaranteed" if many > 1 else ""
+        lines.append(f"  {name:<{width}}  {low} to {high}{count}")
+    return lines
+
+
+def _found_lines(plans: Plans) -> list[str]:
     from stlc.controller.evaluation.held_out import wilson
     from stlc.view.words import interval, number
     from stlc.view.words import seconds as duration
@@ -132,13 +195,13 @@ def _lines(plans: Plans) -> list[str]:
 
     count, good, spent = plans["starts"], plans["satisfied"], plans["seconds"]
     least, middle, greatest = (number(float(value)) for value in plans["robustness"].values())  # type: ignore[arg-type]
-    judged, end = f"{plans['evaluations']:,.0f} plans judged", f"trace {plans['trace']}"
+    judged = f"{plans['evaluations']:,.0f} plans judged"
     if count == 1:
         verdict = f"the plan {'satisfies' if good else 'violates'} it, robustness {least}"
         if plans["infeasible"]:
             verdict = "there is no satisfying plan, proved"
         cost = f"{plans['method']}: {duration(spent['mean'])}, {judged}"
-        return [f"{plans['spec']}: {verdict}", cost, end]
+        return [f"{plans['spec']}: {verdict}", cost]
     proved = f", {plans['infeasible']:,} proved infeasible" if plans["infeasible"] else ""
     within = f"{percent(good / count)}, 95 % interval {interval(wilson(good / count, count))}"
     return [
@@ -146,5 +209,4 @@ def _lines(plans: Plans) -> list[str]:
         f"robustness {least} to {greatest}, median {middle}",
         f"{plans['method']}: {duration(spent['mean'])} of processor time a plan (median "
         f"{duration(spent['median'])}, most {duration(spent['most'])}), {judged} for each",
-        end,
     ]

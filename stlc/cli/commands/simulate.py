@@ -32,6 +32,7 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
+from stlc.registry import GUARDS, guard_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -48,11 +49,6 @@ if TYPE_CHECKING:
 
 ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"
-GUARDS: dict[Mode, tuple[Mode, ...]] = {
-    "none": ("none",),
-    "paper": ("none", "paper"),
-    "full": ("none", "full"),
-}
 
 
 @command(
@@ -73,15 +69,15 @@ def simulate(
     guard: Annotated[
         str | None,
         typer.Option(
-            metavar="none|paper|full",
-            help="Guard, by default none; `full` repairs plans before it tries the backup.",
+            metavar="|".join(GUARDS),
+            help="Guard, by default none; `full` also repairs plans, `certified` also bounds errors.",
         ),
     ] = None,
     time_limit: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
-            help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
+            help="Time limit of a guard's decision per agent, or `none`; 100ms unless it is the paper's.",
         ),
     ] = None,
     ceiling: Annotated[
@@ -333,7 +329,7 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
     rules = rules_of(run)
     margin = order.requested.of(run.task, run.policy, order.guard, order.setting.replan)
     order = replace(order, setting=replace(order.setting, margin=margin))
-    for mode in GUARDS[order.guard]:
+    for mode in dict.fromkeys(("none", order.guard)):
         title = " · ".join((run.task.compiled.name, guard_words(mode).title, *([name] if name else [])))
         guarded = mode == order.guard
         watching = Watching(title, order.live, order.margins if writes and guarded else None)
@@ -427,16 +423,11 @@ def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
 
 
 def _guard(backup: bool | None, guard: str | None) -> Mode:
-    if guard not in (None, *GUARDS):
-        advice = ("--guard none, paper or full",)
-        raise usage(f"there is no guard `{guard}`", *advice)
+    named = None if guard is None else guard_named(guard)
     if backup is not None and guard is not None and backup != (guard == "paper"):
         option = "--backup" if backup else "--no-backup"
         raise usage(f"`{option}` and `--guard {guard}` contradict each other")
-    for mode in GUARDS:
-        if mode == guard:
-            return mode
-    return "paper" if backup else "none"
+    return named or ("paper" if backup else "none")
 
 
 def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:

@@ -2,6 +2,8 @@
 
 from typing import Annotated, Any, Literal, TypeAlias, TypedDict, final
 
+from stlc.registry import GuardName
+
 Num: TypeAlias = float | str
 Count = Annotated[int, 0]
 
@@ -90,7 +92,7 @@ class CertifiedInputs(TypedDict):
 class CertifiedConditions(TypedDict):
     """Options of the deployment; seeds are ranges [first, last]."""
 
-    guard: Literal["none", "paper", "full"]
+    guard: GuardName
     scenario: str | None
     overrides: dict[str, str]
     require: list[str]

@@ -28,6 +28,7 @@ from stlc.cli.framework.assured import (
     Verified,
 )
 from stlc.cli.framework.plant_documents import PlantSimulation
+from stlc.registry import GuardName
 
 if TYPE_CHECKING:
     from stlc.view.learning import Learning
@@ -386,6 +387,24 @@ class PlanSeconds(TypedDict):
     most: float
 
 
+class GuaranteedRobustness(TypedDict):
+    """Bounds on the robustness of a requirement over all initial states, and the plans that satisfy it."""
+
+    low: float | str
+    high: float | str
+    guaranteed: int
+
+
+class PlanTubes(TypedDict):
+    """Bounds for all errors of a scenario; normal noise is bounded at a number of standard deviations."""
+
+    scenario: str
+    deviations: float | None
+    guaranteed: int
+    robustness: list[float | str]
+    requirements: dict[str, GuaranteedRobustness]
+
+
 class Plans(TypedDict):
     spec: str
     system: str
@@ -397,6 +416,7 @@ class Plans(TypedDict):
     robustness: PlanRobustness
     seconds: PlanSeconds
     evaluations: float
+    tube: NotRequired[PlanTubes]
     trace: str
 
 
@@ -662,7 +682,7 @@ class SystemFacts(TypedDict):
 
 
 class GuardResult(TypedDict):
-    guard: Literal["none", "paper", "full"]
+    guard: GuardName
     drives: int
     satisfied: int
     share: Num
@@ -674,7 +694,7 @@ class GuardResult(TypedDict):
 
 
 class ClosedLoopRecord(TypedDict):
-    recommended: Literal["none", "paper", "full", None]
+    recommended: GuardName | None
     share: Num | None
     interval: list[Num] | None
     guards: list[GuardResult]

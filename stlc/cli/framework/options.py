@@ -11,13 +11,14 @@ import typer
 
 from stlc.cli.framework.completion import requirement_names, run_names
 from stlc.diagnostics import Diagnostic, UsageError, usage
-from stlc.registry import PLANNERS
+from stlc.registry import GUARDS, PLANNERS
 
 if TYPE_CHECKING:
     from stlc.controller.training.budget import Clock
     from stlc.controller.training.config import PlannerChoice
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
+GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS), help="Guard of the policy.")]
 SystemOption = Annotated[
     str | None,
     typer.Option(

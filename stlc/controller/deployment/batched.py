@@ -41,15 +41,16 @@ class Setting:
     """Options of a deployment.
 
     An agent replans every `replan` steps. It also replans immediately when an exogenous signal (role `env` in
-    the system file) has changed. A guard judges plans at run time and replaces bad ones; "paper" and "full"
-    are two guards.
+    the system file) has changed. A guard judges plans at run time and replaces bad ones; "paper", "full"
+    and "certified" are guards.
 
     Attributes:
         seeds: random seeds; each has a world of its own.
         agents: number of agents per seed.
         steps: number of steps.
         replan: replanning period in steps.
-        limit: time limit of a decision of the guard "full", in seconds per agent; None: no limit.
+        limit: time limit of a decision of the guards "full" and "certified", in seconds per agent; None: no
+            limit.
         ceiling: number of visited states, over all seeds, for which feasibility is checked. A state counts as
             feasible if the followed plan satisfies the specification, or if a search finds another plan that
             satisfies it.

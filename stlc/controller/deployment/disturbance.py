@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -32,6 +32,41 @@ _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
 """Random streams of a seed, one per use, so that a world draws the same numbers whatever is disturbed."""
 
 
+@dataclass(frozen=True, slots=True)
+class ErrorSizes:
+    """Sizes of the errors in a scenario, in the units of controls and states, float64.
+
+    Attributes:
+        gain: constant relative error of each actuator, (m,); 0 for directions (`squash: angle`).
+        offset: constant error of each actuator, (m,); 0 for all but directions.
+        push: standard deviation of the noise on each actuator, (m,).
+        blur: standard deviation of the noise on each measured state, (n,).
+        parameters: constant relative error of the numbers in the dynamics.
+    """
+
+    gain: Tensor
+    offset: Tensor
+    push: Tensor
+    blur: Tensor
+    parameters: float
+
+    @classmethod
+    def of(cls, system: System) -> ErrorSizes:
+        """Return the sizes of the errors in the scenario of a system; all are 0 without a scenario."""
+        scenario = system.decl.scenario
+        errors = scenario.errors if scenario else ErrorsDecl()
+        controls = system.decl.controls
+        angle = torch.tensor([control.squash == "angle" for control in controls], dtype=torch.float64)
+        half = 0.5 * torch.tensor([high - low for low, high in system.actuators]).double()
+        return cls(
+            errors.actuator_gain * (1.0 - angle),
+            errors.actuator_gain * angle,
+            errors.actuator_noise * torch.where(angle > 0.0, 1.0, half),
+            errors.sensor_noise * _ranges(system),
+            errors.parameters,
+        )
+
+
 class Disturbance:
     """Disturbance, measurement noise and model errors that the scenario of a system declares.
 
@@ -49,43 +84,30 @@ class Disturbance:
         self._generators, self._agents = generators, agents
         self._pushes = _drawings(scenario.disturb if scenario else ())
         self._noises = _drawings(scenario.noise if scenario else ())
-        self._errors = scenario.errors if scenario else ErrorsDecl()
+        self._sizes = ErrorSizes.of(system)
         own = [[seeded(each.initial_seed(), key) for key in range(4)] for each in generators]
         self.streams = tuple(zip(*own, strict=True))
-        angles = [control.squash == "angle" for control in system.decl.controls]
-        self._angle = torch.tensor(angles, dtype=torch.bool)
-        self._factor, self._offset = self._wrong_gains()
-        half = 0.5 * torch.tensor([high - low for low, high in system.actuators]).double()
-        self._reach = torch.where(self._angle, 1.0, half)
-        self._spread = self._errors.sensor_noise * _ranges(system)
+        signs = self._signs(_GAINS, len(self._sizes.gain))
+        self._factor, self._offset = 1.0 + self._sizes.gain * signs, self._sizes.offset * signs
 
     def acted(self, action: Tensor) -> Tensor:
         """Outputs of the actuators, (rows, m), for the commands `action`, including actuator errors."""
         given = action
-        if self._errors.actuator_gain:
+        if bool(self._sizes.gain.any() | self._sizes.offset.any()):
             given = given * self._factor.to(given) + self._offset.to(given)
-        if self._errors.actuator_noise:
+        if bool(self._sizes.push.any()):
             drawn = self._normal(_PUSHES, action.shape[1])
-            given = given + (self._errors.actuator_noise * self._reach * drawn).to(given)
+            given = given + (self._sizes.push * drawn).to(given)
         return given
 
     def truths(self, truth: System) -> list[System]:
         """True dynamics of each seed: `truth` with its constants changed by random parameter errors."""
-        off = self._errors.parameters
+        off = self._sizes.parameters
         loose = perturbable(truth.decl) if off else None
         if loose is None or not loose.numbers:
             return [truth] * len(self._generators)
         factors = 1.0 + off * self._signs(_NUMBERS, len(loose.numbers))
         return [PerturbedSystem(loose, each) for each in torch.split(factors, self._agents)]
-
-    def _wrong_gains(self) -> tuple[Tensor, Tensor]:
-        """Factors and offsets that turn a command into the output of a faulty actuator, (rows, m) each.
-
-        The sizes of the errors are given by the scenario; their signs are random.
-        """
-        off, angle = self._errors.actuator_gain, self._angle
-        signs = self._signs(_GAINS, len(angle))
-        return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)
 
     def _signs(self, stream: int, count: int) -> Tensor:
         """Draw random signs, 1 or -1, (rows, count).
@@ -124,9 +146,10 @@ class Disturbance:
         seen = x
         if self._noises:
             seen = self._changed(x, self._drawn(self._noises, x, step), clamped=False)
-        if self._errors.sensor_noise:
-            drawn = self._spread * self._normal(_BLURS, len(self._spread))
-            later = torch.zeros((len(x), x.shape[1] - len(self._spread)), dtype=drawn.dtype)
+        blur = self._sizes.blur
+        if bool(blur.any()):
+            drawn = blur * self._normal(_BLURS, len(blur))
+            later = torch.zeros((len(x), x.shape[1] - len(blur)), dtype=drawn.dtype)
             seen = seen + torch.cat((drawn, later), 1).to(x)
         return seen
 

@@ -33,6 +33,7 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.training.config import DRIVES
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
+from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,8 +42,8 @@ if TYPE_CHECKING:
 
 SEED = 1 << 40
 """Seed of the first closed-loop runs; those of `simulate` begin at 0."""
-GUARDS: tuple[Mode, ...] = ("none", "paper", "full")
-"""Guards by increasing cost."""
+COMPARED: tuple[Mode, ...] = GUARDS[: GUARDS.index("full") + 1]
+"""Guards by increasing cost. The guard "certified" needs a scenario, and training has none."""
 NARROW = 0.005
 """A guard is simulated no more once the confidence interval of its share has at most this half-width."""
 NEAR = 0.02
@@ -253,7 +254,7 @@ class _Trial:
         self.most, self.seed = most, seed
         self.make = world_type(self.task.system.decl)
         self.test = self.task.system.decl.test
-        self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in GUARDS}
+        self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in COMPARED}
 
     def simulate(self) -> None:
         """Simulate seeds until the time is used up, or until it is clear enough which guard is best."""
@@ -270,7 +271,7 @@ class _Trial:
         """
         if self.left() <= 0.0:
             return None
-        for mode in GUARDS:
+        for mode in COMPARED:
             known = self.known[mode]
             if known.seeds and known.share == 1.0:
                 break

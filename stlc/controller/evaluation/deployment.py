@@ -61,7 +61,7 @@ class Deployment:
     """Results of one guard over all seeds.
 
     Attributes:
-        guard: name of the guard: "none", "paper" or "full".
+        guard: name of the guard, one of `stlc.registry.GUARDS`.
         recording: trajectories and decisions.
         metrics: name -> mean over seeds with its confidence interval; see `metrics.METRICS`. Further entries:
             `holds.NAME`, the share of start instants at which requirement NAME holds, and the world's

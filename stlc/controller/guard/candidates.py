@@ -9,12 +9,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from math import inf
 from time import perf_counter
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.registry import GuardName
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.problem.task import Task
 
-Mode: TypeAlias = Literal["none", "paper", "full"]
+Mode: TypeAlias = GuardName
 RobustnessMargins: TypeAlias = Mapping[str, float]
 """Safety requirement -> required robustness margin, in its unit; 0 for requirements left out."""
 
@@ -206,9 +207,9 @@ class Deadline:
 class Limits:
     """Computational limits of a decision.
 
-    The guard "paper" searches for plans as Meng and Fan (2023) do. The guard "full" uses more search methods.
-    Each method is called a stage. A prefix is a sequence of first actions that a stage tries; the policy
-    plans the rest.
+    The guard "paper" searches for plans as Meng and Fan (2023) do. The guard "full" uses more search methods,
+    and so does the guard "certified", which has the limits of the guard "full". Each method is called a
+    stage. A prefix is a sequence of first actions that a stage tries; the policy plans the rest.
 
     Attributes:
         seconds: time limit of the guard "full" per agent, after which the best plan found is taken. None: no
@@ -225,7 +226,7 @@ class Limits:
         rescue: whether the guard "full" also searches for a safe plan without the policy. It does so only if
             no earlier stage found a safe plan; the search ignores all requirements that are not tagged
             `@safety`.
-        margin: name of a safety requirement -> robustness margin in the unit of the requirement. Both guards
+        margin: name of a safety requirement -> robustness margin in the unit of the requirement. Guards
             accept a plan only if it satisfies the requirement by this margin.
         paper: time limit of the guard "paper" in seconds per agent; None: no limit.
     """

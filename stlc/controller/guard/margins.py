@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import torch
@@ -25,7 +26,7 @@ from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.problem.task import Task
 from stlc.controller.streams import seeded
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.dynamics.model.algebra import add
+from stlc.dynamics.model.algebra import add, multiply
 from stlc.registry import closest
 
 if TYPE_CHECKING:
@@ -35,29 +36,55 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
 
-def with_margins(task: Task, margin: RobustnessMargins) -> Task:
+def with_margins(
+    task: Task, margin: RobustnessMargins, ramp: Mapping[str, float] = MappingProxyType({})
+) -> Task:
     """Return the task with tightened safety requirements: the robustness of each is reduced by its margin.
 
     Predicates that read only time and constants (such as `t <= 5`) are unchanged. They influence whether a
     formula holds, but their values never enter its robustness.
+
+    Args:
+        task: the task.
+        margin: name of a safety requirement -> its margin, in its unit.
+        ramp: name of a requirement -> steps in which its margin grows from 0 at the start of a plan to
+            `margin`. The margin of any other requirement is the same for all samples.
     """
     if not any(margin.values()):
         return task
-    safe = {rule.name: _tightened(rule, margin.get(rule.name, 0.0)) for rule in task.compiled.safety}
+    safe = {
+        rule.name: _tightened(rule, _amount(margin.get(rule.name, 0.0), ramp.get(rule.name)))
+        for rule in task.compiled.safety
+    }
     rules = tuple(safe.get(rule.name, rule) for rule in task.rules)
     return Task(replace(task.compiled, requirements=rules), task.plain)
 
 
-def _tightened(rule: CompiledRequirement, margin: float) -> CompiledRequirement:
+def _amount(margin: float, steps: float | None) -> ir.Num:
+    """Margin at a sample of a plan; it grows for `steps` steps unless this is None."""
+    if steps is None:
+        return ir.Const(margin)
+    share = multiply(ir.Signal(ir.ELAPSED), ir.Const(1.0 / steps))
+    return multiply(ir.Const(margin), ir.Op("min", (share, ir.Const(1.0))))
+
+
+def _tightened(rule: CompiledRequirement, margin: ir.Num) -> CompiledRequirement:
     return replace(rule, formula=tightened(rule.formula, margin), lowered=tightened(rule.lowered, margin))
 
 
-def tightened(formula: ir.Formula, margin: float) -> ir.Formula:
-    """The formula whose robustness is that of `formula` minus `margin`, for every trajectory."""
+def tightened(formula: ir.Formula, margin: ir.Num) -> ir.Formula:
+    """The formula whose predicates have a robustness that is smaller by `margin`.
+
+    If `margin` is a constant, so is the difference of the robustness of the formulas, for every trajectory.
+    """
     if isinstance(formula, ir.Predicate):
-        less = add(formula.num, ir.Const(-formula.sign * margin))
+        less = add(formula.num, _signed(margin, -formula.sign))
         return formula if formula.guard else replace(formula, num=less)
     return map_children(formula, formulas=lambda part: tightened(part, margin))
+
+
+def _signed(num: ir.Num, sign: int) -> ir.Num:
+    return ir.Const(sign * num.value) if isinstance(num, ir.Const) else multiply(ir.Const(float(sign)), num)
 
 
 SHARE = 0.99
@@ -158,7 +185,7 @@ class MarginRequest:
                 )
         found = dict.fromkeys(names, self.every)
         if self.share is not None and mode != "none":
-            steps = 1 if mode == "full" else replan
+            steps = replan if mode == "paper" else 1
             found |= calibrated_margins(task, policy, steps, self.share)
         found |= self.named
         return {name: margin for name, margin in found.items() if margin}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
 from stlc.dynamics.model.system import System
+from stlc.dynamics.scenarios.scenario import scenario_constants
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parse.parser import parse
 
@@ -38,6 +39,7 @@ def load_task(
     *,
     hint: str = HINT,
     found: Callable[[Path], None] | None = None,
+    scenario: str | None = None,
 ) -> Task:
     """Load a specification and a system, and compile the specification for the system.
 
@@ -47,9 +49,10 @@ def load_task(
         overrides: constants of the specification and keys of the system file to change, name -> text.
         hint: what the user may do if no system is named.
         found: function that receives the path of the system file before it is read.
+        scenario: name of a scenario of the system file to apply.
 
     Raises:
-        UsageError: U101, no system is named; U102, there is no such file.
+        UsageError: U101, no system is named, or there is no such scenario; U102, there is no such file.
         SpecError: the specification is invalid or does not fit the system.
         SystemFileError: the system file is invalid.
     """
@@ -62,4 +65,6 @@ def load_task(
     if found is not None:
         found(there)
     changed = dict(overrides or {})
-    return Task.of(parsed, System.load(there, changed), overrides=changed)
+    if scenario is not None:
+        changed = {**scenario_constants(there, scenario, changed), **changed}
+    return Task.of(parsed, System.load(there, changed, scenario=scenario), overrides=changed)

@@ -217,6 +217,28 @@ class FormOps:
         half = 0.5 * (0.25 / slope - start)
         return x.times(slope).widened(start + half, half + slope * slack)
 
+    def sin(self, x: Forms) -> Forms:
+        """Sine: the tangent at the centre, from which it is off by at most half the squared radius."""
+        return self._wave("sin", x, np.sin(x.centre), np.cos(x.centre))
+
+    def cos(self, x: Forms) -> Forms:
+        """Cosine: the tangent at the centre, from which it is off by at most half the squared radius."""
+        return self._wave("cos", x, np.cos(x.centre), -np.sin(x.centre))
+
+    def _wave(self, name: str, x: Forms, value: Floats, slope: Floats) -> Forms:
+        """Tangent of a function whose second derivative is within [-1, 1]; its range if `x` is wide."""
+        radius = x.radius
+        found = x.times(slope).widened(value - slope * x.centre, 0.5 * radius**2 + SLACK)
+        keep = radius <= 1.0
+        if keep.all():
+            return found
+        plain = self._by_range(name, x)
+        return Forms(
+            np.where(keep, found.centre, plain.centre),
+            found.generators * keep,
+            np.where(keep, found.rest, plain.rest),
+        )
+
     def gt(self, a: Operand, b: Operand) -> Belief:
         """`a > b`."""
         found = self.sub(a, b).range

@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from stlc.compile.backends.array.arith import ArrayProgram
+from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import sampler_names
@@ -25,6 +28,9 @@ from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.model.algebra import map_parts
 from stlc.trace import load_trace
 from stlc.trace.formats.npz import read_npz
+
+Draw: TypeAlias = Callable[[str, list[Any]], Array]
+"""Function from the name of a sampler, such as `uniform`, and its arguments to its value."""
 
 _HARD = Hard()
 _SAMPLERS = frozenset(sampler_names())
@@ -114,13 +120,35 @@ class Drawing:
 
         `env` maps the names that the assignment reads to their values (count,); it must not be empty.
         """
+        value: Tensor = self.value(env, TORCH, partial(_draw, rows=rows))
+        return value.expand(rows.count)
+
+    def value(self, env: Mapping[str, Array], ops: Ops, draw: Draw) -> Array:
+        """Return the assigned values, where `draw` gives the value of each sampler.
+
+        Args:
+            env: name -> array, for the names that the assignment reads; it must not be empty.
+            ops: the array library of `env`.
+            draw: function from the name of a sampler and its arguments to its value.
+        """
         if self._calls:
             env = dict(env)
             for call in self._calls:
-                args = call.args(env, TORCH, _HARD)
-                env[call.name] = _draw(call.sampler, [args[str(i)] for i in range(call.arity)], rows)
-        value: Tensor = self._program(env, TORCH, _HARD)[self.name]
-        return value.expand(rows.count)
+                args = call.args(env, ops, _HARD)
+                env[call.name] = draw(call.sampler, [args[str(i)] for i in range(call.arity)])
+        return self._program(env, ops, _HARD)[self.name]
+
+    @property
+    def samplers(self) -> frozenset[str]:
+        """Names of the samplers in the value, such as `uniform`."""
+        return frozenset(call.sampler for call in self._calls)
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """Names of the columns that the assignment reads, in the arguments of its samplers, too."""
+        programs = (self._program, *(call.args for call in self._calls))
+        drawn = {call.name for call in self._calls}
+        return frozenset().union(*(program.columns for program in programs)) - drawn
 
     def _extract(self, num: ir.Num) -> ir.Num:
         """Return the number with each sampler, such as `uniform(0, 1)`, replaced by a column.

@@ -7,6 +7,7 @@ An undefined result, such as 0 / 0 or the root of a negative number, is the inte
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeAlias, final
@@ -21,6 +22,9 @@ End: TypeAlias = Any
 
 EPSILON = float(np.finfo(np.float64).eps)
 """Distance from 1 to the next float64, 2^-52."""
+
+_MOST = 1 << 20
+"""Elements of the largest intermediate results whose memory is kept."""
 
 TINY = 5e-324
 """Least positive float64. Products below the normal range are off by less than this."""
@@ -173,7 +177,37 @@ def add(a: Operand, b: Operand) -> Intervals:
     """`a + b`."""
     (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
     low = a_low + b_low
-    return widened(low, low if a_low is a_high and b_low is b_high else a_high + b_high)
+    if a_low is a_high and b_low is b_high:
+        return widened(low, low)
+    return _moved_apart(low, a_high + b_high)
+
+
+class _Memory(threading.local):
+    """Memory of intermediate results, one array per thread: new large arrays cost more than sums."""
+
+    def __init__(self) -> None:
+        self._values = np.empty(0)
+
+    def like(self, values: Floats) -> Floats:
+        """Array of the same shape, valid until the next call."""
+        if self._values.size < values.size:
+            self._values = np.empty(values.size)
+        return self._values[: values.size].reshape(values.shape)
+
+
+_MEMORY = _Memory()
+
+
+def _moved_apart(low: End, high: End) -> Intervals:
+    """`widened` by the rounding error of one operation, in the memory of two new arrays."""
+    if not isinstance(low, np.ndarray) or low.size > _MOST:
+        return widened(low, high)
+    slack = _MEMORY.like(low)
+    for end, move in ((low, np.subtract), (high, np.add)):
+        np.abs(end, out=slack)
+        slack *= EPSILON
+        move(end, slack, out=end)
+    return known(low, high)
 
 
 def mul(a: Operand, b: Operand) -> Intervals:
