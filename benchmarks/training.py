@@ -405,9 +405,34 @@ class SeedGroup:
         """Accuracy on the held-out states, one number per seed."""
         return tuple(float(each["accuracy"]) for each in self.results)
 
+    @property
+    def judged(self) -> tuple[int, ...]:
+        """Number of held-out states on which each result's policy was judged."""
+        return tuple(map(judged_states, self.results))
+
     def mean(self, name: str) -> float:
         """Return the mean over the seeds of the number that the results store under `name`."""
         return fmean(float(each[name]) for each in self.results)
+
+
+def judged_states(result: Result) -> int:
+    """Return the number of held-out states that the accuracy of a stored training result is a share of.
+
+    These are the first of the requested states: the evaluation of a slow policy ends before the last of them.
+    """
+    return int(result.get("held_out", result["key"]["held_out"]))
+
+
+def fewer_text(judged: Sequence[int], held_out: int) -> str:
+    """Return the number of judged states as text, such as ` (of 80 states)`; "" if all were judged.
+
+    Args:
+        judged: number of judged states, one per seed.
+        held_out: number of requested states.
+    """
+    if min(judged) == held_out:
+        return ""
+    return f" (of {', '.join(map(str, dict.fromkeys(judged)))} states)"
 
 
 def grouped(results: Iterable[Result]) -> list[SeedGroup]:
