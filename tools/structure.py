@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import tokenize
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,6 +18,10 @@ CRUMB = 100
 """Lines below which a module with one importer should be merged into it."""
 NODES = 6
 """Number of distinguished node classes from which on a function counts as a tree traversal."""
+_NO_CODE = (
+    *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
+    *(tokenize.ENCODING, tokenize.ENDMARKER),
+)
 TREES = ("stlc.grammar.ast", "stlc.compile.ir.nodes", "stlc.compile.ir.typed")
 """Modules that define the tree classes."""
 
@@ -48,6 +53,14 @@ class House:
         return {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in self.files.items()}
 
     @cached_property
+    def code(self) -> dict[str, int]:
+        """Lines of code of each module: without blank lines, comments and docstrings.
+
+        A text that stands alone as a statement counts as a docstring.
+        """
+        return {name: _code_lines(path, self.trees[name]) for name, path in self.files.items()}
+
+    @cached_property
     def trees(self) -> dict[str, ast.Module]:
         """Syntax tree of each module."""
         return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in self.files.items()}
@@ -69,10 +82,11 @@ class House:
                     elif node.module in self.files:
                         yield node.module
 
-    def packages(self) -> list[tuple[str, int, int]]:
-        """Files and lines of each package, two levels deep."""
+    def packages(self) -> list[tuple[str, int, int, int]]:
+        """Files, lines and lines of code of each package, two levels deep."""
         files: Counter[str] = Counter()
         lines: Counter[str] = Counter()
+        code: Counter[str] = Counter()
         for name, count in self.lines.items():
             parts = name.split(".")
             inner = [".".join(parts[:depth]) for depth in (1, 2, 3)]
@@ -80,7 +94,8 @@ class House:
                 if (self.root / package.replace(".", "/")).is_dir():
                     files[package] += 1
                     lines[package] += count
-        return [(package, files[package], lines[package]) for package in sorted(files)]
+                    code[package] += self.code[name]
+        return [(package, files[package], lines[package], code[package]) for package in sorted(files)]
 
     def crumbs(self) -> list[str]:
         """Modules with one importer and under `CRUMB` lines, without `__init__.py` files."""
@@ -165,6 +180,22 @@ class House:
                     yield name, node
 
 
+def _code_lines(path: Path, tree: ast.Module) -> int:
+    """Number of lines of a file on which a token stands that is neither a comment nor a docstring."""
+    prose = {
+        line
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+        for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+    }
+    with path.open("rb") as file:
+        tokens = [token for token in tokenize.tokenize(file.readline) if token.type not in _NO_CODE]
+    lines = {line for token in tokens for line in range(token.start[0], token.end[0] + 1)}
+    return len(lines - prose)
+
+
 def _unlike(annotation: ast.expr) -> bool:
     """True if an annotation is a tuple of fixed length with entries of different types."""
     if not (isinstance(annotation, ast.Subscript) and ast.unparse(annotation.value) == "tuple"):
@@ -184,8 +215,8 @@ def main() -> None:
     parser.add_argument("--brief", action="store_true", help="counts alone")
     options = parser.parse_args()
     house = House(options.folder)
-    for package, files, lines in house.packages():
-        print(f"{package:40} {files:4} files {lines:6} lines")
+    for package, files, lines, code in house.packages():
+        print(f"{package:40} {files:4} files {lines:6} lines {code:6} of code")
     print()
     for title, found in (
         (f"modules with one importer and under {CRUMB} lines", house.crumbs()),
