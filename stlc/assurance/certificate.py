@@ -28,8 +28,8 @@ from stlc.assurance.bounds import (
 from stlc.assurance.conformal import (
     SAME,
     AdaptiveBound,
+    DistributionShift,
     OnlineBound,
-    Shift,
     adaptive_bound,
     calibrate_online,
     drives_for_bound,
@@ -183,7 +183,7 @@ class Claim:
 
     share: float | None = 0.99
     confidence: float = 0.95
-    shift: Shift = SAME
+    shift: DistributionShift = SAME
     any_time: bool = False
     calibration: int | None = None
     online: bool = False
@@ -371,7 +371,7 @@ def _reached(least: NDArray[np.float64], claim: Claim) -> float:
     return tolerance_bound(least, share, claim.confidence, any_time=claim.any_time)
 
 
-def _before(shift: Shift, miss: float) -> float:
+def _before(shift: DistributionShift, miss: float) -> float:
     """Greatest probability of an event before the shift with which it is at most `miss` after it."""
     low, high = 0.0, miss
     if shift.greatest(high) <= miss:
@@ -531,7 +531,7 @@ def _assumptions(found: Assessment) -> Iterator[str]:
         yield "nothing is said about what the simulated world leaves out"
 
 
-def _distance(shift: Shift) -> str:
+def _distance(shift: DistributionShift) -> str:
     names = {"tv": "total variation", "kl": "Kullback-Leibler divergence", "chi2": "chi-square divergence"}
     return f"{names[shift.kind]} {shift.size:g}"
 
@@ -552,7 +552,7 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
     claim = Claim(
         None if document["share"] is None else float(document["share"]),
         confidence,
-        SAME if document["shift"] is None else Shift.parse(str(document["shift"])),
+        SAME if document["shift"] is None else DistributionShift.parse(str(document["shift"])),
         any_time,
     )
     wrong = []

@@ -311,7 +311,7 @@ class Difference:
 
 
 @dataclass(frozen=True, slots=True)
-class Verification:
+class CertificateVerification:
     """Comparison of a certificate with a run.
 
     Attributes:
@@ -330,7 +330,7 @@ class Verification:
         return not self.inputs and not self.numbers
 
 
-def verify(document: Mapping[str, Any], folder: RunDir) -> Verification:
+def verify(document: Mapping[str, Any], folder: RunDir) -> CertificateVerification:
     """Compare a certificate with the present state of a run's folder and of the software.
 
     The policy is not loaded, so that a changed checkpoint is a difference and not an error.
@@ -344,7 +344,7 @@ def verify(document: Mapping[str, Any], folder: RunDir) -> Verification:
     scenario = conditions["scenario"]
     task = task_of_run(folder, changed, None if scenario is None else str(scenario))
     present = inputs_of(folder, task, rules_for(folder, task.system.decl))
-    return Verification(
+    return CertificateVerification(
         _different(document["inputs"], present),
         tuple(wrong_numbers(document)),
         _different(document["versions"], versions()),

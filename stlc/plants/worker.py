@@ -39,7 +39,7 @@ ORPHAN = 1.0
 """Seconds between two checks whether the process that started this one still lives."""
 
 
-class Simulator:
+class ControlledPlant:
     """A plant with its controller: simulations in parts."""
 
     def __init__(self, layout: Layout) -> None:
@@ -103,7 +103,7 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
             raise EOFError
         return found
 
-    simulator: Simulator | None = None
+    simulator: ControlledPlant | None = None
     while True:
         try:
             request = received(read)
@@ -113,7 +113,7 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
             if simulator is None:
                 layout = layout_of(request.header["layout"])
                 _limit_memory(layout.memory)
-                simulator = Simulator(layout)
+                simulator = ControlledPlant(layout)
                 reply = Message({"units": simulator.units}, np.zeros((0, 0)))
             else:
                 does: dict[str, Callable[[Any, Floats], Message]] = {

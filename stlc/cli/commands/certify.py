@@ -134,13 +134,13 @@ def certify(
     if verify is not None:
         return _verified(verify, run, runs)
     from stlc.assurance.certificate import Claim
-    from stlc.assurance.conformal import SAME, Shift
+    from stlc.assurance.conformal import SAME, DistributionShift
 
     wanted = share if share is not None or width is not None else DEFAULT_SHARE
     claim = Claim(
         None if wanted is None else checked_share("--share", wanted),
         checked_share("--confidence", confidence),
-        SAME if shift is None else Shift.parse(shift),
+        SAME if shift is None else DistributionShift.parse(shift),
         online=True,
     )
     if width is not None:

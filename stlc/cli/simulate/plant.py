@@ -67,7 +67,7 @@ class PlantOrder:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class RequirementResult:
     """Result of one requirement on one simulation.
 
     Attributes:
@@ -107,7 +107,7 @@ class JudgedRun:
     point: Mapping[str, float]
     samples: int
     status: Status | None
-    requirements: tuple[Judged, ...] = ()
+    requirements: tuple[RequirementResult, ...] = ()
     finding: PlantFinding | None = None
 
 
@@ -257,7 +257,7 @@ def _judged(plant: Plant, monitor: Monitor, run: PlantRun) -> JudgedRun:
     rows = []
     for each in verdict:
         low, high = (float(end.min()) for end in each.margins)
-        rows.append(Judged(each.rule, each.statuses[0], low, high, float(each.least[0])))
+        rows.append(RequirementResult(each.rule, each.statuses[0], low, high, float(each.least[0])))
     return JudgedRun(run.seed, point, run.outcome.samples, verdict.statuses[0], tuple(rows))
 
 
@@ -279,7 +279,7 @@ def _streamed(
             yield JudgedRun(seed, named, 0, None, finding=finding)
             continue
         rows = [
-            Judged(online.rule(name), tally.status, tally.low, tally.high, tally.robustness)
+            RequirementResult(online.rule(name), tally.status, tally.low, tally.high, tally.robustness)
             for name, tally in online.finish().items()
         ]
         found = {each.status for each in rows}

@@ -13,7 +13,7 @@ import typer
 from stlc.cli.framework.documents import TrainedRun, verdict_record
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import PULSE, Answer, console, say, show_diagnostics
-from stlc.cli.train.progress import Progress, final_screen
+from stlc.cli.train.progress import TrainingDisplay, final_screen
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
@@ -53,7 +53,7 @@ class Session:
 
     folder: RunDir
     outcome: TrainingOutcome | None = None
-    progress: Progress = field(default_factory=Progress)
+    progress: TrainingDisplay = field(default_factory=TrainingDisplay)
     logger: Opener | None = None
     writes: bool = True
     _log: TensorBoardLogger | None = None

@@ -32,7 +32,7 @@ from stlc.compile.frontend.regions import area, dimension, points, signed_distan
 from stlc.compile.frontend.scope import External, Scope
 from stlc.compile.frontend.values import (
     REGION_TYPES,
-    Box,
+    BoxRegion,
     Combined,
     Complement,
     Dilated,
@@ -146,7 +146,7 @@ def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]],
     return NormBall(center, radius, call.span)
 
 
-def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Box:
+def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> BoxRegion:
     lower, upper = (
         as_vector(value, expr, Expectation("a corner of a box is a vector"), scope) for expr, value in given
     )
@@ -162,7 +162,7 @@ def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scop
             scope.fail(
                 Diagnostic("E205", "this box is empty: a lower bound is above the upper one", call.span)
             )
-    return Box(lower, upper, call.span)
+    return BoxRegion(lower, upper, call.span)
 
 
 def _polygon_of(call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Polygon:

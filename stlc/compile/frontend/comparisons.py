@@ -12,7 +12,7 @@ from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.sweep import swept_distance
 from stlc.compile.frontend.values import (
     REGION_TYPES,
-    Box,
+    BoxRegion,
     Complement,
     Number,
     Operand,
@@ -253,7 +253,7 @@ def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: S
             as_number(value, end, Expectation("`in [lo, hi]` compares numbers", "a bound"), scope)
             for end, value in region
         ]
-        place: Region = Box(VectorValue((ends[0],)), VectorValue((ends[1],)), expr.region.span)
+        place: Region = BoxRegion(VectorValue((ends[0],)), VectorValue((ends[1],)), expr.region.span)
     elif isinstance(region[0].value, REGION_TYPES):
         place = region[0].value
     else:

@@ -14,7 +14,7 @@ from typing import TypeVar
 from stlc.compile.frontend.arithmetic import agree, apply, cross, dot, gap, minus, negated, norm
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
-    Box,
+    BoxRegion,
     Combined,
     Complement,
     Dilated,
@@ -116,7 +116,7 @@ def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
 def dimension(region: Region) -> int:
     """Return the number of coordinates of the points of a region."""
     match region:
-        case NormBall(vector) | Box(vector) | HalfSpace(vector):
+        case NormBall(vector) | BoxRegion(vector) | HalfSpace(vector):
             return len(vector.items)
         case Polygon():
             return 2
@@ -144,7 +144,7 @@ def signed_distance(point: VectorValue, region: Region, span: Span, scope: Scope
         case NormBall(center, radius):
             away = norm(minus(point, center, span, scope), span, scope)
             return apply("sub", (radius, away), span, scope)
-        case Box(lower, upper):
+        case BoxRegion(lower, upper):
             return _box(point, lower, upper, span, scope)
         case HalfSpace(normal, offset):
             room = gap(offset, dot(normal, point, span, scope), span, scope)

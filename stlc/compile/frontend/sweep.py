@@ -31,7 +31,7 @@ from stlc.compile.frontend.regions import (
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
     REGION_TYPES,
-    Box,
+    BoxRegion,
     Combined,
     Complement,
     Dilated,
@@ -103,7 +103,7 @@ class _Sweep:
                 return self.apply(which, *self.at_ends(region), *clearances)
             case NormBall(center, radius) if which == "max":
                 return self.apply("sub", self.apply("max", radius, _later(radius)), self.past(center))
-            case Box() if which == "max":
+            case BoxRegion() if which == "max":
                 return self._over_box(region)
             case Polygon(corners) if which == "max":
                 outside = [self.negative(self.past(corner)) for corner in corners]
@@ -113,7 +113,7 @@ class _Sweep:
 
     # ------------------------------------------------------------------ convex regions
 
-    def _over_box(self, box: Box) -> Number:
+    def _over_box(self, box: BoxRegion) -> Number:
         faces = []
         for axis, sides in enumerate(zip(box.lower.items, box.upper.items, strict=True)):
             for face, sign in zip(sides, (1, -1), strict=True):

@@ -215,7 +215,7 @@ def _network(widths: Sequence[int], last: float) -> nn.Sequential:
 
 
 @dataclass(frozen=True, slots=True)
-class Episodes:
+class EpisodeBatch:
     """Transitions of one episode in every environment.
 
     Attributes:
@@ -287,7 +287,7 @@ class PpoLearner(ActorLearner):
         return loss
 
     @torch.no_grad()
-    def _played(self) -> Episodes:
+    def _played(self) -> EpisodeBatch:
         """Play one episode in every environment with controls drawn from the policy."""
         environments, network = self.environments, self.network
         seen, means, raws, rewards = [environments.reset().to(self.device)], [], [], []
@@ -301,7 +301,7 @@ class PpoLearner(ActorLearner):
             seen.append(result.observation.to(self.device))
         raw, noise = torch.stack(raws), torch.stack(noises[:-1])
         density = network.density(torch.stack(means), noise, raw)
-        return Episodes(torch.stack(seen[:-1]), raw, noise, density, torch.stack(rewards))
+        return EpisodeBatch(torch.stack(seen[:-1]), raw, noise, density, torch.stack(rewards))
 
     def _noise(self) -> Tensor:
         """Draw independent standard normal numbers for the raw controls of every environment, (N, w)."""
@@ -326,7 +326,7 @@ class PpoLearner(ActorLearner):
         mean, spread = advantages.mean(), advantages.std()
         return (advantages - mean) / (spread + 1e-8), advantages + values
 
-    def _learnt(self, episodes: Episodes, advantages: Tensor, targets: Tensor) -> float:
+    def _learnt(self, episodes: EpisodeBatch, advantages: Tensor, targets: Tensor) -> float:
         """Make all gradient steps of one training step; stop early if a loss or gradient is not finite.
 
         Args:

@@ -77,7 +77,7 @@ class Eased:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class ShootingDynamics:
     """Dynamics of a system, in which the expressions of a step do not include the clamps of states.
 
     Attributes:
@@ -137,7 +137,12 @@ class Shooting:
     """
 
     def __init__(
-        self, motion: Motion, demands: Sequence[ScaledFormula], *, smoothing: float, sharpness: float
+        self,
+        motion: ShootingDynamics,
+        demands: Sequence[ScaledFormula],
+        *,
+        smoothing: float,
+        sharpness: float,
     ) -> None:
         """Build the program.
 

@@ -90,7 +90,12 @@ class Mpc:
         return partial(self._run, shooting=shooting, solve=solver)
 
     def _shooting(self, task: Task) -> Shooting:
-        from stlc.compile.backends.casadi.shooting import Motion, NotSmoothError, ScaledFormula, Shooting
+        from stlc.compile.backends.casadi.shooting import (
+            NotSmoothError,
+            ScaledFormula,
+            Shooting,
+            ShootingDynamics,
+        )
         from stlc.compile.semantics.kinds.smooth import LogSumExp
 
         system = task.system
@@ -98,7 +103,7 @@ class Mpc:
         bounds = zip(system.control_low.tolist(), system.control_high.tolist(), strict=True)
         step = {**free.next, **{timer.name: timer.update for timer in system.timers}}
         named = dict(zip(system.control_names, bounds, strict=True))
-        motion = Motion(free.lets, step, system.decl.clamps, named, system.horizon)
+        motion = ShootingDynamics(free.lets, step, system.decl.clamps, named, system.horizon)
         rules = [ScaledFormula(rule.under(LogSumExp()), rule.weight / rule.scale) for rule in task.rules]
         try:
             return Shooting(motion, rules, smoothing=self.smoothing, sharpness=self.sharpness)
