@@ -339,13 +339,11 @@ class ModelLearner(Learner):
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def facts(self) -> dict[str, float | int]:
-        """Numbers that a checkpoint stores in addition to `tensors`."""
         error = {"model_error": self.error} if not math.isnan(self.error) else {}
         own = {"fitted": self.fitted, "environment_steps": self.environment_steps}
         return super().facts() | own | error
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         self.episodes.restore(below(tensors, "episodes"))
         self.ensemble.load_state_dict(below(tensors, "ensemble"))

@@ -255,7 +255,6 @@ class MbpoLearner(ModelLearner):
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         self.actor_critic.restore(tensors)
 

@@ -210,11 +210,9 @@ class PacedTracker:
         return self._inner.settled
 
     def live(self, start: int, stop: int) -> RobustnessBounds:
-        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
         return self._inner.live(start, stop)
 
     def ended(self, starts: range) -> RobustnessBounds:
-        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:

@@ -134,7 +134,6 @@ class _CutTracker(ABC):
         return RobustnessBounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
     def ended(self, starts: range) -> RobustnessBounds:
-        """Return final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
@@ -174,7 +173,6 @@ class _ColumnTracker(_CutTracker):
         return RobustnessBounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; return the index of the first sample still needed."""
         for side in self._sides:
             side.drop(start - self._back)
         return first_needed(self.planned, self.samples)
@@ -318,7 +316,6 @@ class IntervalTracker:
 
     @property
     def samples(self) -> int:
-        """Number of samples received."""
         return self.shared.samples
 
     @property
@@ -334,7 +331,6 @@ class IntervalTracker:
         self.shared.grow(signals, first, samples)
 
     def live(self, start: int, stop: int) -> RobustnessBounds:
-        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
         if stop <= start:
             return RobustnessBounds(np.zeros(0), np.zeros(0))
         return RobustnessBounds(*self.shared.values(self.which, start, stop).T)
@@ -496,14 +492,12 @@ class UnboundedTracker:
             front.advance(samples - self._lag)
 
     def live(self, start: int, stop: int) -> RobustnessBounds:
-        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
         if stop <= start:
             return RobustnessBounds(np.zeros(0), np.zeros(0))
         low, high = self._fronts[:2]
         return RobustnessBounds(low.value(self.samples)[0], high.value(self.samples)[0])
 
     def ended(self, starts: range) -> RobustnessBounds:
-        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         fronts = self._fronts[-2:]
         last = [replace(front, side=front.side.over()) for front in fronts]
         found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
@@ -594,7 +588,6 @@ class RecomputeTracker(_CutTracker):
         return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> RobustnessBounds:
-        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
         low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
         return RobustnessBounds(low[:, 0], high[:, 0])
 

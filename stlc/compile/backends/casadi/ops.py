@@ -158,11 +158,9 @@ class CasadiOps:
     minimum = _elementwise(lambda a, b: _rounded(a, b, -1.0))
 
     def axpy(self, a: Operand, b: SymbolicColumn, factor: float) -> SymbolicColumn:
-        """`a + factor * b`."""
         return b * factor + a
 
     def addcmul(self, a: Operand, b: SymbolicColumn, c: SymbolicColumn, factor: float) -> SymbolicColumn:
-        """`a + factor * b * c`."""
         return b * c * factor + a
 
     def clamp(self, x: SymbolicColumn, low: float | None, high: float | None) -> SymbolicColumn:
@@ -172,7 +170,6 @@ class CasadiOps:
         return held
 
     def norm(self, *components: Operand) -> SymbolicColumn:
-        """Euclidean norm of a vector given by its components."""
         total = sum(part * part for part in map(_entries, components))
         return SymbolicColumn(casadi.sqrt(total + TINY))
 
@@ -187,7 +184,6 @@ class CasadiOps:
         return mask
 
     def lerp(self, no: Operand, yes: Operand, weight: SymbolicColumn) -> SymbolicColumn:
-        """`no + weight (yes - no)`."""
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
