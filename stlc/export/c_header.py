@@ -345,7 +345,7 @@ def _numbers(task: Task, network: PlanNetwork) -> dict[str, object]:
         "LENGTH_COUNT": len(grid.lengths),
         "SAMPLES": grid.samples,
         "RANDOM": int(grid.sampling == "random"),
-        "GENERATORS": _generators(len(controls) * max(grid.lengths, default=1)),
+        "GENERATORS": ", ".join(map("{}u".format, generators(len(controls) * max(grid.lengths, default=1)))),
         "LEVEL_COUNTS": ", ".join(str(len(values)) for values in grid.values),
         "MOST_LEVELS": max(map(len, grid.values)),
         "LEVELS": ", ".join("{" + ", ".join(map(literal, values)) + "}" for values in grid.values),
@@ -428,10 +428,6 @@ def _description(timer: Timer) -> str:
             return timer.about
         case _:
             assert_never(timer.kind)
-
-
-def _generators(dims: int) -> str:
-    return ", ".join(f"{each}u" for each in generators(dims))
 
 
 def _block(lines: Sequence[str]) -> str:

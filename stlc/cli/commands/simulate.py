@@ -172,9 +172,11 @@ def simulate(
         overrides = parse_overrides(set_)
         given = PlantOrder(run, plant, from_, seeds, record, jobs, stream, overrides, fail_under)
         own = {"--backup": backup, "--guard": guard, "--scenario": scenario, "--method": method}
-        _no_policy({**own, "--certify": certify})
+        why = "is for trained policies and planners, and `--plant` has neither"
+        _refuse_given({**own, "--certify": certify}, why)
         return simulate_plant(given)
-    _no_plant({"--from": from_, "--stream": stream or None})
+    advice = "stlc simulate SPEC --plant FILE"
+    _refuse_given({"--from": from_, "--stream": stream or None}, "is for plants", advice)
     from stlc.cli.simulate.text import closing, screen
     from stlc.controller.deployment.simulator import Setting
     from stlc.controller.guard.margins import parse_margins
@@ -233,18 +235,11 @@ def _require_writable(record: Path | None, margins: str | None) -> None:
     require_writable(margins)
 
 
-def _no_policy(options: Mapping[str, object]) -> None:
-    """Raise UsageError (U101) if an option of trained policies is given with `--plant`."""
+def _refuse_given(options: Mapping[str, object], why: str, *advice: str) -> None:
+    """Raise UsageError (U101) with the reason `why` if one of the options has a value other than None."""
     for name, value in options.items():
         if value is not None:
-            raise usage(f"`{name}` is for trained policies and planners, and `--plant` has neither")
-
-
-def _no_plant(options: Mapping[str, object]) -> None:
-    """Raise UsageError (U101) if an option of plants is given without `--plant`."""
-    for name, value in options.items():
-        if value is not None:
-            raise usage(f"`{name}` is for plants", "stlc simulate SPEC --plant FILE")
+            raise usage(f"`{name}` {why}", *advice)
 
 
 def _planner(

@@ -119,7 +119,7 @@ class _Watched:
         begin = max(self.needs(), first)  # a constant number of samples: its schedule is cached
         starts = range(self.next - begin, stop - begin)
         self.whole.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
-        shape = (len(starts), _traces(env))
+        shape = (len(starts), next(iter(env.values())).shape[1])
         low, high = (np.broadcast_to(end, shape) for end in self.whole.of_all(starts))
         fails, holds = high < -TOLERANCE, low >= -TOLERANCE
         if len(self.violated) != low.shape[1]:
@@ -196,7 +196,3 @@ class Margins:
             self._found, self._evaluated = dict(zip(self.requirements, found, strict=True)), self.samples
             self._history.forget(min([each.needs() for each in self._watched], default=self.samples))
         return self._found
-
-
-def _traces(env: Mapping[str, Floats]) -> int:
-    return int(next(iter(env.values())).shape[1])

@@ -213,10 +213,6 @@ class BoundedTracker(_ColumnTracker):
         return max(self.samples - self._ahead - self.planned.lag, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         for side in self._sides:
             side.grow(signals, first, samples)
         self.samples = samples
@@ -324,10 +320,6 @@ class IntervalTracker:
         return max(self.shared.samples - self.ahead, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         self.shared.grow(signals, first, samples)
 
     def live(self, start: int, stop: int) -> RobustnessBounds:
@@ -385,10 +377,6 @@ class PlanningWindowTracker(_ColumnTracker):
         return max(self.samples - self.window, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         for now in range(self.samples + 1, samples + 1) if self._beyond else (samples,):
             known = {name: values[: now - first] for name, values in signals.items()}
             for side in self._sides:
@@ -482,10 +470,6 @@ class UnboundedTracker:
         return 0
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         self.samples = samples
         for front in self._fronts:
             front.side.grow(signals, first, samples)
@@ -546,10 +530,6 @@ class RecomputeTracker(_CutTracker):
         return max(self.samples - ahead - looks_on(self.rule.formula), 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         self._signals, self.samples = signals, samples
 
     @property

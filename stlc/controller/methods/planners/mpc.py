@@ -19,7 +19,7 @@ from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.training.local_search import Searcher
-from stlc.diagnostics import Diagnostic, MissingError, usage
+from stlc.diagnostics import not_installed, usage
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
@@ -72,8 +72,7 @@ class Mpc:
         try:
             import casadi
         except ModuleNotFoundError:
-            finding = Diagnostic("R301", "planner `mpc` needs casadi", help=("pip install 'stlc[mpc]'",))
-            raise MissingError(finding) from None
+            raise not_installed("planner `mpc` needs casadi", "mpc") from None
         shooting = self._shooting(task)
         options: dict[str, Any] = {
             "print_time": False,
