@@ -1,4 +1,4 @@
-"""Statistical certificates: what judged drives say about future ones, with the assumptions in words.
+"""Statistical certificates: bounds on future drives from judged ones, with the assumptions in words.
 
 A drive is one agent in one simulated world, or one recorded trace. The drives of a world may influence each
 other, so the observations that bounds count are independent *units*: worlds, or drives if nothing couples
@@ -169,7 +169,7 @@ def together(judged: Sequence[Judged], weights: Mapping[str, float] | None = Non
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What is asked of the drives.
+    """Request: the share of drives to certify, and the bounds to compute.
 
     Attributes:
         share: share of future drives to certify; None if the share is only measured.
@@ -254,7 +254,7 @@ def _counted(tally: Tally) -> tuple[int, int] | None:
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What the drives say about one requirement.
+    """Bounds on one requirement, from a sample of drives.
 
     Attributes:
         name: name of the requirement.
@@ -364,7 +364,10 @@ def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
 
 
 def _reached(least: NDArray[np.float64], claim: Claim) -> float:
-    """Robustness that the requested share of future units reaches; without that shift, of observed ones."""
+    """Lower bound on the robustness that the requested share of future units reaches.
+
+    `least` is the least robustness of each observed unit, (units,). The result is -inf if there is no bound.
+    """
     share = 1.0 - _before(claim.shift, 1.0 - claim.target)
     if not 0.0 < share < 1.0:
         return -math.inf
@@ -372,7 +375,7 @@ def _reached(least: NDArray[np.float64], claim: Claim) -> float:
 
 
 def _before(shift: DistributionShift, miss: float) -> float:
-    """Greatest probability of an event before the shift with which it is at most `miss` after it."""
+    """Greatest probability of an event before the shift, such that it is at most `miss` after the shift."""
     low, high = 0.0, miss
     if shift.greatest(high) <= miss:
         return high
@@ -387,10 +390,10 @@ def _before(shift: DistributionShift, miss: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """What a sample of drives says about future drives.
+    """Bounds on future drives: a statement on each requirement, and the answer to the claim.
 
     Attributes:
-        claim: what was asked.
+        claim: the request.
         overall: statement on all requirements together.
         requirements: statement on each requirement.
         noun: what an independent unit is.
@@ -425,7 +428,7 @@ class Assessment:
         return {"certified": 0, "measured": 0, "refuted": 1, "undecided": 4}[self.answer]
 
     def assumptions(self) -> list[str]:
-        """Conditions under which the bounds hold, a sentence each, from the most particular on."""
+        """Conditions under which the bounds hold, a sentence each; the most specific comes first."""
         return list(_assumptions(self))
 
     def summary(self) -> dict[str, Any]:
@@ -466,7 +469,7 @@ class Assessment:
 
 
 def assess(sample: Sample, claim: Claim) -> Assessment:
-    """Compute what a sample of at least one drive says."""
+    """Compute the bounds on future drives from a sample of at least one drive."""
     sizes = sample.sizes
     ordered = sample.least(sample.overall.robustness).tolist() if claim.adaptive else None
     return Assessment(

@@ -205,7 +205,7 @@ class OnlineBound:
 
     @property
     def margins(self) -> NDArray[np.float64]:
-        """What is subtracted from the prediction at each step, (steps,)."""
+        """Numbers that are subtracted from the prediction at each step, (steps,)."""
         return self.radius * self.scale
 
 

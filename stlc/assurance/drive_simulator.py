@@ -75,7 +75,7 @@ class DriveSimulator:
         return tuple(each.name for each in self._verdict(self.drive(np.full((1, 1), 0.5))))
 
     def seen(self, requirement: int) -> float:  # noqa: ARG002
-        """1: a drive has no input signals."""
+        """Return 1, since a drive has no input signals."""
         return 1.0
 
     def simulate(self, points: NDArray[np.float64]) -> Simulations:
@@ -101,7 +101,7 @@ class DriveSimulator:
         return trace_of(self.run, self.drive(points), self._at(points), self._rules)
 
     def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:  # noqa: ARG002
-        """None: a world has the time step for which it was written, and the policy that of its training."""
+        """Return None, since the time steps of a world and of a trained policy cannot be changed."""
         return None
 
     def _verdict(self, recording: DeploymentRecording) -> Verdict:

@@ -135,7 +135,7 @@ class Campaign:
         rules: specification of drives; None if that of the plans judges them.
         guard: name of the guard.
         setting: options of each deployment; its seeds are not used.
-        claim: what is asked of the drives.
+        claim: the claim that the drives are to decide.
         require: names of the requirements that count; all if empty.
         width: width of the interval at which the deployment stops; None: it stops once the claim is decided.
         overrides: values of `--set` in the deployment.
@@ -160,7 +160,7 @@ class Progress:
     """State of a sequential deployment after a batch.
 
     Attributes:
-        assessment: what the drives so far say.
+        assessment: bounds from the drives so far.
         seeds: seeds so far.
         batches: number of batches so far.
         done: whether no further batch follows.
@@ -173,7 +173,7 @@ class Progress:
 
 
 def campaign(order: Campaign, watch: Watch | None = None) -> Iterator[Progress]:
-    """Deploy batch by batch, and yield what is known after each.
+    """Deploy in batches, and yield the state of the deployment after each batch.
 
     Without fixed seeds, the deployment stops once the claim is answered, or the interval is as narrow as
     asked, or there are `order.most` units; only bounds that are valid at any stopping time are then used.

@@ -66,7 +66,7 @@ class ModelSimulator:
         return cls(task, None if decl.discrete else lambda: load_task(spec, system, halved))
 
     def renewed(self) -> ModelSimulator:
-        """Return the same simulator before its first simulation: its guidance is scaled anew."""
+        """Return a copy without earlier simulations, which measures the scales of the guidance anew."""
         made = ModelSimulator(self.task, self.finer, self.batch)
         made.__dict__.update(points=self.points, space=self.space, _finer=self._finer)
         return made
@@ -90,7 +90,10 @@ class ModelSimulator:
         return SearchSpace(self.points.dim, tuple(blocks))
 
     def _time_coordinates(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Coordinates of the free switching times of an input: each is the last of those that affect it."""
+        """Coordinates of the free switching times `names` of an input.
+
+        A time is computed from several coordinates; the last of them belongs to this time alone.
+        """
         return self.points.last_coordinates_of(names)
 
     @cached_property

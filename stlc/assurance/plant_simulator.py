@@ -77,7 +77,7 @@ class PlantSimulator:
         return self.monitor.requirements
 
     def seen(self, requirement: int) -> float:  # noqa: ARG002
-        """1: the whole simulation may matter."""
+        """Return 1, since all values of an input may affect a requirement."""
         return 1.0
 
     def simulate(self, points: NDArray[np.float64]) -> Simulations:
@@ -88,7 +88,7 @@ class PlantSimulator:
         return Simulations(margins, margins, ~failed)
 
     def at_half_step(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:  # noqa: ARG002
-        """None: a black box has the time step of its file."""
+        """Return None, since the time step of a black box is fixed by its plant file."""
         return None
 
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002

@@ -98,7 +98,10 @@ class VertexSampling(Strategy):
 
 
 class HillClimbing(Strategy):
-    """Steps from the best of a few points with long pieces: single values, or runs of values of an input."""
+    """Local search, which begins at the best of a few points with long pieces.
+
+    A step changes single values, or a run of successive values of an input.
+    """
 
     name = "hill climbing"
 
