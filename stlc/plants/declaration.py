@@ -234,7 +234,7 @@ class PlantDecl:
         path: path of the plant file.
         source: text of the plant file.
         kind: kind of plant, an entry of `stlc.plants.kinds.KINDS`.
-        options: what the file says about the plant itself.
+        options: keys and values under the name of the kind in the plant file.
         dt: time step in seconds.
         steps: time steps of a simulation.
         initial: start values.
@@ -273,7 +273,7 @@ class PlantDecl:
         return tuple(each.signal for each in self.inputs if each.signal is not None)
 
     def layout(self, scratch: str) -> Layout:
-        """Return what the process of the plant is told; `scratch` is its folder for temporary files."""
+        """Return the data with which the process of the plant starts; `scratch`: its temporary folder."""
         return Layout(
             kind=self.kind,
             options=self.options,

@@ -66,7 +66,7 @@ class ControlledPlant:
         return Message({"ended": False}, self._y[None])
 
     def advance(self, _header: Any, array: Floats) -> Message:
-        """Advance by a row of free inputs each, (steps, free inputs).
+        """Advance by one step for each row of the free inputs, (steps, free inputs).
 
         The reply has a row for each step that was made: the outputs after it, then the inputs that the
         controller wrote before it.
@@ -128,7 +128,7 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
 
 
 def _failure(error: BaseException, step: int) -> dict[str, Any]:
-    """Header of the reply to a request that failed; other errors than ours are printed, too."""
+    """Header of the reply to a request that failed; unexpected errors, as of the plant, are also printed."""
     match error:
         case UnfitError():
             return {"unfit": str(error), "place": error.place}
