@@ -39,8 +39,8 @@ class Forms:
         centre: (batch,).
         generators: (symbols, batch); a form may have fewer than others, the missing ones are 0.
         rest: radius of the remainder, (batch,).
-        floor: values that are known to be no greater, (batch,); None if none are known. What follows a
-            `relu` is 0 at least, although its form may reach below.
+        floor: lower bounds that are known in addition to the form, (batch,); None if none are known. The
+            result of `relu`, for example, is at least 0, although its form may extend below 0.
     """
 
     centre: Floats
@@ -117,7 +117,7 @@ def _combined(a: Floats, b: Floats) -> Floats:
 class FormOps:
     """The part of `stlc.compile.backends.array.namespace.Ops` that one step of a system needs.
 
-    Other operations go by the range of the form and lose the symbols.
+    Other operations are computed on the range of the form, and their results share no symbols.
     """
 
     name = "forms"
@@ -277,7 +277,10 @@ class FormOps:
 
 
 def tanh(x: Forms) -> Forms:
-    """Hyperbolic tangent: its least slope over the range, and half of what is left (Singh et al. 2018)."""
+    """Hyperbolic tangent: a line with the least slope over the range, and the deviation from it.
+
+    Source: Singh et al. 2018.
+    """
     bound = x.range
     first, last = np.tanh(bound.low), np.tanh(bound.high)
     slope = np.minimum(1.0 - first**2, 1.0 - last**2)
