@@ -14,9 +14,12 @@ from stlc.cli.certify.text import bounds_lines, checked_share, floored, raised
 from stlc.cli.framework.assured import Certificate, CertificateCheck, DifferentEntry
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
+    DriveStepsOption,
+    MarginOption,
     RequireOption,
     RunsOption,
     SetOption,
+    TimeLimitOption,
     parse_limit,
     parse_overrides,
     parse_seeds,
@@ -41,24 +44,10 @@ class Driving:
     """Options on how the policy is deployed."""
 
     guard: Annotated[str, typer.Option(metavar="none|paper|full", help="Guard of the policy.")] = "none"
-    time_limit: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
-        ),
-    ] = None
-    margin: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="M|NAME=M|auto",
-            help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
-        ),
-    ] = None
+    time_limit: TimeLimitOption = None
+    margin: MarginOption = None
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="A scenario of the system.")] = None
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")] = (
-        None
-    )
+    steps: DriveStepsOption = None
     agents: Annotated[
         int | None, typer.Option(min=1, help="Agents in each world; by default the system's.")
     ] = None

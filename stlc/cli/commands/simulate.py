@@ -14,8 +14,10 @@ from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, re
 from stlc.cli.framework.assured import Assurance
 from stlc.cli.framework.documents import ScenarioResult, SimulateResult, Simulation
 from stlc.cli.framework.options import (
+    DriveStepsOption,
     FailUnderOption,
     JsonOption,
+    MarginOption,
     PicturesOption,
     PlannerOption,
     PlannerOptionsOption,
@@ -24,6 +26,7 @@ from stlc.cli.framework.options import (
     SeedsOption,
     SetOption,
     SystemOption,
+    TimeLimitOption,
     parse_limit,
     parse_overrides,
     parse_seeds,
@@ -77,27 +80,13 @@ def simulate(
             help="Guard, by default none; `full` repairs plans before it tries the backup.",
         ),
     ] = None,
-    time_limit: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
-        ),
-    ] = None,
+    time_limit: TimeLimitOption = None,
     ceiling: Annotated[
         int, typer.Option(min=0, help="Number of visited states to check for a feasible plan.")
     ] = 0,
-    margin: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="M|NAME=M|auto",
-            help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
-        ),
-    ] = None,
+    margin: MarginOption = None,
     seeds: SeedsOption = "0..9",
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")
-    ] = None,
+    steps: DriveStepsOption = None,
     agents: Annotated[
         int | None, typer.Option(min=1, help="Agents in each run; by default the system's.")
     ] = None,

@@ -59,6 +59,23 @@ FailUnderOption = Annotated[
         help="Exit with 1 if a smaller share satisfies everything, else with 0.",
     ),
 ]
+TimeLimitOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TIME",
+        help="Time limit of a guard's decision per agent, or `none`; default of the full guard: 100ms.",
+    ),
+]
+MarginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="M|NAME=M|auto",
+        help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
+    ),
+]
+DriveStepsOption = Annotated[
+    int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")
+]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
 PicturesOption = Annotated[bool, typer.Option(help="Draw pictures and the report.")]
 SetOption = Annotated[
