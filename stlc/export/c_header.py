@@ -450,8 +450,7 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 def _falling(motion: Motion, plan: Plan) -> list[str]:
     """C function `fall`: robustness of the safety requirements on the first steps of a trajectory.
 
-    The later steps count as harmless. They are marked by an additional signal, which is positive at the
-    samples after the first steps. Its index is STATES, that is, it follows the states.
+    A signal with the index STATES is positive at the later samples, which count as harmless.
     """
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

@@ -246,11 +246,7 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Select, for each state, the results for shorter prefixes (`before`) or the present ones (`here`).
-
-    `decided` is True for states in which a plan with a shorter prefix was accepted. For these states the
-    entries of `before` are returned, for the other states those of `here`.
-    """
+    """Results for shorter prefixes (`before`) for the states in `decided`, else the present ones (`here`)."""
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
         for old, new in zip(before, here, strict=True)

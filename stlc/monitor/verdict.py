@@ -275,11 +275,7 @@ class Monitor:
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _who_knows(self, finding: Diagnostic) -> Diagnostic:
-        """Add to a finding E311 the note that the system file does not exist.
-
-        E311 means that `dt` or `T` is unknown. The note is added only if the specification names a system.
-        All other findings are returned unchanged.
-        """
+        """Add to E311 (unknown `dt` or `T`) the note that the system file in the specification is missing."""
         if finding.code != "E311" or self.spec.system is None:
             return finding
         return finding.with_note(f"the specification names `{self.spec.system}`, but there is no such file")

@@ -362,10 +362,7 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
 
 
 def _satisfied(document: Simulation, guard: Mode) -> float:
-    """Least share, over all scenarios in `document`, of closed-loop runs that satisfy all requirements.
-
-    Only the runs with the guard `guard` are counted.
-    """
+    """Least share, over all scenarios, of the drives with the guard `guard` that obey every requirement."""
     guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
     runs = [each[guard]["drives"] for each in guards]
     return min(float(each["obeyed"] / each["count"]) for each in runs)

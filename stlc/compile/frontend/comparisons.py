@@ -107,11 +107,9 @@ def _pred(
 
 
 def _compared(*sides: Number) -> Unit:
-    """Return the unit in which the robustness of a comparison is reported.
+    """Return the unit in which the robustness of a comparison of numbers is reported.
 
-    `sides` are the numbers that are compared. If some of them have a unit, those without a unit are ignored.
-    Of the remaining numbers, the first one that varies gives the unit. If all of them are constant, the first
-    one does.
+    It is the unit of the first number that has one and varies, or else of the first that has one.
     """
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)

@@ -526,10 +526,7 @@ def _about(item: ast.Item) -> str:
 
 
 def _read_in(value: Value, unit: Unit) -> Value:
-    """Return the value of a signal converted to `unit`, the unit that the file declares.
-
-    The system may store the signal in another unit.
-    """
+    """Return the value of a signal, which the system may store in another unit, converted to `unit`."""
     if isinstance(value, VectorValue):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value

@@ -242,9 +242,6 @@ def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, s
 
 
 def _left_of_all(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> ir.Formula:
-    """Return a formula that holds if a point is left of every edge of a convex polygon.
-
-    The corners are in counter-clockwise order.
-    """
+    """Return the formula that a point is left of all edges of a polygon; corners counter-clockwise."""
     sides = (side(point, start, end, span, scope) for start, end in edges(corners))
     return ir.BoolOp("and", tuple(ir.Predicate(each.num, span=span) for each in sides), span)

@@ -203,10 +203,9 @@ class _Sweep:
         return found
 
     def _passing(self, face: Pair) -> Number:
-        """Return the position in [0, 1] along the segment where the segment crosses a face.
+        """Return the position in [0, 1] at which the segment crosses a face; arbitrary if it does not.
 
-        `face` contains the signed distances of the start and the end of the segment to the face. If the
-        segment does not cross the face, the position is arbitrary.
+        `face`: signed distances of the start and the end of the segment to the face.
         """
         before, after = face
         slope = self.apply("sub", after, before)

@@ -79,10 +79,7 @@ class Disturbance:
         return [PerturbedSystem(loose, each) for each in torch.split(factors, self._agents)]
 
     def _wrong_gains(self) -> tuple[Tensor, Tensor]:
-        """Factors and offsets that turn a command into the output of a faulty actuator, (rows, m) each.
-
-        The sizes of the errors are given by the scenario; their signs are random.
-        """
+        """Factors and offsets of faulty actuators, (rows, m) each; the signs of the errors are random."""
         off, angle = self._errors.actuator_gain, self._angle
         signs = self._signs(_GAINS, len(angle))
         return torch.where(angle, 1.0, 1.0 + off * signs), torch.where(angle, off * signs, 0.0)

@@ -340,14 +340,8 @@ class Trainer(Learner):
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
         """Imitation loss of the states for which a search has found a plan, ().
 
-        The loss of a state is the squared distance from the plan found to the nearest proposed plan. It is 0
-        if the network already proposes a satisfying plan. The result is the mean over the states, times the
-        weight `config.imitation`.
-
-        Args:
-            plans: proposed plans, (k, plans, T, m).
-            targets: plans that the search found, (k, T, m).
-            solved: whether a proposed plan satisfies the specification, (k,).
+        The loss of a state is the squared distance from the plan found, (k, T, m), to the nearest plan of
+        `plans`, (k, plans, T, m); it is 0 where a proposed plan is `solved`, (k,).
         """
         half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
         distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)

@@ -145,11 +145,7 @@ class _Watched:
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Return how many samples, counted from sample `next` on, the margin no longer considers.
-
-        A sample is no longer considered if the window that starts there ends before the latest sample.
-        `samples` is the number of samples received.
-        """
+        """Number of samples after `next` whose windows have ended; the margin leaves them out."""
         if not self.everywhere or self.ahead is None:
             return 0
         return max(samples - 1 - self.ahead - self.next, 0)

@@ -321,11 +321,7 @@ def _names(num: ir.Num | ir.Formula) -> set[str]:
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals whose initial value an expression reads.
-
-    The initial value is the value at the first sample of the plan, at whatever sample the expression is
-    evaluated.
-    """
+    """Names of the signals whose value at the first sample of the plan an expression reads."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 
