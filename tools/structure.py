@@ -18,6 +18,8 @@ CRUMB = 100
 """Lines below which a module with one importer should be merged into it."""
 NODES = 6
 """Number of distinguished node classes from which on a function counts as a tree traversal."""
+SHORT = 5
+"""Lines up to which a function with one use should read well without a long docstring, or in its caller."""
 _NO_CODE = (
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
     *(tokenize.ENCODING, tokenize.ENDMARKER),
@@ -173,11 +175,34 @@ class House:
                 found.append(f"{name}.{function.name} ({len(told & nodes)})")
         return found
 
+    def wordy(self) -> list[str]:
+        """Private functions of at most `SHORT` lines, used once in their module, with a longer docstring."""
+        found = []
+        for name, tree in self.trees.items():
+            uses = Counter(
+                node.id if isinstance(node, ast.Name) else node.attr
+                for node in ast.walk(tree)
+                if isinstance(node, ast.Name | ast.Attribute)
+            )
+            for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+                if function.name[:1] != "_" or uses[function.name] != 1 or not ast.get_docstring(function):
+                    continue
+                prose, *code = function.body
+                lines = _extent(code[0], code[-1]) if code else SHORT + 1
+                if lines <= min(SHORT, _extent(prose, prose) - 1):
+                    found.append(f"{name}:{function.lineno} {function.name} ({lines} lines)")
+        return found
+
     def _functions(self) -> Iterator[tuple[str, ast.FunctionDef]]:
         for name, tree in self.trees.items():
             for node in ast.walk(tree):
                 if isinstance(node, ast.FunctionDef):
                     yield name, node
+
+
+def _extent(first: ast.stmt, last: ast.stmt) -> int:
+    """Number of lines from the beginning of a statement to the end of another."""
+    return (last.end_lineno or last.lineno) - first.lineno + 1
 
 
 def _code_lines(path: Path, tree: ast.Module) -> int:
@@ -224,6 +249,7 @@ def main() -> None:
         ("parameters that pack a tuple of unlike things", house.packed()),
         ("public classes of one name and two meanings", house.homonyms()),
         (f"functions that tell {NODES} or more tree nodes apart", house.walks()),
+        (f"functions of up to {SHORT} lines with one use and a longer docstring", house.wordy()),
     ):
         print(f"{title}: {len(found)}")
         if not options.brief:
