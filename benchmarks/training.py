@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
 from stlc.cli.framework.output import say
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.parallel import executor
 from stlc.controller.parallel.bundle import input_files
 from stlc.controller.parallel.jobs import Job
@@ -179,8 +180,11 @@ class Place:
             return None
 
     def best_run(self, results: Sequence[Result]) -> RunDir | None:
-        """Return the run with the highest accuracy among `results`, or None if that run no longer exists."""
-        best = max(results, key=lambda result: float(result["accuracy"]))
+        """Return the most accurate run among `results`, or None if that run no longer exists.
+
+        Compared are the lower ends of the 95 % intervals, since some runs are judged on few states.
+        """
+        best = max(results, key=lambda result: wilson(float(result["accuracy"]), judged_states(result))[0])
         return self.newest_run(Cell.of(best).key)
 
     def valid(self) -> list[Result]:

@@ -329,6 +329,17 @@ def test_a_policy_that_is_judged_on_the_first_states_only(tmp_path: Path) -> Non
     assert [(each.method, each.fewer) for each in shares] == [("pets", " (of 8 states)")]
 
 
+def test_the_best_run_is_not_one_that_was_judged_on_few_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lucky = {**cell_result("traffic", "pets", 0, 1.0), "held_out": 32}
+    place = Place(ResultStore("paper", tmp_path))
+    monkeypatch.setattr(Place, "newest_run", lambda _, key: key.name)
+    assert str(place.best_run([lucky, cell_result("traffic", "guided", 0, 0.97)])).startswith(
+        "traffic-guided"
+    )
+
+
 def test_clocks_do_not_share_a_row() -> None:
     documents = [cell_result("traffic", "guided", 0, 0.9)]
     documents += [cell_result("traffic", "guided", 1, 0.9, clock="processor")]
