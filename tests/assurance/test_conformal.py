@@ -58,7 +58,8 @@ def test_the_shifted_chance_is_the_greatest_within_the_distance(
 def test_the_shifted_chance_is_concave(shift: DistributionShift, first: float, second: float) -> None:
     """This is why it also bounds the mean over calibrations."""
     middle = shift.greatest((first + second) / 2)
-    assert middle >= (shift.greatest(first) + shift.greatest(second)) / 2 - 1e-9
+    # a divergence near 0 is known up to 1e-16, and so is the square of the distance from `chance`
+    assert middle >= (shift.greatest(first) + shift.greatest(second)) / 2 - 1e-7
 
 
 @given(st.integers(0, 500), st.integers(1, 99))
