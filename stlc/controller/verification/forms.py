@@ -11,7 +11,7 @@ Values are computed in float64 without outward rounding. `SLACK` covers the roun
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast, final
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.interval import Belief, Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.namespace import Ops
+from stlc.compile.backends.array.namespace import FloatConstants, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -114,7 +114,7 @@ def _combined(a: Floats, b: Floats) -> Floats:
 
 
 @final
-class FormOps:
+class FormOps(FloatConstants):
     """The part of `stlc.compile.backends.array.namespace.Ops` that one step of a system needs.
 
     Other operations are computed on the range of the form, and their results share no symbols.
@@ -254,14 +254,6 @@ class FormOps:
     def full(self, shape: tuple[int, ...], value: float, like: Forms) -> Forms:  # noqa: ARG002
         """Array of a constant."""
         return Forms.point(np.full(shape, value))
-
-    def kind(self, like: Forms) -> Hashable:  # noqa: ARG002
-        """Return None: constants are Python floats."""
-        return None
-
-    def constant(self, value: float, like: Forms) -> float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
 
     def quiet(self) -> AbstractContextManager[object]:
         """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""

@@ -11,7 +11,7 @@ directions, hence `_ULPS` = 8. Elementary operations and the square root are rou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial, reduce
 from typing import Any, cast, final
@@ -38,7 +38,7 @@ from stlc.compile.backends.array.interval import (
     widened,
     within,
 )
-from stlc.compile.backends.array.namespace import Ops, Sliding
+from stlc.compile.backends.array.namespace import FloatConstants, Ops, Sliding
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir.functions import FUNCTIONS
@@ -61,7 +61,7 @@ _WINDOWS = Windows(Exact(), NUMPY)
 
 
 @final
-class IntervalOps:
+class IntervalOps(FloatConstants):
     """Implementation of `stlc.compile.backends.array.namespace.Ops` for `Intervals`, without gradients."""
 
     name = "intervals"
@@ -301,14 +301,6 @@ class IntervalOps:
         return Intervals(low, low if left.is_point and right.is_point else until(left.high, right.high))
 
     # ------------------------------------------------------------------- constants and shapes
-
-    def kind(self, like: Intervals) -> Hashable:  # noqa: ARG002
-        """Return None: all arrays are of float64, and constants are Python floats."""
-        return None
-
-    def constant(self, value: float, like: Intervals) -> float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
 
     def full(self, shape: tuple[int, ...], value: float, like: Intervals) -> Intervals:  # noqa: ARG002
         return Intervals.point(np.full(shape, value))

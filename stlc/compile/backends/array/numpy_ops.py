@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import reduce
 from typing import Any, cast, final
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.kernel import Strided, window_kernel
-from stlc.compile.backends.array.namespace import Array, Mask, Ops, Sliding
+from stlc.compile.backends.array.namespace import Array, FloatConstants, Mask, Ops, Sliding
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.schedule.schedule import Pick
 
@@ -27,7 +27,7 @@ _LARGE_KERNEL = 1 << 16
 
 
 @final
-class NumpyOps:
+class NumpyOps(FloatConstants):
     """Implementation of `stlc.compile.backends.array.namespace.Ops` for NumPy arrays, without gradients."""
 
     name = "numpy"
@@ -133,17 +133,6 @@ class NumpyOps:
     def sigmoid(self, x: Array) -> Array:
         """`1 / (1 + exp(-x))`."""
         return 0.5 + 0.5 * np.tanh(0.5 * x)
-
-    def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Return None for every array, so that all arrays share converted constants.
-
-        A converted constant is just a Python float, which suits every array.
-        """
-        return None
-
-    def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
 
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
         return np.full(shape, value, dtype=like.dtype)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import reduce
@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.backends.array.namespace import Ops, Sliding
+from stlc.compile.backends.array.namespace import FloatConstants, Ops, Sliding
 from stlc.compile.schedule.schedule import Pick
 
 ROUNDING = 1e-3
@@ -135,7 +135,7 @@ def _each(*functions: Any) -> list[Any]:
 
 
 @final
-class CasadiOps:
+class CasadiOps(FloatConstants):
     """Implementation of `stlc.compile.backends.array.namespace.Ops` for CasADi expressions."""
 
     name = "casadi"
@@ -264,17 +264,6 @@ class CasadiOps:
         """Return None: there is no special method for `until`."""
 
     # ------------------------------------------------------ constants and shapes
-
-    def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """Return None for every array, so that all arrays share converted constants.
-
-        A converted constant is just a Python float, which suits every array.
-        """
-        return None
-
-    def constant(self, value: float, like: SymbolicColumn) -> float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
 
     def full(self, shape: tuple[int, ...], value: float, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
         """Time series of a constant."""
