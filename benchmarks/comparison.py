@@ -33,6 +33,7 @@ class Learned:
         interval: 95 % confidence interval of the accuracy.
         seconds: training time, mean over seeds.
         outdated: whether an input, such as the specification, has changed since the measurement.
+        fewer: number of judged states as text, such as ` (of 80 states)`; "" if all were judged.
     """
 
     benchmark: str
@@ -42,6 +43,7 @@ class Learned:
     interval: tuple[float, float]
     seconds: float
     outdated: bool = False
+    fewer: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,7 @@ def _spared(
 def _learned_text(cell: Learned | None) -> str:
     if cell is None:
         return ""
-    return f"{_interval(cell.accuracy, cell.interval)}{' (outdated)' if cell.outdated else ''}"
+    return f"{_interval(cell.accuracy, cell.interval)}{cell.fewer}{' (outdated)' if cell.outdated else ''}"
 
 
 def _planned_text(row: PlanRow | None) -> str:

@@ -9,14 +9,14 @@ proves for most of the other states that no satisfying plan exists.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from benchmarks.store import Key, Result, ResultStore, load
-from benchmarks.training import benchmark_order, pack, unpack
+from benchmarks.training import benchmark_order, judged_states, pack, unpack
 from stlc.cli.framework.output import say
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.planning.planner import PlanBudget, plan, planner_named
@@ -56,6 +56,8 @@ class KnownFeasible:
         by_search: number of states from which only the search found a plan, and no policy.
         passes: number of searches so far.
         tries: number of plans that were evaluated for each open state.
+        partial: n -> share among the first n states, for each n below the number of states that some policy
+            was judged on.
     """
 
     benchmark: str
@@ -66,6 +68,11 @@ class KnownFeasible:
     by_search: int
     passes: int
     tries: int
+    partial: Mapping[int, float] = field(default_factory=dict)
+
+    def share_among(self, judged: int) -> float:
+        """Share among the first `judged` states."""
+        return self.partial.get(judged, self.share)
 
 
 def key_of(result: Result) -> Key:
@@ -254,20 +261,36 @@ def _union(digits: Iterable[str], count: int) -> list[bool]:
 
 def _solved(entry: Mapping[str, Any], own: Sequence[Result]) -> list[bool]:
     """Return for each held-out state whether the search or any policy has found a satisfying plan."""
-    return _union((entry["found"], *(each["solved"] for each in own)), int(own[0]["key"]["held_out"]))
+    count = int(own[0]["key"]["held_out"])
+    return _union((entry["found"], *(_solved_by_policy(each, count) for each in own)), count)
+
+
+def _solved_by_policy(result: Result, count: int) -> str:
+    """Return the packed flags of the `count` held-out states that the policy of a training result solves.
+
+    States on which it was not judged count as not solved.
+    """
+    judged = judged_states(result)
+    return pack([*unpack(result["solved"], judged), *(False,) * (count - judged)])
 
 
 def _known(benchmark: str, entry: Mapping[str, Any], own: Sequence[Result]) -> KnownFeasible:
     same = [each for each in own if key_of(each) == key_of(own[0])]
     count = int(own[0]["key"]["held_out"])
-    known = sum(_solved(entry, same))
+    solved = _solved(entry, same)
+    known = sum(solved)
     return KnownFeasible(
         benchmark=benchmark,
         share=known / count,
         interval=wilson(known / count, count),
         open=count - known,
         proved=sum(unpack(entry["infeasible"], count)) if "infeasible" in entry else None,
-        by_search=known - sum(_union((each["solved"] for each in same), count)),
+        by_search=known - sum(_union((_solved_by_policy(each, count) for each in same), count)),
         passes=int(entry["passes"]),
         tries=int(entry["tries"]),
+        partial={
+            judged: sum(solved[:judged]) / judged
+            for judged in sorted({*map(judged_states, same)})
+            if judged < count
+        },
     )

@@ -15,16 +15,18 @@ from benchmarks.comparison import Learned
 from benchmarks.curves import PICTURE, draw_results
 from benchmarks.feasible import KnownFeasible
 from benchmarks.store import Result
-from benchmarks.table import Columns, Table, listed, provenance
-from benchmarks.training import OUTDATED_TEXT, SeedGroup, benchmark_order, grouped, inputs_text
+from benchmarks.table import Columns, Table, listed, provenance, text_of
+from benchmarks.training import OUTDATED_TEXT, SeedGroup, benchmark_order, fewer_text, grouped, inputs_text
 from stlc.controller.evaluation.held_out import wilson
 from stlc.registry import METHODS
 
 TEXT = f"""\
 `accuracy` is the mean over seeds with its 95 % Wilson interval, `share of feasible` that mean as a share of
-the known feasible states (in brackets that of the worst seed). `known feasible` is the share of the same
-states for which some satisfying plan is known, a lower bound of the feasible share. From those `proved
-infeasible` no plan exists, by the planner `milp` (traffic and reach_n_avoid, whose encodings are exact).
+the known feasible states (in brackets that of the worst seed). A slow policy is judged on the first of the
+held-out states only: their number stands behind its accuracy, and its shares refer to them. `known feasible`
+is the share of the same states for which some satisfying plan is known, a lower bound of the feasible share.
+From those `proved infeasible` no plan exists, by the planner `milp` (traffic and reach_n_avoid, whose
+encodings are exact).
 {OUTDATED_TEXT}"""
 
 
@@ -38,8 +40,11 @@ class Row:
         length: training time as text, such as `60 s`.
         seeds: seeds of the training runs, in order.
         accuracies: plan accuracy for each seed, on the same held-out initial states.
-        interval: 95 % Wilson interval of the mean accuracy, over the held-out states of all seeds.
-        known_feasible: share of these states from which a satisfying plan is known; None before a search.
+        interval: 95 % Wilson interval of the mean accuracy, over the judged states of all seeds.
+        judged: number of held-out states on which the policy was judged, for each seed.
+        held_out: number of held-out states that were requested. Slow policies are judged on the first only.
+        known_shares: share of the judged states from which a satisfying plan is known, for each seed; empty
+            before a search.
         requirements: name of a requirement -> share of plans that satisfy it, mean over seeds.
         seconds: training time, mean over seeds.
         steps: number of training steps, mean over seeds.
@@ -52,7 +57,9 @@ class Row:
     seeds: tuple[int, ...]
     accuracies: tuple[float, ...]
     interval: tuple[float, float]
-    known_feasible: float | None
+    judged: tuple[int, ...]
+    held_out: int
+    known_shares: tuple[float, ...]
     requirements: Mapping[str, float]
     seconds: float
     steps: float
@@ -64,14 +71,20 @@ class Row:
         return fmean(self.accuracies)
 
     @property
+    def known_feasible(self) -> float | None:
+        """Mean of `known_shares` over all seeds; None before a search."""
+        return fmean(self.known_shares) if self.known_shares else None
+
+    @property
     def share(self) -> float | None:
         """Mean accuracy divided by `known_feasible`; None if that is unknown."""
         return self.accuracy / self.known_feasible if self.known_feasible else None
 
     @property
     def worst_share(self) -> float | None:
-        """Accuracy of the worst seed divided by `known_feasible`; None if that is unknown."""
-        return min(self.accuracies) / self.known_feasible if self.known_feasible else None
+        """Smallest ratio of a seed's accuracy to its entry of `known_shares`; None if these are unknown."""
+        pairs = zip(self.accuracies, self.known_shares, strict=False)
+        return min((accuracy / known for accuracy, known in pairs if known), default=None)
 
 
 def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
@@ -79,12 +92,14 @@ def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
 
     `known` maps the name of a benchmark to the share of states from which a satisfying plan is known.
     """
-    cell, results = group.cell, group.results
+    cell, results, judged = group.cell, group.results, group.judged
     found = known.get(cell.benchmark)
     return Row(
         *(cell.benchmark, cell.contender, cell.length.text, group.seeds, group.accuracies),
-        interval=wilson(group.mean("accuracy"), sum(int(each["key"]["held_out"]) for each in results)),
-        known_feasible=None if found is None else found.share,
+        interval=wilson(group.mean("accuracy"), sum(judged)),
+        judged=judged,
+        held_out=cell.held_out,
+        known_shares=() if found is None else tuple(map(found.share_among, judged)),
         requirements={
             name: fmean(each["requirements"][name] for each in results) for name in results[0]["requirements"]
         },
@@ -98,7 +113,10 @@ FIRST: Columns[Row] = {"benchmark": "{benchmark}", "method": "{method}", "budget
 SHOWN: Columns[Row] = {
     **FIRST,
     "seeds": lambda row: ", ".join(map(str, row.seeds)),
-    "accuracy": "{accuracy:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]",
+    "accuracy": lambda row: (
+        text_of(row, "{accuracy:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]")
+        + fewer_text(row.judged, row.held_out)
+    ),
     "worst seed": lambda row: f"{min(row.accuracies):.4f}",
     "known feasible": "{known_feasible:.4f}",
     "share of feasible": lambda row: "" if row.share is None else f"{row.share:.3f} ({row.worst_share:.3f})",
@@ -167,6 +185,7 @@ def learned(results: Sequence[Result]) -> list[Learned]:
         Learned(
             *(row.benchmark, row.method, row.length, row.accuracy, row.interval, row.seconds),
             outdated=bool(row.outdated),
+            fewer=fewer_text(row.judged, row.held_out),
         )
         for row in rows
     ]

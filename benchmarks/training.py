@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
 from stlc.cli.framework.output import say
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.parallel import executor
 from stlc.controller.parallel.bundle import input_files
 from stlc.controller.parallel.jobs import Job
@@ -179,8 +180,11 @@ class Place:
             return None
 
     def best_run(self, results: Sequence[Result]) -> RunDir | None:
-        """Return the run with the highest accuracy among `results`, or None if that run no longer exists."""
-        best = max(results, key=lambda result: float(result["accuracy"]))
+        """Return the most accurate run among `results`, or None if that run no longer exists.
+
+        Compared are the lower ends of the 95 % intervals, since some runs are judged on few states.
+        """
+        best = max(results, key=lambda result: wilson(float(result["accuracy"]), judged_states(result))[0])
         return self.newest_run(Cell.of(best).key)
 
     def valid(self) -> list[Result]:
@@ -405,9 +409,34 @@ class SeedGroup:
         """Accuracy on the held-out states, one number per seed."""
         return tuple(float(each["accuracy"]) for each in self.results)
 
+    @property
+    def judged(self) -> tuple[int, ...]:
+        """Number of held-out states on which each result's policy was judged."""
+        return tuple(map(judged_states, self.results))
+
     def mean(self, name: str) -> float:
         """Return the mean over the seeds of the number that the results store under `name`."""
         return fmean(float(each[name]) for each in self.results)
+
+
+def judged_states(result: Result) -> int:
+    """Return the number of held-out states that the accuracy of a stored training result is a share of.
+
+    These are the first of the requested states: the evaluation of a slow policy ends before the last of them.
+    """
+    return int(result.get("held_out", result["key"]["held_out"]))
+
+
+def fewer_text(judged: Sequence[int], held_out: int) -> str:
+    """Return the number of judged states as text, such as ` (of 80 states)`; "" if all were judged.
+
+    Args:
+        judged: number of judged states, one per seed.
+        held_out: number of requested states.
+    """
+    if min(judged) == held_out:
+        return ""
+    return f" (of {', '.join(map(str, dict.fromkeys(judged)))} states)"
 
 
 def grouped(results: Iterable[Result]) -> list[SeedGroup]:

@@ -89,7 +89,7 @@ class Cache:
         """Remove the file `name`, which is not trusted, and warn about it with the reason `why`."""
         with suppress(OSError):
             (self.folder / name).unlink()
-        _warn(f"`{self.shown / name}` {why}", "it is made anew")
+        notice(Diagnostic("W701", f"`{self.shown / name}` {why}; it is made anew"))
 
     def write(self, name: str, data: bytes) -> bool:
         """Write `data` to the file `name`; return False if that fails.
@@ -138,10 +138,6 @@ def _require_own(found: os.stat_result, right_kind: bool, otherwise: str) -> Non
         raise Unusable(f"belongs to another user ({found.st_uid})", distrusted=True)
     if found.st_mode & _OTHERS:
         raise Unusable(f"may be written by others (mode {found.st_mode & 0o777:o})", distrusted=True)
-
-
-def _warn(problem: str, instead: str) -> None:
-    notice(Diagnostic("W701", f"{problem}; {instead}"))
 
 
 # ---------------------------------------------------------------------- persistent cache

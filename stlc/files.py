@@ -207,10 +207,7 @@ def find_spec(name: Path | str) -> Path:
 
 
 def _straight(path: Path) -> Path:
-    """Shorten a path such as `specs/../examples/car.yaml` to `examples/car.yaml`.
-
-    Because of symbolic links, the short path may lead to another file. The path is then returned unchanged.
-    """
+    """Shorten `specs/../examples/car.yaml` to `examples/car.yaml`, unless that is another file (links)."""
     short = Path(os.path.normpath(path))
     return short if short.is_file() and short.samefile(path) else path
 

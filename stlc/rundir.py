@@ -315,10 +315,7 @@ def _names(run: RunDir) -> tuple[str, str, str, str]:
 
 
 def _folder_of(path: Path) -> Path:
-    """Return the run folder that contains `path`: the path itself or its nearest parent with a `run.json`.
-
-    If there is none, `path` is returned.
-    """
+    """Return the nearest folder with a `run.json` at or above `path`; `path` itself if there is none."""
     candidates = (path, *path.parents)
     return next((folder for folder in candidates if (folder / RECORD).is_file()), path)
 

@@ -405,11 +405,25 @@ def test_the_architecture_names_files_that_exist():
     rows = [line for line in text.splitlines() if re.match(r"\| `[\w/*]+\.(py|lark)`", line)]
     assert len(rows) > 30
     for line in rows:
-        folder = ""
-        for name in re.findall(r"`([\w/*]+\.(?:py|lark))`", line.split("|")[1]):
+        folder, text = "", ""
+        _, files, _, holds, _ = line.split("|")
+        for name in re.findall(r"`([\w/*]+\.(?:py|lark))`", files):
             folder = name.rpartition("/")[0] or folder
             full = name if "/" in name or not folder else f"{folder}/{name}"
-            assert [*(ROOT / "stlc").glob(full), *ROOT.glob(full)], full
+            found = [*(ROOT / "stlc").glob(full), *ROOT.glob(full)]
+            assert found, full
+            text += "\n".join(path.read_text(encoding="utf-8") for path in found)
+        for name in re.findall(r"`(?:\w+\.)*(\w+)`", holds):
+            assert re.search(rf"\b{name}\b", text), f"{files.strip()} has no {name}"
+
+
+def test_the_architecture_names_the_packages_of_each_room():
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    for room in sorted((ROOT / "stlc").iterdir()):
+        packages = [path.parent.name for path in room.glob("*/__init__.py")]
+        if packages:
+            (line,) = re.findall(rf"^\| `{room.name}` \| (.*) \|$", text, re.MULTILINE)
+            assert set(packages) <= set(re.findall(r"`(\w+)`", line)), room.name
 
 
 def test_the_architecture_lists_the_decisions():

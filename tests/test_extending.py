@@ -75,6 +75,31 @@ def test_the_page_has_an_example_of_each_extension():
     assert len(operator) == 4  # an operator, a trace format, a function and a kind of plant
 
 
+def test_an_extension_needs_the_files_that_the_page_promises():
+    """New files and changed lines of source of each section; a table entry counts as one line."""
+    promised = dict(re.findall(r"^\| \[([\w -]+)\]\(#[\w-]+\) \| (.+?) \|", TEXT, re.MULTILINE))
+    sections = re.split(r"^## An? ", TEXT, flags=re.MULTILINE)[1:]
+    found = {}
+    for section in sections:
+        blocks = [
+            (kind, body)
+            for kind, name, body in BLOCK.findall(section)
+            if kind == "change" or name[-3:] == ".py"
+        ]
+        added = [body for kind, body in blocks if kind == "change"]
+        lines = sum(line.startswith("+") for body in added for line in body.splitlines())
+        found[section.partition("\n")[0]] = (sum(kind == "file" for kind, _ in blocks), len(added), lines)
+    entry, line, file = (0, 1), (1, 1, 1), (1, 0, 0)
+    names = {"method": "training method"}
+    assert {names.get(name, name) for name in found} == set(promised)
+    for name, counts in found.items():
+        text = promised[names.get(name, name)]
+        if "1 entry" in text:
+            assert counts[:2] == entry, name
+        else:
+            assert counts == (line if "1 line" in text else file), name
+
+
 @pytest.mark.parametrize("name", [name for name, _ in CHECKS])
 def test_an_example_works(name, failures):
     assert name not in failures, failures.get(name)

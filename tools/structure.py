@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import tokenize
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,6 +18,12 @@ CRUMB = 100
 """Lines below which a module with one importer should be merged into it."""
 NODES = 6
 """Number of distinguished node classes from which on a function counts as a tree traversal."""
+SHORT = 5
+"""Lines up to which a function with one use should read well without a long docstring, or in its caller."""
+_NO_CODE = (
+    *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
+    *(tokenize.ENCODING, tokenize.ENDMARKER),
+)
 TREES = ("stlc.grammar.ast", "stlc.compile.ir.nodes", "stlc.compile.ir.typed")
 """Modules that define the tree classes."""
 
@@ -48,6 +55,14 @@ class House:
         return {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in self.files.items()}
 
     @cached_property
+    def code(self) -> dict[str, int]:
+        """Lines of code of each module: without blank lines, comments and docstrings.
+
+        A text that stands alone as a statement counts as a docstring.
+        """
+        return {name: _code_lines(path, self.trees[name]) for name, path in self.files.items()}
+
+    @cached_property
     def trees(self) -> dict[str, ast.Module]:
         """Syntax tree of each module."""
         return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in self.files.items()}
@@ -69,10 +84,11 @@ class House:
                     elif node.module in self.files:
                         yield node.module
 
-    def packages(self) -> list[tuple[str, int, int]]:
-        """Files and lines of each package, two levels deep."""
+    def packages(self) -> list[tuple[str, int, int, int]]:
+        """Files, lines and lines of code of each package, two levels deep."""
         files: Counter[str] = Counter()
         lines: Counter[str] = Counter()
+        code: Counter[str] = Counter()
         for name, count in self.lines.items():
             parts = name.split(".")
             inner = [".".join(parts[:depth]) for depth in (1, 2, 3)]
@@ -80,7 +96,8 @@ class House:
                 if (self.root / package.replace(".", "/")).is_dir():
                     files[package] += 1
                     lines[package] += count
-        return [(package, files[package], lines[package]) for package in sorted(files)]
+                    code[package] += self.code[name]
+        return [(package, files[package], lines[package], code[package]) for package in sorted(files)]
 
     def crumbs(self) -> list[str]:
         """Modules with one importer and under `CRUMB` lines, without `__init__.py` files."""
@@ -158,11 +175,50 @@ class House:
                 found.append(f"{name}.{function.name} ({len(told & nodes)})")
         return found
 
+    def wordy(self) -> list[str]:
+        """Private functions of at most `SHORT` lines, used once in their module, with a longer docstring."""
+        found = []
+        for name, tree in self.trees.items():
+            uses = Counter(
+                node.id if isinstance(node, ast.Name) else node.attr
+                for node in ast.walk(tree)
+                if isinstance(node, ast.Name | ast.Attribute)
+            )
+            for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+                if function.name[:1] != "_" or uses[function.name] != 1 or not ast.get_docstring(function):
+                    continue
+                prose, *code = function.body
+                lines = _extent(code[0], code[-1]) if code else SHORT + 1
+                if lines <= min(SHORT, _extent(prose, prose) - 1):
+                    found.append(f"{name}:{function.lineno} {function.name} ({lines} lines)")
+        return found
+
     def _functions(self) -> Iterator[tuple[str, ast.FunctionDef]]:
         for name, tree in self.trees.items():
             for node in ast.walk(tree):
                 if isinstance(node, ast.FunctionDef):
                     yield name, node
+
+
+def _extent(first: ast.stmt, last: ast.stmt) -> int:
+    """Number of lines from the beginning of a statement to the end of another."""
+    return (last.end_lineno or last.lineno) - first.lineno + 1
+
+
+def _code_lines(path: Path, tree: ast.Module) -> int:
+    """Number of lines of a file on which a token stands that is neither a comment nor a docstring."""
+    prose = {
+        line
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+        for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+    }
+    with path.open("rb") as file:
+        tokens = [token for token in tokenize.tokenize(file.readline) if token.type not in _NO_CODE]
+    lines = {line for token in tokens for line in range(token.start[0], token.end[0] + 1)}
+    return len(lines - prose)
 
 
 def _unlike(annotation: ast.expr) -> bool:
@@ -184,8 +240,8 @@ def main() -> None:
     parser.add_argument("--brief", action="store_true", help="counts alone")
     options = parser.parse_args()
     house = House(options.folder)
-    for package, files, lines in house.packages():
-        print(f"{package:40} {files:4} files {lines:6} lines")
+    for package, files, lines, code in house.packages():
+        print(f"{package:40} {files:4} files {lines:6} lines {code:6} of code")
     print()
     for title, found in (
         (f"modules with one importer and under {CRUMB} lines", house.crumbs()),
@@ -193,6 +249,7 @@ def main() -> None:
         ("parameters that pack a tuple of unlike things", house.packed()),
         ("public classes of one name and two meanings", house.homonyms()),
         (f"functions that tell {NODES} or more tree nodes apart", house.walks()),
+        (f"functions of up to {SHORT} lines with one use and a longer docstring", house.wordy()),
     ):
         print(f"{title}: {len(found)}")
         if not options.brief:

@@ -22,7 +22,7 @@ from benchmarks.table import Columns, Table, listed, provenance, publish
 from stlc.assurance.bounds import Tally, betting_lower, clopper_pearson_lower, drives_needed
 from stlc.assurance.campaign import SEED
 from stlc.assurance.certificate import Sample, joined
-from stlc.assurance.conformal import SAME, Shift, lower_bound
+from stlc.assurance.conformal import SAME, DistributionShift, lower_bound
 from stlc.assurance.drives import PolicyDrives
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
@@ -32,7 +32,7 @@ from stlc.controller.training.run import Run
 from stlc.rundir import RunDir
 
 SHARE, CONFIDENCE = 0.99, 0.95
-SHIFT = Shift("tv", 0.02)
+SHIFT = DistributionShift("tv", 0.02)
 _OUTPUT = Output(Path("docs/assurance.md"))
 TEXT = """\
 Written by `python -m benchmarks certificates` from `benchmarks/results/certificates.json`: drives of one

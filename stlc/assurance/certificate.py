@@ -1,4 +1,4 @@
-"""Statistical certificates: what judged drives say about future ones, with the assumptions in words.
+"""Statistical certificates: bounds on future drives from judged ones, with the assumptions in words.
 
 A drive is one agent in one simulated world, one recorded trace, or one simulation of a plant or system. The
 drives of a world may influence each other, so the observations that bounds count are independent *units*:
@@ -29,8 +29,8 @@ from stlc.assurance.bounds import (
 from stlc.assurance.conformal import (
     SAME,
     AdaptiveBound,
+    DistributionShift,
     OnlineBound,
-    Shift,
     adaptive_bound,
     calibrate_online,
     drives_for_bound,
@@ -170,7 +170,7 @@ def together(judged: Sequence[Judged], weights: Mapping[str, float] | None = Non
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What is asked of the drives.
+    """Request: the share of drives to certify, and the bounds to compute.
 
     Attributes:
         share: share of future drives to certify; None if the share is only measured.
@@ -185,7 +185,7 @@ class Claim:
 
     share: float | None = 0.99
     confidence: float = 0.95
-    shift: Shift = SAME
+    shift: DistributionShift = SAME
     any_time: bool = False
     calibration: int | None = None
     online: bool = False
@@ -257,7 +257,7 @@ def _counted(tally: Tally) -> tuple[int, int] | None:
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What the drives say about one requirement.
+    """Bounds on one requirement, from a sample of drives.
 
     Attributes:
         name: name of the requirement.
@@ -367,15 +367,18 @@ def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
 
 
 def _reached(least: NDArray[np.float64], claim: Claim) -> float:
-    """Robustness that the requested share of future units reaches; without that shift, of observed ones."""
+    """Lower bound on the robustness that the requested share of future units reaches.
+
+    `least` is the least robustness of each observed unit, (units,). The result is -inf if there is no bound.
+    """
     share = 1.0 - _before(claim.shift, 1.0 - claim.target)
     if not 0.0 < share < 1.0:
         return -math.inf
     return tolerance_bound(least, share, claim.confidence, any_time=claim.any_time)
 
 
-def _before(shift: Shift, miss: float) -> float:
-    """Greatest probability of an event before the shift with which it is at most `miss` after it."""
+def _before(shift: DistributionShift, miss: float) -> float:
+    """Greatest probability of an event before the shift, such that it is at most `miss` after the shift."""
     low, high = 0.0, miss
     if shift.greatest(high) <= miss:
         return high
@@ -390,10 +393,10 @@ def _before(shift: Shift, miss: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """What a sample of drives says about future drives.
+    """Bounds on future drives: a statement on each requirement, and the answer to the claim.
 
     Attributes:
-        claim: what was asked.
+        claim: the request.
         overall: statement on all requirements together.
         requirements: statement on each requirement.
         noun: what an independent unit is.
@@ -428,7 +431,7 @@ class Assessment:
         return {"certified": 0, "measured": 0, "refuted": 1, "undecided": 4}[self.answer]
 
     def assumptions(self) -> list[str]:
-        """Conditions under which the bounds hold, a sentence each, from the most particular on."""
+        """Conditions under which the bounds hold, a sentence each; the most specific comes first."""
         return list(_assumptions(self))
 
     def summary(self) -> dict[str, Any]:
@@ -469,7 +472,7 @@ class Assessment:
 
 
 def assess(sample: Sample, claim: Claim) -> Assessment:
-    """Compute what a sample of at least one drive says."""
+    """Compute the bounds on future drives from a sample of at least one drive."""
     sizes = sample.sizes
     ordered = sample.least(sample.overall.robustness).tolist() if claim.adaptive else None
     return Assessment(
@@ -549,7 +552,7 @@ def _units(noun: Noun, most: int) -> Iterator[str]:
     yield "worlds of different seeds are independent, as the numbers of a pseudo-random generator are"
 
 
-def _distance(shift: Shift) -> str:
+def _distance(shift: DistributionShift) -> str:
     names = {"tv": "total variation", "kl": "Kullback-Leibler divergence", "chi2": "chi-square divergence"}
     return f"{names[shift.kind]} {shift.size:g}"
 
@@ -570,7 +573,7 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
     claim = Claim(
         None if document["share"] is None else float(document["share"]),
         confidence,
-        SAME if document["shift"] is None else Shift.parse(str(document["shift"])),
+        SAME if document["shift"] is None else DistributionShift.parse(str(document["shift"])),
         any_time,
     )
     wrong = []

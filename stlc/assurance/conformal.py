@@ -29,7 +29,7 @@ _STEPS = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
+class DistributionShift:
     """Largest distance of the distribution Q of future drives from the distribution P of recorded ones.
 
     Attributes:
@@ -42,7 +42,7 @@ class Shift:
     size: float
 
     @classmethod
-    def parse(cls, text: str) -> Shift:
+    def parse(cls, text: str) -> DistributionShift:
         """Parse `0.02` (total variation) or `kl=0.01`. Raises UsageError (U101) for anything else."""
         kind, found, number = text.strip().rpartition("=")
         try:
@@ -96,14 +96,14 @@ def _binary_kl(q: float, p: float) -> float:
     return q * math.log(q / p) + rest
 
 
-SAME = Shift("tv", 0.0)
+SAME = DistributionShift("tv", 0.0)
 """Future drives are distributed as the recorded ones."""
 
 
 # ---------------------------------------------------------------------- the next drive
 
 
-def rank(drives: int, miss: float, shift: Shift = SAME) -> int:
+def rank(drives: int, miss: float, shift: DistributionShift = SAME) -> int:
     """Rank k of the conformal bound: the k-th smallest of the recorded values; 0 if there are too few drives.
 
     The next value lies below the k-th smallest of n exchangeable ones with probability at most k / (n + 1).
@@ -118,7 +118,7 @@ def rank(drives: int, miss: float, shift: Shift = SAME) -> int:
     return low
 
 
-def lower_bound(values: ArrayLike, confidence: float = 0.95, shift: Shift = SAME) -> float:
+def lower_bound(values: ArrayLike, confidence: float = 0.95, shift: DistributionShift = SAME) -> float:
     """Split conformal lower bound on the next value; -inf if there are too few values.
 
     The next value is at least the bound with probability `confidence`, over the recorded values and the next
@@ -138,7 +138,7 @@ def lower_bound(values: ArrayLike, confidence: float = 0.95, shift: Shift = SAME
     return float(ordered[k - 1]) if k else -math.inf
 
 
-def drives_for_bound(confidence: float = 0.95, shift: Shift = SAME) -> int | None:
+def drives_for_bound(confidence: float = 0.95, shift: DistributionShift = SAME) -> int | None:
     """Smallest number of drives with which `lower_bound` is finite; None if the shift allows none."""
     miss = 1.0 - confidence
     if shift.greatest(0.0) >= miss - _ROUNDING:
@@ -205,12 +205,12 @@ class OnlineBound:
 
     @property
     def margins(self) -> NDArray[np.float64]:
-        """What is subtracted from the prediction at each step, (steps,)."""
+        """Numbers that are subtracted from the prediction at each step, (steps,)."""
         return self.radius * self.scale
 
 
 def calibrate_online(
-    predicted: ArrayLike, final: ArrayLike, confidence: float = 0.95, shift: Shift = SAME
+    predicted: ArrayLike, final: ArrayLike, confidence: float = 0.95, shift: DistributionShift = SAME
 ) -> OnlineBound:
     """Calibrate an online bound from recorded drives that are exchangeable with the next one.
 

@@ -75,7 +75,7 @@ class DriveSimulator:
         return tuple(each.name for each in self._verdict(self.drive(np.full((1, 1), 0.5))))
 
     def seen(self, requirement: int) -> float:  # noqa: ARG002
-        """1: a drive has no input signals."""
+        """Return 1, since a drive has no input signals."""
         return 1.0
 
     def graded(self, requirement: int) -> bool:  # noqa: ARG002

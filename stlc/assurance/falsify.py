@@ -1,7 +1,7 @@
 """Falsification: the search for a simulation that violates a requirement.
 
-A counterexample is accepted only if it also violates the requirement at half the time step. What is reported
-when none is found is what was searched, which is never a proof.
+A counterexample is accepted only if it also violates the requirement at half the time step. A search that
+finds none is no proof; its result says which part of the space was searched.
 """
 
 from __future__ import annotations
@@ -476,12 +476,12 @@ def _changes(space: SearchSpace) -> Iterator[tuple[tuple[int, ...], Values]]:
 
 
 def _like(coordinate: int) -> Values:
-    """The value of another coordinate."""
+    """Return the function that proposes the value of another coordinate of the point."""
     return lambda point: (float(point[coordinate]),)
 
 
 def _rounded(coordinate: int) -> Values:
-    """The value with few decimal digits."""
+    """Return the function that proposes the present value, rounded to few decimal digits."""
     return lambda point: tuple(round(float(point[coordinate]), digits) for digits in DIGITS)
 
 

@@ -87,7 +87,10 @@ class ModelSimulator:
         return SearchSpace(self.points.dim, tuple(blocks))
 
     def _time_coordinates(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Coordinates of the free switching times of an input: each is the last of those that affect it."""
+        """Coordinates of the free switching times `names` of an input.
+
+        A time is computed from several coordinates; the last of them belongs to this time alone.
+        """
         return self.points.last_coordinates_of(names)
 
     @cached_property

@@ -144,7 +144,7 @@ class SearchSpace:
 
 @dataclass(frozen=True, slots=True)
 class PartOfSpace:
-    """Search space with some coordinates of a larger one, the others at 0.5.
+    """Part of a search space, in which only some coordinates vary; the others are 0.5.
 
     Attributes:
         space: the smaller space.

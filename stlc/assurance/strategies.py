@@ -1,4 +1,4 @@
-"""Strategies of falsification: each proposes points of the unit cube, and is told how robust they were."""
+"""Strategies of falsification: each proposes points of the unit cube and receives their robustness."""
 
 from __future__ import annotations
 

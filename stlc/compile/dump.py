@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 
 from stlc.compile.augment.timers import Timer
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.discretize import Grid, in_words
+from stlc.compile.ir.discretize import Grid, duration, in_words
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.text import show_formula, shown
 from stlc.compile.ir.traverse import nodes
@@ -52,15 +52,9 @@ def _head(compiled: Compiled) -> Iterator[str]:
     if grid.dt is not None:
         facts.append(f"dt {in_words(Fraction(1), grid)}")
     if grid.horizon is not None:
-        facts.append(f"horizon {_both(grid.horizon, grid)}")
-    facts.append(f"formula horizon {_both(compiled.reach, grid)}")
+        facts.append(f"horizon {duration(grid.horizon, grid)}")
+    facts.append(f"formula horizon {duration(compiled.reach, grid)}")
     yield " · ".join(facts)
-
-
-def _both(steps: int, grid: Grid) -> str:
-    """Return the text of a duration, in seconds and in steps; in steps only if no time step is known."""
-    count = f"{steps} step{'' if steps == 1 else 's'}"
-    return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
 
 def _rules(compiled: Compiled) -> Iterator[tuple[CompiledRequirement, str]]:
@@ -167,6 +161,6 @@ def _states(compiled: Compiled) -> Iterator[str]:
         yield f"  + param   {shown(each.column.name)}  {each.text}, drawn for every trajectory"
     yield from (_added(timer) for timer in compiled.timers)
     if compiled.mission is not None:
-        yield f"  mission   {_both(compiled.mission, compiled.grid)}"
+        yield f"  mission   {duration(compiled.mission, compiled.grid)}"
     safe = ", ".join(show_name(rule.name) for rule in compiled.safety)
     yield f"  phi_safe  {safe or '(no requirement is tagged @safety)'}"

@@ -293,11 +293,10 @@ class _Stage:
         )
 
     def _rewritten(self, requirement: typed.Requirement) -> Augmented:
-        """Rewrite a requirement without absolute operators and, for training, without past operators.
+        """Rewrite absolute operators and, for training, past operators of a requirement.
 
-        The interval of an absolute operator such as `always@[a, b]` counts from the start of the mission. For
-        training, formulas over added states replace absolute operators and past operators. For a recorded
-        trace, which starts with the mission, the interval simply counts from the first sample.
+        For training, formulas over added states replace them. A recorded trace begins with the mission, so
+        the interval of an absolute operator counts from its first sample.
         """
         if self.purpose == "train":
             return augment(requirement, self.grid, self.table, self.sink)

@@ -91,7 +91,8 @@ def complete(document: Document, offset: int) -> Completion:
     assert match is not None
     start = match.start()
     if match[0].startswith("@"):
-        return Completion(start, tuple(_tags()))
+        tags = sorted(TAGS.items())
+        return Completion(start, tuple(Offer(f"@{name}", "Property", text) for name, text in tags))
     behind_dot = _OF_MODULE.search(text[:start])
     if behind_dot is not None:
         names = sorted(_shared(document, behind_dot[1]), key=lambda offer: offer.text)
@@ -224,7 +225,3 @@ def _units() -> Iterator[Offer]:
     rest: Iterable[str] = (unit for unit in SYMBOLS if unit not in _FIRST_UNITS)
     yield from (Offer(unit, "Unit", order=1) for unit in _FIRST_UNITS)
     yield from (Offer(unit, "Unit", order=8) for unit in rest)
-
-
-def _tags() -> Iterator[Offer]:
-    yield from (Offer(f"@{name}", "Property", text) for name, text in sorted(TAGS.items()))

@@ -111,11 +111,7 @@ class Document:
         return tuple(sorted(found, key=lambda one: one.span.start))
 
     def _place(self, finding: Diagnostic) -> Finding:
-        """Locate a diagnostic in this text.
-
-        A diagnostic of another file is placed where this text names the system. If the text names no system,
-        it is placed at the start of the text.
-        """
+        """Locate a diagnostic in this text; one of another file is placed where the system is named."""
         span = finding.span
         if span is not None and span.source.name == self.source.name:
             return Finding(finding, self.source.span(span.start, span.end))

@@ -9,7 +9,7 @@ from fractions import Fraction
 from stlc.compile.frontend.modules import STD
 from stlc.compile.frontend.values import Number, Value, VectorValue, describe
 from stlc.compile.ir import typed
-from stlc.compile.ir.discretize import Grid, in_words
+from stlc.compile.ir.discretize import Grid, duration, in_words
 from stlc.compile.ir.nodes import Window
 from stlc.editor.document import Document, borrowed_at
 from stlc.editor.symbols import Symbol
@@ -36,7 +36,8 @@ def hover(document: Document, offset: int) -> tuple[Span, str] | None:
         return borrowed.span, about_shared(borrowed.item, borrowed.module.key)
     lexeme, before = _lexeme(document.source.text, offset)
     node = _temporal_at(document.spec, offset)
-    if node is not None and (lexeme is None or lexeme.kind != "word" or _is_temporal(lexeme)):
+    other = lexeme is not None and lexeme.kind == "word" and lexeme.text.rstrip("_") not in _ALIASES
+    if node is not None and not other:
         return _place_of(document, node, lexeme, offset), _about_temporal(document, node)
     if lexeme is None or lexeme.kind != "word":
         return None
@@ -57,10 +58,6 @@ def _lexeme(text: str, offset: int) -> tuple[Lexeme | None, str]:
             found, before = lexeme, last
         last = lexeme.text
     return found, before
-
-
-def _is_temporal(lexeme: Lexeme) -> bool:
-    return lexeme.text.rstrip("_") in _ALIASES
 
 
 def _place_of(document: Document, node: ast.Temporal | ast.Until, lexeme: Lexeme | None, offset: int) -> Span:
@@ -93,12 +90,6 @@ def _grid_value(word: str, grid: Grid) -> str:
     if word == "T" and grid.horizon is not None:
         return f"\n\n{duration(grid.horizon, grid)}"
     return ""
-
-
-def duration(steps: int, grid: Grid) -> str:
-    """A number of steps in seconds and in steps: `2.5 s = 25 steps`."""
-    count = f"{steps} step{'' if steps == 1 else 's'}"
-    return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
 
 
 # ------------------------------------------------------------------------- symbols

@@ -26,7 +26,7 @@ from stlc.version import __version__
 _BREAK = re.compile(r"\r\n|\r|\n")
 
 
-class Layout:
+class PositionMapper:
     """Conversion between offsets in a text and positions (line, column) of the language server protocol.
 
     A position beyond the end of a line or of the text is converted to that end. Lines end at CR, LF or CRLF,
@@ -97,11 +97,11 @@ class Server(LanguageServer):
 
     def offset(self, document: Document, position: lsp.Position) -> int:
         """Return the character offset of a position that the editor sent."""
-        return Layout(document.source.text, self.workspace.position_codec).offset(position)
+        return PositionMapper(document.source.text, self.workspace.position_codec).offset(position)
 
     def range(self, span: Span) -> lsp.Range:
         """Convert a source location to a range (start and end) of the language server protocol (LSP)."""
-        layout = Layout(span.source.text, self.workspace.position_codec)
+        layout = PositionMapper(span.source.text, self.workspace.position_codec)
         return lsp.Range(layout.place(span.start), layout.place(span.end))
 
     def location(self, span: Span) -> lsp.Location:

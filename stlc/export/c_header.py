@@ -344,7 +344,7 @@ def _numbers(task: Task, network: PlanProposer) -> dict[str, object]:
         "LENGTH_COUNT": len(grid.lengths),
         "SAMPLES": grid.samples,
         "RANDOM": int(grid.sampling == "random"),
-        "GENERATORS": _generators(len(controls) * max(grid.lengths, default=1)),
+        "GENERATORS": ", ".join(map("{}u".format, generators(len(controls) * max(grid.lengths, default=1)))),
         "LEVEL_COUNTS": ", ".join(str(len(values)) for values in grid.values),
         "MOST_LEVELS": max(map(len, grid.values)),
         "LEVELS": ", ".join("{" + ", ".join(map(literal, values)) + "}" for values in grid.values),
@@ -454,10 +454,6 @@ def _description(timer: Timer) -> str:
             assert_never(timer.kind)
 
 
-def _generators(dims: int) -> str:
-    return ", ".join(f"{each}u" for each in generators(dims))
-
-
 def _block(lines: Sequence[str]) -> str:
     return "\n".join(f"  {line}" for line in lines)
 
@@ -478,8 +474,7 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
 def _falling(motion: Motion, plan: Plan) -> list[str]:
     """C function `fall`: robustness of the safety requirements on the first steps of a trajectory.
 
-    The later steps count as harmless. They are marked by an additional signal, which is positive at the
-    samples after the first steps. Its index is STATES, that is, it follows the states.
+    A signal with the index STATES is positive at the later samples, which count as harmless.
     """
     blocks = forward_blocks(plan, state_index(motion) | {BEYOND: len(motion.states)})
     return in_parts(replace(CHECK, name="fall"), blocks, declared(plan))

@@ -15,7 +15,7 @@ from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, Value
 from stlc.controller.guard import candidates as backup
 from stlc.controller.training.run import spec_hash, system_hash
-from stlc.diagnostics import Diagnostic, MissingError, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, not_installed
 from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.jsontext import dumps
 from stlc.provenance import sha256
@@ -47,8 +47,7 @@ def require_onnx() -> None:
     try:
         import onnx  # noqa: F401
     except ImportError:
-        message = "`--to onnx` needs the packages `onnx` and `onnxruntime`"
-        raise MissingError(Diagnostic("R301", message, help=("pip install 'stlc[onnx]'",))) from None
+        raise not_installed("`--to onnx` needs the packages `onnx` and `onnxruntime`", "onnx") from None
 
 
 def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) -> bytes:

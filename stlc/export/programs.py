@@ -192,8 +192,8 @@ class Guarding(nn.Module):
 
         A prefix consists of the first T0 actions of a plan. The policy plans the later actions, from the
         state that the prefix reaches when it starts in `x`. One more plan is tried first: its prefix is that
-        of the policy's own plan `own`. If `falls` is True, the robustness of the safety requirements on every
-        first part of each plan is computed, too.
+        of the policy's own plan `own`. If `falls` is True, the robustness of the safety requirements is
+        also computed on every initial segment of each plan.
         """
         heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
@@ -246,11 +246,7 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
 
 
 def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Select, for each state, the results for shorter prefixes (`before`) or the present ones (`here`).
-
-    `decided` is True for states in which a plan with a shorter prefix was accepted. For these states the
-    entries of `before` are returned, for the other states those of `here`.
-    """
+    """Results for shorter prefixes (`before`) for the states in `decided`, else the present ones (`here`)."""
     return tuple(
         torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
         for old, new in zip(before, here, strict=True)

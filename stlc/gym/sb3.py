@@ -12,15 +12,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, MissingError, usage
+from stlc.diagnostics import not_installed, usage
 from stlc.gym.spaces import Floats
 from stlc.gym.vector import SpecVectorEnv
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ModuleNotFoundError:
-    message = "stlc.gym.sb3 needs stable-baselines3, which is not installed"
-    raise MissingError(Diagnostic("R301", message, help=("pip install 'stlc[rl]'",))) from None
+    raise not_installed("stlc.gym.sb3 needs stable-baselines3, which is not installed", "rl") from None
 
 Indices: TypeAlias = Iterable[int] | int | None
 

@@ -26,14 +26,14 @@ PROBED = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class SpaceBounds:
     """Bounds of a space, (k,) float32, with the conversion between physical and normalised values."""
 
     low: Floats
     high: Floats
 
     @classmethod
-    def of(cls, ranges: Sequence[tuple[float, float]]) -> Bounds:
+    def of(cls, ranges: Sequence[tuple[float, float]]) -> SpaceBounds:
         """Bounds from pairs (low, high)."""
         ends = np.array(ranges, dtype=np.float32).reshape(-1, 2)
         return cls(ends[:, 0].copy(), ends[:, 1].copy())
@@ -63,12 +63,12 @@ class Bounds:
         return np.clip(scaled, -1.0, 1.0, out=scaled)
 
 
-def of_actuators(task: Task) -> Bounds:
+def of_actuators(task: Task) -> SpaceBounds:
     """Bounds of the actuator commands, in physical units."""
-    return Bounds.of(task.system.actuators)
+    return SpaceBounds.of(task.system.actuators)
 
 
-def of_observation(task: Task, *, time: bool) -> Bounds:
+def of_observation(task: Task, *, time: bool) -> SpaceBounds:
     """Bounds of the observed values, in physical units.
 
     They cover the nominal ranges and the values that random plans reach, widened by a quarter at each end. If
@@ -94,7 +94,7 @@ def of_observation(task: Task, *, time: bool) -> Bounds:
             least, most = float(column.min()), float(column.max())
         wider = 0.25 * max(most - least, 1e-3)
         found.append((least - wider, most + wider))
-    return Bounds.of([*found, *([(0.0, 1.0)] if time else [])])
+    return SpaceBounds.of([*found, *([(0.0, 1.0)] if time else [])])
 
 
 def initial_state(task: Task, given: object, count: int) -> Tensor:

@@ -94,10 +94,7 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
 
 
 def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """True if a word or number follows the sign `item` without a space.
-
-    If a word then replaced the sign, the two would become one word: `!p` would become `notp`.
-    """
+    """True if a word follows the sign `item` without a space: `!p` must not become `notp`."""
     return following.start == item.end and following.kind in ("word", "number")
 
 

@@ -234,10 +234,7 @@ class Monitor:
 
         recorded = given_times(dt, None) if like is None else recorded_times(like, self._given)
         compiled = self._ready(recorded)
-        rules = _chosen(compiled.requirements, require)
-        if not rules:
-            raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
-        return Online(compiled, rules, how)
+        return Online(compiled, _chosen(compiled, require), how)
 
     # ------------------------------------------------------------------- compiling
 
@@ -245,9 +242,7 @@ class Monitor:
         given = load_trace(subject, reading_of(self.spec)) if isinstance(subject, (str, Path)) else subject
         recorded = recorded_times(given, self._given) if isinstance(given, Trace) else Times()
         compiled = self._ready(recorded)
-        rules = _chosen(compiled.requirements, require)
-        if not rules:
-            raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
+        rules = _chosen(compiled, require)
         key = (compiled.grid, tuple(rule.name for rule in rules), plain)
         if key not in self._needs:
             self._needs[key] = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
@@ -280,11 +275,7 @@ class Monitor:
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _who_knows(self, finding: Diagnostic) -> Diagnostic:
-        """Add to a finding E311 the note that the system file does not exist.
-
-        E311 means that `dt` or `T` is unknown. The note is added only if the specification names a system.
-        All other findings are returned unchanged.
-        """
+        """Add to E311 (unknown `dt` or `T`) the note that the system file in the specification is missing."""
         if finding.code != "E311" or self.spec.system is None:
             return finding
         return finding.with_note(f"the specification names `{self.spec.system}`, but there is no such file")
@@ -303,12 +294,15 @@ def _source(spec: str | Path) -> Source:
     return Source("<text>", spec)
 
 
-def _chosen(rules: Sequence[CompiledRequirement], names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
-    known = [rule.name for rule in rules]
+def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
+    """Requirements called `names`; all if there are no names. Raises UsageError (U101) if there are none."""
+    if not compiled.requirements:
+        raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
+    known = [rule.name for rule in compiled.requirements]
     for name in names:
         if name not in known:
             raise unknown_requirement(name, known)
-    return tuple(rule for rule in rules if not names or rule.name in names)
+    return tuple(rule for rule in compiled.requirements if not names or rule.name in names)
 
 
 def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:

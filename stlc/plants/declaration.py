@@ -85,7 +85,7 @@ class VariableKeys:
 
 
 @dataclass(repr=False, eq=False)
-class InputKeys(VariableKeys):
+class PlantInputKeys(VariableKeys):
     """The keys of an input signal."""
 
     pieces: int = key(integer(high=10_000), "number of pieces of the signal", 1)
@@ -160,7 +160,7 @@ class PlantKeys:
     time: TimeKeys = key(part(TimeKeys), "time step and duration", TimeKeys(), required=True)
     initial: Node | None = key(_free(VariableKeys), "start values")
     param: Node | None = key(_free(VariableKeys), "parameters, constant during a simulation")
-    input: Node | None = key(_free(InputKeys), "input signals")
+    input: Node | None = key(_free(PlantInputKeys), "input signals")
     output: Node | None = key(
         raw(mapping_of(json_schema(OutputKeys)), OutputKeys), "output signals", required=True
     )
@@ -235,7 +235,7 @@ class PlantDecl:
         path: path of the plant file.
         source: text of the plant file.
         kind: kind of plant, an entry of `stlc.plants.kinds.KINDS`.
-        options: what the file says about the plant itself.
+        options: keys and values under the name of the kind in the plant file.
         dt: time step in seconds.
         steps: time steps of a simulation.
         halves: whether the plant may also be simulated at half the time step.
@@ -302,7 +302,7 @@ class PlantDecl:
         return (*kind.packages, *(() if self.controller is None else ("onnxruntime",)))
 
     def layout(self, scratch: str) -> Layout:
-        """Return what the process of the plant is told; `scratch` is its folder for temporary files."""
+        """Return the data with which the process of the plant starts; `scratch`: its temporary folder."""
         return Layout(
             kind=self.kind,
             options=self.options,
@@ -497,7 +497,7 @@ class _Reading:
     ) -> tuple[PlantInput, ...]:
         found = []
         for index, entry in self._entries(node, "input"):
-            name, keys = entry.key.text, InputKeys(**self._values(entry, "input", InputKeys))
+            name, keys = entry.key.text, PlantInputKeys(**self._values(entry, "input", PlantInputKeys))
             source = self._source("input", index, name, keys.source)
             unit = self._unit(entry, keys)
             if name in written:
@@ -511,7 +511,7 @@ class _Reading:
             found.append(PlantInput(name, unit, source, low, high, signal))
         return tuple(found)
 
-    def _limits(self, entry: Entry, keys: InputKeys) -> tuple[float | None, float | None]:
+    def _limits(self, entry: Entry, keys: PlantInputKeys) -> tuple[float | None, float | None]:
         """Return the range of an input that a controller writes, which may be missing."""
         given = entry.value.entries if isinstance(entry.value, MappingNode) else ()
         for each in given:

@@ -52,7 +52,7 @@ class PlantVariable:
 
 @dataclass(frozen=True, slots=True)
 class PlantFinding:
-    """A simulation that gave no trace: the plant crashed, hung, or gave what is not its outputs.
+    """A simulation that gave no trace: the plant crashed, hung, or returned invalid outputs.
 
     Attributes:
         reason: kind of failure.
@@ -347,7 +347,7 @@ class _Simulation:
         )
 
     def parts(self, samples: int) -> Iterator[Trace]:
-        """Yield the trace in parts of at most `samples` samples, at least two if there are so many."""
+        """Yield the trace in parts of at most `samples` samples, but at least two."""
         decl, size = self.decl, max(samples, 2)
         written = len(decl.inputs) - len(decl.free)
         first = np.concatenate((self.initial, self.param, self._inputs(0, 1)[0]))

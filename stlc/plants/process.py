@@ -211,7 +211,7 @@ class PlantProcess:
                 return
 
     def _drain(self) -> bool:
-        """Read what stands in the pipe of the standard error. Returns whether more may come."""
+        """Read the pending bytes of the standard error; return whether more may come."""
         stream = self._process.stderr
         assert stream is not None
         with self._reading:

@@ -39,7 +39,7 @@ ORPHAN = 1.0
 """Seconds between two checks whether the process that started this one still lives."""
 
 
-class Simulator:
+class ControlledPlant:
     """A plant with its controller: simulations in parts."""
 
     def __init__(self, layout: Layout) -> None:
@@ -66,7 +66,7 @@ class Simulator:
         return Message({"ended": False}, self._y[None])
 
     def advance(self, _header: Any, array: Floats) -> Message:
-        """Advance by a row of free inputs each, (steps, free inputs).
+        """Advance by one step for each row of the free inputs, (steps, free inputs).
 
         The reply has a row for each step that was made: the outputs after it, then the inputs that the
         controller wrote before it.
@@ -103,7 +103,7 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
             raise EOFError
         return found
 
-    simulator: Simulator | None = None
+    simulator: ControlledPlant | None = None
     while True:
         try:
             request = received(read)
@@ -113,7 +113,7 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
             if simulator is None:
                 layout = layout_of(request.header["layout"])
                 _limit_memory(layout.memory)
-                simulator = Simulator(layout)
+                simulator = ControlledPlant(layout)
                 reply = Message({"units": simulator.units}, np.zeros((0, 0)))
             else:
                 does: dict[str, Callable[[Any, Floats], Message]] = {
@@ -128,7 +128,7 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
 
 
 def _failure(error: BaseException, step: int) -> dict[str, Any]:
-    """Header of the reply to a request that failed; other errors than ours are printed, too."""
+    """Header of the reply to a request that failed; unexpected errors, as of the plant, are also printed."""
     match error:
         case UnfitError():
             return {"unfit": str(error), "place": error.place}

@@ -110,10 +110,7 @@ def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
 
 
 def _seconds(trace: str, group: ClockGroup) -> NDArray[np.float64]:
-    """Convert a time column of dates and times to seconds since the first one.
-
-    Raises TraceError (E603) if the column contains other words.
-    """
+    """Convert dates and times to seconds since the first one. Raises TraceError (E603) for other words."""
     instants = instants_of(trace, group)
     first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
     return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import not_installed
 
 _PACKAGES = {"matplotlib": "matplotlib", "PIL": "pillow"}
 
@@ -24,12 +24,7 @@ def require_drawing() -> None:
     missing = _missing()
     if missing:
         verb = "is" if len(missing) == 1 else "are"
-        finding = Diagnostic(
-            "R301",
-            f"pictures need {' and '.join(missing)}, which {verb} not installed",
-            help=("pip install 'stlc[plot]'",),
-        )
-        raise MissingError(finding)
+        raise not_installed(f"pictures need {' and '.join(missing)}, which {verb} not installed", "plot")
 
 
 def _missing() -> list[str]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stlc.controller.sketch import DECIDED, NOTE, deciders
 from stlc.controller.stage import Ball, Stage
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import Diagnostic, MissingError, not_installed
 from stlc.dynamics.robots.kinematics import read_urdf, robot_of
 from stlc.view.scene import Scene
 
@@ -93,8 +93,7 @@ def show(stage: Stage, scene: Scene, dt: float) -> None:
 def require_window() -> None:
     """Raise MissingError: R301 if PyBullet is not installed, R302 if there is no display."""
     if not available():
-        message = "a window needs pybullet, which is not installed"
-        raise MissingError(Diagnostic("R301", message, help=(ADVICE,)))
+        raise not_installed("a window needs pybullet, which is not installed", "panda")
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         advice = ("leave `--window` out: the animation shows the same, and needs no display",)
         raise MissingError(Diagnostic("R302", "there is no display for a window", help=advice))

@@ -160,10 +160,7 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
 
 
 def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows, one per requirement.
-
-    A row contains the share of instants from which the executed trajectory satisfies the requirement.
-    """
+    """Table rows: requirement, and the share of instants from which the executed run satisfies it."""
     names = [name for name in _names(guards) if name.startswith(HOLDS)]
     return [(name.removeprefix(HOLDS), *_cells(guards, name, _share_cell)) for name in names]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
@@ -45,7 +44,8 @@ def recorded_section(contents: RunContents) -> Section | None:
         return Section("driven", TITLE, el("p", f"The trace could not be judged: {_messages(error)}."))
     names = trace_names(trace)
     causes = explain_all(verdict)
-    choices = choose_traces(_per_trace(verdict), names, acted_in(trace))
+    robustness = np.atleast_1d(np.asarray(verdict.robustness, dtype=float))
+    choices = choose_traces(robustness, names, acted_in(trace))
     picture = draw_signals(trace, margins, choices, units_of(verdict))
     body = join(
         _rules_part(contents, trace, names),
@@ -103,10 +103,6 @@ def map_section(contents: RunContents) -> Section | None:
         return None
     picture = draw_map(region_map)
     return Section("map", "Where it drives", figure(picture.data_uri(), picture.alt, MAP_CAPTION), picture)
-
-
-def _per_trace(verdict: Verdict) -> NDArray[np.float64]:
-    return np.atleast_1d(np.asarray(verdict.robustness, dtype=float))
 
 
 def _summary(verdict: Verdict) -> str:

@@ -218,11 +218,9 @@ def _draw_regions(axes: Axes, region_map: RegionMap) -> list[PathPatch]:
 
 
 def _clearest(depth: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> tuple[int, int]:
-    """Return the grid position (row, column) for the label of a region.
+    """Grid position (row, column) for the label of a region: deep inside, if possible outside of the others.
 
-    `depth` is the distance of each grid point to the border of the region, positive inside. `others` are the
-    distances to the borders of the other regions. The label is placed deep inside the region and, if
-    possible, outside the other regions.
+    `depth`, `others`: signed distance of each grid point to the border of a region, positive inside.
     """
     free = np.minimum.reduce([depth, *(-other for other in others)])
     row, column = np.unravel_index(np.argmax(free if (free >= 0).any() else depth), depth.shape)

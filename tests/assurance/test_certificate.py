@@ -20,7 +20,7 @@ from stlc.assurance.certificate import (
     together,
     wrong_numbers,
 )
-from stlc.assurance.conformal import Shift
+from stlc.assurance.conformal import DistributionShift
 from stlc.jsontext import plain
 
 
@@ -79,10 +79,12 @@ def test_samples_are_joined_with_their_worlds_apart() -> None:
     st.lists(st.sampled_from([-1.0, 1.0, -np.inf]), min_size=1, max_size=80),
     st.booleans(),
     st.sampled_from([None, 0.5, 0.9]),
-    st.sampled_from([Shift("tv", 0.0), Shift("tv", 0.05), Shift("kl", 0.01)]),
+    st.sampled_from(
+        [DistributionShift("tv", 0.0), DistributionShift("tv", 0.05), DistributionShift("kl", 0.01)]
+    ),
 )
 def test_a_certificate_is_consistent(
-    values: list[float], any_time: bool, share: float | None, shift: Shift
+    values: list[float], any_time: bool, share: float | None, shift: DistributionShift
 ) -> None:
     units = [index // 2 for index in range(len(values))]
     found = assess(sample(values, units, "world"), Claim(share, shift=shift, any_time=any_time))

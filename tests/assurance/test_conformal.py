@@ -13,7 +13,7 @@ from scipy import optimize, stats
 from stlc.assurance.conformal import (
     DIVERGENCES,
     SAME,
-    Shift,
+    DistributionShift,
     adaptive_bound,
     calibrate_online,
     drives_for_bound,
@@ -25,7 +25,7 @@ from stlc.diagnostics import UsageError
 
 RECALIBRATIONS = 200
 CHANCES = st.floats(0.001, 0.999)
-SHIFTS = st.builds(Shift, st.sampled_from(DIVERGENCES), st.floats(0, 0.5))
+SHIFTS = st.builds(DistributionShift, st.sampled_from(DIVERGENCES), st.floats(0, 0.5))
 
 
 def divergence(kind: str, q: float, p: float) -> float:
@@ -40,7 +40,9 @@ def divergence(kind: str, q: float, p: float) -> float:
 
 
 @given(SHIFTS, CHANCES)
-def test_the_shifted_chance_is_the_greatest_within_the_distance(shift: Shift, chance: float) -> None:
+def test_the_shifted_chance_is_the_greatest_within_the_distance(
+    shift: DistributionShift, chance: float
+) -> None:
     greatest = shift.greatest(chance)
     assert chance - 1e-12 <= greatest <= 1.0
     at_one = divergence(shift.kind, 1.0, chance)
@@ -53,10 +55,11 @@ def test_the_shifted_chance_is_the_greatest_within_the_distance(shift: Shift, ch
 
 
 @given(SHIFTS, CHANCES, CHANCES)
-def test_the_shifted_chance_is_concave(shift: Shift, first: float, second: float) -> None:
+def test_the_shifted_chance_is_concave(shift: DistributionShift, first: float, second: float) -> None:
     """This is why it also bounds the mean over calibrations."""
     middle = shift.greatest((first + second) / 2)
-    assert middle >= (shift.greatest(first) + shift.greatest(second)) / 2 - 1e-9
+    # a divergence near 0 is known up to 1e-16, and so is the square of the distance from `chance`
+    assert middle >= (shift.greatest(first) + shift.greatest(second)) / 2 - 1e-7
 
 
 @given(st.integers(0, 500), st.integers(1, 99))
@@ -66,25 +69,30 @@ def test_the_rank_is_the_usual_one(drives: int, percent: int) -> None:
 
 
 @given(st.integers(1, 300), SHIFTS)
-def test_a_shift_never_raises_the_bound(drives: int, shift: Shift) -> None:
+def test_a_shift_never_raises_the_bound(drives: int, shift: DistributionShift) -> None:
     values = np.random.default_rng(drives).normal(size=drives)
     assert lower_bound(values, 0.9, shift) <= lower_bound(values, 0.9)
 
 
-@pytest.mark.parametrize(("text", "shift"), [("0.02", Shift("tv", 0.02)), ("kl=.1", Shift("kl", 0.1))])
-def test_a_shift_is_written(text: str, shift: Shift) -> None:
-    assert Shift.parse(text) == shift
-    assert Shift.parse(str(shift)) == shift
+@pytest.mark.parametrize(
+    ("text", "shift"), [("0.02", DistributionShift("tv", 0.02)), ("kl=.1", DistributionShift("kl", 0.1))]
+)
+def test_a_shift_is_written(text: str, shift: DistributionShift) -> None:
+    assert DistributionShift.parse(text) == shift
+    assert DistributionShift.parse(str(shift)) == shift
 
 
 @pytest.mark.parametrize("text", ["", "-1", "1.5", "l2=.1", "kl=", "tv=nan", "kl=inf"])
 def test_other_shifts_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="U101"):
-        Shift.parse(text)
+        DistributionShift.parse(text)
 
 
-@pytest.mark.parametrize("shift", [SAME, Shift("tv", 0.02), Shift("kl", 0.01), Shift("chi2", 0.01)])
-def test_the_drives_for_a_bound_are_the_fewest(shift: Shift) -> None:
+@pytest.mark.parametrize(
+    "shift",
+    [SAME, DistributionShift("tv", 0.02), DistributionShift("kl", 0.01), DistributionShift("chi2", 0.01)],
+)
+def test_the_drives_for_a_bound_are_the_fewest(shift: DistributionShift) -> None:
     needed = drives_for_bound(0.95, shift)
     assert needed is not None
     assert math.isfinite(lower_bound(np.zeros(needed), 0.95, shift))
@@ -93,12 +101,12 @@ def test_the_drives_for_a_bound_are_the_fewest(shift: Shift) -> None:
 
 
 def test_too_large_a_shift_allows_no_bound() -> None:
-    assert drives_for_bound(0.95, Shift("tv", 0.05)) is None
-    assert lower_bound(np.zeros(10_000), 0.95, Shift("tv", 0.06)) == -math.inf
+    assert drives_for_bound(0.95, DistributionShift("tv", 0.05)) is None
+    assert lower_bound(np.zeros(10_000), 0.95, DistributionShift("tv", 0.06)) == -math.inf
 
 
-@pytest.mark.parametrize("shift", [SAME, Shift("tv", 0.05)])
-def test_the_bound_covers_the_next_drive_under_the_stated_shift(shift: Shift) -> None:
+@pytest.mark.parametrize("shift", [SAME, DistributionShift("tv", 0.05)])
+def test_the_bound_covers_the_next_drive_under_the_stated_shift(shift: DistributionShift) -> None:
     """With the probability of the shift the next drive comes from a worse place: the worst case."""
     rng = np.random.default_rng(3)
     covered, naive = [], []

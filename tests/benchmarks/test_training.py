@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,9 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.__main__ import main as measure
-from benchmarks.feasible import TRIES, _union, known_feasible, prove_on, search_on
+from benchmarks.feasible import TRIES, KnownFeasible, _union, known_feasible, prove_on, search_on
+from benchmarks.learned import learned
 from benchmarks.options import Training
 from benchmarks.store import BENCHMARKS, ResultStore, load
+from benchmarks.table import text_of
 from benchmarks.tables import ablation, paper
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import (
@@ -33,6 +34,7 @@ from benchmarks.training import (
     remaining,
     unpack,
 )
+from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT_SEED
 from stlc.controller.training.launch import Launch, open_folder
@@ -281,8 +283,8 @@ def cell_result(benchmark: str, method: str, seed: int, accuracy: float, **chang
 
 
 def paper_rows(documents: list[dict[str, Any]], known: dict[str, float]) -> list[paper.Row]:
-    found = {name: SimpleNamespace(benchmark=name, share=share) for name, share in known.items()}
-    return paper.tables(documents, found)["rows"].rows  # type: ignore[arg-type]
+    found = {name: KnownFeasible(name, share, (0.0, 1.0), 0, None, 0, 0, 0) for name, share in known.items()}
+    return paper.tables(documents, found)["rows"].rows
 
 
 def test_rows_are_means_over_seeds_as_shares_of_what_is_feasible() -> None:
@@ -300,6 +302,42 @@ def test_rows_are_means_over_seeds_as_shares_of_what_is_feasible() -> None:
     assert low < 0.81 < high < low + 0.014
     assert [row.benchmark for row in paper_rows(documents, {})] == ["traffic", "ship_safe"]
     assert set(BENCHMARKS) >= {"traffic", "ship_safe"}
+
+
+def test_a_policy_that_is_judged_on_the_first_states_only(tmp_path: Path) -> None:
+    flags = {40: [i % 4 > 0 for i in range(40)], 8: [i < 7 for i in range(8)]}
+    full, part = (
+        {
+            **cell_result("traffic", method, 0, sum(own) / len(own), held_out=40),
+            **{"held_out": len(own), "solved": pack(own)},
+        }
+        for method, own in zip(("guided", "pets"), flags.values(), strict=True)
+    )
+    for each in (full, part):
+        each["key"] |= {"spec_sha256": "", "system_sha256": "", "held_out_seed": 1}
+    known = known_feasible(ResultStore("feasible", tmp_path), [full, part])
+    # of the first eight states, guided solves all but 0 and 4, and pets all but 7
+    assert (known["traffic"].share, known["traffic"].partial) == (32 / 40, {8: 1.0})
+    rows = {row.method: row for row in paper.tables([full, part], known)["rows"].rows}
+    assert (rows["pets"].judged, rows["pets"].known_feasible, rows["pets"].share) == ((8,), 1.0, 7 / 8)
+    assert rows["pets"].interval == wilson(7 / 8, 8)
+    assert rows["guided"].interval == wilson(0.75, 40)
+    shown = {name: text_of(row, paper.SHOWN["accuracy"]) for name, row in rows.items()}
+    assert shown["pets"].endswith("] (of 8 states)")
+    assert shown["guided"].endswith("]")
+    shares = [each for each in learned([full, part]) if each.fewer]
+    assert [(each.method, each.fewer) for each in shares] == [("pets", " (of 8 states)")]
+
+
+def test_the_best_run_is_not_one_that_was_judged_on_few_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lucky = {**cell_result("traffic", "pets", 0, 1.0), "held_out": 32}
+    place = Place(ResultStore("paper", tmp_path))
+    monkeypatch.setattr(Place, "newest_run", lambda _, key: key.name)
+    assert str(place.best_run([lucky, cell_result("traffic", "guided", 0, 0.97)])).startswith(
+        "traffic-guided"
+    )
 
 
 def test_clocks_do_not_share_a_row() -> None:

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from stlc.compile.frontend.expressions import Number, resolve_number, resolve_numbers, stored
 from stlc.compile.frontend.scope import (
     Definition,
+    Known,
     Scope,
     column_entries,
-    constant_entries,
+    constant_value,
     enforced,
     member_entries,
 )
@@ -39,13 +40,17 @@ COLUMNS = (
     Column("q[0]", parse_unit("m")),
     Column("q[1]", parse_unit("m")),
 )
-CONSTANTS = {"amax": (10.0, parse_unit("m/s^2")), "dt": (0.1, parse_unit("s")), "two": (2.0, DIMENSIONLESS)}
+CONSTANTS = {
+    "amax": Known(constant_value(10.0, parse_unit("m/s^2"))),
+    "dt": Known(constant_value(0.1, parse_unit("s"))),
+    "two": Known(constant_value(2.0, DIMENSIONLESS)),
+}
 ROW = {"x": 3.0, "v": 2.0, "psi": 90.0, "d": 1.5, "free": 0.25, "sign": 1.0, "yielding": 0.0, "gear": 3.0}
 ROW |= {"q[0]": 3.0, "q[1]": -4.0}
 
 
 def scope(**settings: object) -> Scope:
-    entries = {**column_entries(COLUMNS), **member_entries([LABELS]), **constant_entries(CONSTANTS)}
+    entries = {**column_entries(COLUMNS), **member_entries([LABELS]), **CONSTANTS}
     entries["has_lead"] = Definition("has_lead", parse_expr(Source("d", "x >= 0")))
     given_ = {"error": SystemFileError, "facts": enforced(COLUMNS), **settings}
     return Scope(entries, **given_)  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.plants.declaration import PlantDecl, parse_plant
-from stlc.plants.worker import Simulator
+from stlc.plants.worker import ControlledPlant
 from stlc.source import Source
 
 PENDULUM = """
@@ -89,7 +89,7 @@ def simulated(
 
     `values` are start values and parameters; `inputs` is (steps, free inputs), by default zeros.
     """
-    simulator = Simulator(decl.layout(str(folder)))
+    simulator = ControlledPlant(decl.layout(str(folder)))
     start = [values.get(each.name, each.low) for each in (*decl.initial, *decl.param)]
     u = np.zeros((decl.steps, len(decl.free))) if inputs is None else inputs
     first = simulator.start({"seed": int(values.get("seed", 0))}, np.array([[*start, *u[0]]]))

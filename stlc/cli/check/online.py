@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from stlc.monitor.explain.report import Cause
     from stlc.monitor.judgement import Status
     from stlc.monitor.online.online import Decision, Online
-    from stlc.monitor.online.tally import Tally
+    from stlc.monitor.online.tally import RequirementSummary
     from stlc.monitor.signals import Conversion
     from stlc.monitor.verdict import Monitor
     from stlc.trace.live import Sample, Uniform
@@ -119,7 +119,9 @@ def _outcome(
     )
 
 
-def _row(name: str, tally: Tally, online: Online, cause: Cause | None, gaps: Mapping[str, str]) -> VerdictRow:
+def _row(
+    name: str, tally: RequirementSummary, online: Online, cause: Cause | None, gaps: Mapping[str, str]
+) -> VerdictRow:
     rule = online.rule(name)
     where = f"from {_moment(online, tally.worst)}" if tally.instants > 1 else ""
     unit = rule.unit or ("" if cause is None else cause.unit)
@@ -143,13 +145,15 @@ def _moment(online: Online, sample: int) -> str:
     return f"t = {online.time(sample):.10g} s"
 
 
-def _violation(name: str, tally: Tally, cause: Cause, *, color: bool) -> str:
+def _violation(name: str, tally: RequirementSummary, cause: Cause, *, color: bool) -> str:
     count = f", at {tally.fails:,} of {tally.instants:,} starts" if tally.instants > 1 else ""
     place = render_place(cause.place, cause.labels, [("because", cause.because)], color=color)
     return f"{visible(name)} is violated{count}.\n{place}".rstrip("\n")
 
 
-def _requirement(name: str, tally: Tally, online: Online, cause: Cause | None) -> CheckedRequirement:
+def _requirement(
+    name: str, tally: RequirementSummary, online: Online, cause: Cause | None
+) -> CheckedRequirement:
     least = tally.robustness
     return requirement_record(
         online.rule(name),

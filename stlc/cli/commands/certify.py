@@ -22,10 +22,13 @@ from stlc.cli.framework.assured import (
 )
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
+    DriveStepsOption,
     GuardOption,
+    MarginOption,
     RequireOption,
     RunsOption,
     SetOption,
+    TimeLimitOption,
     parse_limit,
     parse_overrides,
     parse_seeds,
@@ -53,24 +56,10 @@ class Driving:
     """Options on how the policy is deployed."""
 
     guard: GuardOption = "none"
-    time_limit: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Time limit of a guard's decision per agent, or `none`; 100ms unless it is the paper's.",
-        ),
-    ] = None
-    margin: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="M|NAME=M|auto",
-            help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
-        ),
-    ] = None
+    time_limit: TimeLimitOption = None
+    margin: MarginOption = None
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="A scenario of the system.")] = None
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")] = (
-        None
-    )
+    steps: DriveStepsOption = None
     agents: Annotated[
         int | None, typer.Option(min=1, help="Agents in each world; by default the system's.")
     ] = None
@@ -181,13 +170,13 @@ def certify(
         return _verified(verify, run, what, runs)
     from stlc.assurance.campaign import Campaign
     from stlc.assurance.certificate import Claim
-    from stlc.assurance.conformal import SAME, Shift
+    from stlc.assurance.conformal import SAME, DistributionShift
 
     wanted = share if share is not None or width is not None else DEFAULT_SHARE
     claim = Claim(
         None if wanted is None else checked_share("--share", wanted),
         checked_share("--confidence", confidence),
-        SAME if shift is None else Shift.parse(shift),
+        SAME if shift is None else DistributionShift.parse(shift),
         online=True,
     )
     if width is not None:

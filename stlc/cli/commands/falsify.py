@@ -158,7 +158,7 @@ def falsify(
 
 @dataclass(frozen=True, slots=True)
 class _Target:
-    """What is simulated, as given on the command line."""
+    """Subject of the simulations, as given on the command line."""
 
     name: str
     system: str | None

@@ -212,11 +212,7 @@ def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Pat
 
 
 def _system_file(folder: Path, name: str) -> tuple[dict[Path, str], str]:
-    """Path and text of a new system file `NAME.yaml`.
-
-    Returns:
-        Path -> text, and the command to run next.
-    """
+    """Path and text of a new system file `NAME.yaml`, and the command to run next."""
     path = _path(folder, name, "systems", ".yaml")
     text = _template("system.yaml").format(name=path.stem)
     return {path: text}, shell(("stlc", "system", "show", operand(str(path))))

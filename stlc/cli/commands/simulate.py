@@ -14,8 +14,10 @@ from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, re
 from stlc.cli.framework.assured import Assurance
 from stlc.cli.framework.documents import ScenarioResult, SimulateResult, Simulation
 from stlc.cli.framework.options import (
+    DriveStepsOption,
     FailUnderOption,
     JsonOption,
+    MarginOption,
     PicturesOption,
     PlannerOption,
     PlannerOptionsOption,
@@ -24,6 +26,7 @@ from stlc.cli.framework.options import (
     SeedsOption,
     SetOption,
     SystemOption,
+    TimeLimitOption,
     parse_limit,
     parse_overrides,
     parse_seeds,
@@ -73,27 +76,13 @@ def simulate(
             help="Guard, by default none; `full` also repairs plans, `certified` also bounds errors.",
         ),
     ] = None,
-    time_limit: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Time limit of a guard's decision per agent, or `none`; 100ms unless it is the paper's.",
-        ),
-    ] = None,
+    time_limit: TimeLimitOption = None,
     ceiling: Annotated[
         int, typer.Option(min=0, help="Number of visited states to check for a feasible plan.")
     ] = 0,
-    margin: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="M|NAME=M|auto",
-            help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
-        ),
-    ] = None,
+    margin: MarginOption = None,
     seeds: SeedsOption = "0..9",
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")
-    ] = None,
+    steps: DriveStepsOption = None,
     agents: Annotated[
         int | None, typer.Option(min=1, help="Agents in each run; by default the system's.")
     ] = None,
@@ -168,9 +157,11 @@ def simulate(
         overrides = parse_overrides(set_)
         given = PlantOrder(run, plant, from_, seeds, record, jobs, stream, overrides, fail_under)
         own = {"--backup": backup, "--guard": guard, "--scenario": scenario, "--method": method}
-        _no_policy({**own, "--certify": certify})
+        why = "is for trained policies and planners, and `--plant` has neither"
+        _refuse_given({**own, "--certify": certify}, why)
         return simulate_plant(given)
-    _no_plant({"--from": from_, "--stream": stream or None})
+    advice = "stlc simulate SPEC --plant FILE"
+    _refuse_given({"--from": from_, "--stream": stream or None}, "is for plants", advice)
     from stlc.cli.simulate.text import closing, screen
     from stlc.controller.deployment.simulator import Setting
     from stlc.controller.guard.margins import parse_margins
@@ -229,18 +220,11 @@ def _require_writable(record: Path | None, margins: str | None) -> None:
     require_writable(margins)
 
 
-def _no_policy(options: Mapping[str, object]) -> None:
-    """Raise UsageError (U101) if an option of trained policies is given with `--plant`."""
+def _refuse_given(options: Mapping[str, object], why: str, *advice: str) -> None:
+    """Raise UsageError (U101) with the reason `why` if one of the options has a value other than None."""
     for name, value in options.items():
         if value is not None:
-            raise usage(f"`{name}` is for trained policies and planners, and `--plant` has neither")
-
-
-def _no_plant(options: Mapping[str, object]) -> None:
-    """Raise UsageError (U101) if an option of plants is given without `--plant`."""
-    for name, value in options.items():
-        if value is not None:
-            raise usage(f"`{name}` is for plants", "stlc simulate SPEC --plant FILE")
+            raise usage(f"`{name}` {why}", *advice)
 
 
 def _planner(
@@ -374,10 +358,7 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
 
 
 def _satisfied(document: Simulation, guard: Mode) -> float:
-    """Least share, over all scenarios in `document`, of closed-loop runs that satisfy all requirements.
-
-    Only the runs with the guard `guard` are counted.
-    """
+    """Least share, over all scenarios, of the drives with the guard `guard` that obey every requirement."""
     guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
     runs = [each[guard]["drives"] for each in guards]
     return min(float(each["obeyed"] / each["count"]) for each in runs)

@@ -9,7 +9,7 @@ Count = Annotated[int, 0]
 
 
 class ShareStatement(TypedDict):
-    """What drives say about one requirement; see `stlc.assurance.certificate.Statement`."""
+    """Bounds on one requirement from a sample of drives; see `stlc.assurance.certificate.Statement`."""
 
     name: str
     drives: Count
@@ -78,7 +78,7 @@ class Assurance(TypedDict):
 
 
 class CertifiedInputs(TypedDict):
-    """Hashes and versions of what the drives depend on."""
+    """Hashes and versions of the inputs of the drives."""
 
     spec: str
     system: str
@@ -172,7 +172,7 @@ class DrawnCertificate(Assurance):
 
 
 class DifferentEntry(TypedDict):
-    """Entry of a certificate that differs now."""
+    """Entry of a certificate that differs from the present run."""
 
     name: str
     certificate: str

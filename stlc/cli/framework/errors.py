@@ -13,7 +13,7 @@ from pathlib import Path
 import typer
 
 from stlc.cli.framework.output import emit_json, show_diagnostics
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, os_reason
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, not_installed, os_reason
 
 INTERNAL_ERROR = 70
 INTERRUPTED = 130
@@ -98,7 +98,9 @@ def _known(error: BaseException) -> StlcError | None:
         case MemoryError():
             return MissingError(Diagnostic("R202", "there is not enough memory"))
         case ModuleNotFoundError(name=str() as name) if name.partition(".")[0] in _EXTRAS:
-            return _missing_package(name.partition(".")[0])
+            package = name.partition(".")[0]
+            message = f"this needs the package `{package}`, which is not installed"
+            return not_installed(message, _EXTRAS[package])
     if callable(getattr(error, "format_message", None)):
         return UsageError(_usage(error))
     return None
@@ -112,12 +114,6 @@ def _from_system(error: OSError) -> StlcError | None:
     if error.errno in _NO_FILE and place:
         return UsageError(Diagnostic("U102", f"cannot open{place}: {reason}"))
     return None
-
-
-def _missing_package(name: str) -> StlcError:
-    advice = (f"pip install 'stlc[{_EXTRAS[name]}]'",)
-    message = f"this needs the package `{name}`, which is not installed"
-    return MissingError(Diagnostic("R301", message, help=advice))
 
 
 def _usage(error: BaseException) -> Diagnostic:

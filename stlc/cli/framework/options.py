@@ -68,6 +68,23 @@ ClusterOption = Annotated[
         help="Work on a Ray cluster, with as many processes as it has cores.",
     ),
 ]
+TimeLimitOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TIME",
+        help="Time limit of a guard's decision per agent, or `none`; 100ms unless it is the paper's.",
+    ),
+]
+MarginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="M|NAME=M|auto",
+        help="Safety margin that the guard requests; repeatable. `auto` calibrates it.",
+    ),
+]
+DriveStepsOption = Annotated[
+    int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")
+]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
 PicturesOption = Annotated[bool, typer.Option(help="Draw pictures and the report.")]
 SetOption = Annotated[

@@ -217,15 +217,11 @@ def to_json(diagnostic: Diagnostic) -> dict[str, Any]:
         "message": diagnostic.message,
         **({"file": None, "range": None} if span is None else _place(span)),
         "label": diagnostic.label,
-        "labels": [_label(label) for label in diagnostic.labels],
+        "labels": [{**_place(label.span), "text": label.text} for label in diagnostic.labels],
         "help": list(diagnostic.help),
         "note": list(diagnostic.note),
         "fix": None if fix is None else {"text": fix.text, "edits": edits},
     }
-
-
-def _label(label: Label) -> dict[str, Any]:
-    return {**_place(label.span), "text": label.text}
 
 
 def _place(span: Span) -> dict[str, Any]:

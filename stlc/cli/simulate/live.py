@@ -248,10 +248,7 @@ def _signed(value: float) -> str:
 
 
 def _least(margins: Mapping[str, Margin]) -> NDArray[np.float64]:
-    """Least robustness of each agent over all requirements, (agents of all seeds,).
-
-    `margins` maps the name of a requirement to bounds on its robustness. The upper bounds are used.
-    """
+    """Upper bounds on the least robustness over all requirements, (agents of all seeds,)."""
     least: NDArray[np.float64] = np.min([margin.high for margin in margins.values()], axis=0)
     return least
 

@@ -67,10 +67,7 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
 
 
 def _starts(document: Record) -> Iterator[str]:
-    """Yield a line on the choice of initial states, such as "starts from which a safe plan is known".
-
-    No line is yielded if every sampled initial state was used.
-    """
+    """Yield a line on the choice of initial states; none if every sampled state was used."""
     known = {"savable": "a safe plan", "feasible": "a plan that satisfies everything"}.get(document["starts"])
     if known:
         yield f"  starts from which {known} is known; {document['redrawn']:,} others were drawn again"
@@ -95,10 +92,7 @@ def _drives(document: Record) -> Iterator[str]:
 
 
 def _rules(document: Record) -> Iterator[tuple[str, ...]]:
-    """Table rows that show, for each requirement on drives (closed-loop runs), how many drives obeyed it.
-
-    A row is the name of the requirement, then one cell per guard, such as `37 of 40`.
-    """
+    """Table rows: name of a requirement on drives, then one cell per guard, such as `37 of 40`."""
     guards = [guard["drives"] for guard in document["guards"].values()]
     for name in guards[-1]["rules"]:
         yield (name, *(f"{each['rules'][name]['obeyed']} of {each['count']}" for each in guards))
@@ -165,9 +159,8 @@ def compared(document: Record) -> Iterator[str]:
 def _both(guard: Record) -> list[str]:
     """Return the two cells for one guard in a table that compares scenarios.
 
-    The first cell counts drives (closed-loop runs). `37 of 40` means that a satisfying plan was known for 40
-    drives, and that 37 of them obeyed every requirement. The second cell is the share of plans that satisfy
-    the specification.
+    The first is the number of drives that obeyed everything, of those for which a plan was known: `37 of 40`.
+    The second is the share of plans that satisfy the specification.
     """
     drives = guard["drives"]
     obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"

@@ -52,7 +52,7 @@ def percent(value: float) -> str:
     return f"{100 * value:.1f} %"
 
 
-class Progress:
+class TrainingDisplay:
     """Display of a training run: a panel redrawn in place on a terminal, elsewhere one line every 25 s.
 
     Call `start`, then `update` for every row of `train.jsonl`, then `finish`; after an interruption, `stop`

@@ -13,7 +13,7 @@ import typer
 from stlc.cli.framework.documents import TrainedRun, verdict_record
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import PULSE, Answer, console, say, show_diagnostics
-from stlc.cli.train.progress import Progress, final_screen
+from stlc.cli.train.progress import TrainingDisplay, final_screen
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
@@ -53,7 +53,7 @@ class Session:
 
     folder: RunDir
     outcome: TrainingOutcome | None = None
-    progress: Progress = field(default_factory=Progress)
+    progress: TrainingDisplay = field(default_factory=TrainingDisplay)
     logger: Opener | None = None
     writes: bool = True
     _log: TensorBoardLogger | None = None
@@ -74,11 +74,9 @@ class Session:
         return Watch(self._resolved, self._row, stop, self._steps, self._late, PULSE.now)
 
     def _late(self, budget: float) -> float:
-        """Predict by how many seconds the run would exceed `budget` if the training used all of the budget.
+        """Seconds by which a run that trains for all of `budget` would exceed it; may be negative.
 
-        The run takes longer than the training because of other work, such as imports and pictures. This time
-        is estimated from the time that the imports took. A negative value means that the run would end within
-        `budget`.
+        The time beside the training (pictures, end) is estimated from the time of the imports.
         """
         return (1.0 + AFTER) * self._seconds_before - BESIDE - 0.1 * budget
 

@@ -21,6 +21,8 @@ from stlc.compile.ir import nodes as ir
 _DONE, _LOST = 1e6, 2e6
 """Values of `left` for a goal that is already met, and for one that can no longer be met."""
 _ZERO = ir.Const(0.0)
+_LATEST = ir.Const(0.5 * (_DONE + _LOST))
+"""Greatest `left` of a goal that can still be met."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,18 +159,14 @@ def _nearer(one: _Guidance, other: _Guidance) -> _Guidance:
         "or",
         (
             _is_lost(other.left),
-            ir.BoolOp("and", (_not_lost(one.left), at_least(other.gap, one.gap))),
+            ir.BoolOp("and", (at_least(_LATEST, one.left), at_least(other.gap, one.gap))),
         ),
     )
     return _Guidance(ir.Where(first, one.gap, other.gap), ir.Where(first, one.left, other.left))
 
 
 def _is_lost(left: ir.Num) -> ir.Formula:
-    return at_least(left, ir.Const(0.5 * (_DONE + _LOST)))
-
-
-def _not_lost(left: ir.Num) -> ir.Formula:
-    return at_least(ir.Const(0.5 * (_DONE + _LOST)), left)
+    return at_least(left, _LATEST)
 
 
 def _margin(formula: ir.Formula) -> ir.Num | None:

@@ -132,7 +132,8 @@ def _decided(formula: Absolute, clock: ir.Signal) -> ir.Num:
     mission clock (steps since the start of the mission).
     """
     inside, left, right = _inside(formula.window, clock), formula.left_now, formula.right_now
-    over = _passed(formula.window, clock)
+    end = formula.window.hi
+    over = ir.Truth(False) if end is None else at_least(clock, ir.Const(float(end)))
     match formula.op:
         case "always":
             return choose(both(inside, negate(right)), _FALSE, choose(over, _TRUE, _OPEN))
@@ -155,11 +156,6 @@ def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
         return started
     not_over = at_least(ir.Const(float(window.hi)), clock)
     return not_over if window.lo == 0 else both(started, not_over)
-
-
-def _passed(window: ir.Window, clock: ir.Signal) -> ir.Formula:
-    """Return a formula that holds once the mission clock (steps since the start) reaches `window`'s end."""
-    return ir.Truth(False) if window.hi is None else at_least(clock, ir.Const(float(window.hi)))
 
 
 # ------------------------------------------------------------------------- progression

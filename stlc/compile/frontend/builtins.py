@@ -32,7 +32,7 @@ from stlc.compile.frontend.regions import area, dimension, points, signed_distan
 from stlc.compile.frontend.scope import External, Scope
 from stlc.compile.frontend.values import (
     REGION_TYPES,
-    Box,
+    BoxRegion,
     Combined,
     Complement,
     Dilated,
@@ -146,7 +146,7 @@ def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]],
     return NormBall(center, radius, call.span)
 
 
-def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Box:
+def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> BoxRegion:
     lower, upper = (
         as_vector(value, expr, Expectation("a corner of a box is a vector"), scope) for expr, value in given
     )
@@ -162,7 +162,7 @@ def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scop
             scope.fail(
                 Diagnostic("E205", "this box is empty: a lower bound is above the upper one", call.span)
             )
-    return Box(lower, upper, call.span)
+    return BoxRegion(lower, upper, call.span)
 
 
 def _polygon_of(call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Polygon:
@@ -247,10 +247,9 @@ def _delayed_formula(formula: typed.Formula, delay: typed.Time, span: Span) -> t
 
 
 def _later(number: Number, delay: typed.Time, span: Span) -> Number:
-    """Return `number`, one component of a vector, shifted in time by `delay`.
+    """Return `number`, a component of a vector, shifted in time by `delay`.
 
-    A number such as `if c then p else q`, with bools p and q, can also be used as a formula. This formula is
-    stored in `Number.formula`, and is shifted too.
+    The formula of a number such as `if c then p else q`, with bools p and q, is shifted too.
     """
     formula = None if number.formula is None else _delayed_formula(number.formula, delay, span)
     return replace(number, num=_delayed_number(number.num, delay), formula=formula)
@@ -476,10 +475,9 @@ def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope)
 
 
 def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
-    """Return `deg(angle)` or `rad(angle)`; `name` is the name of the function.
+    """Return `deg(angle)` or `rad(angle)`, by the name of the function.
 
-    `deg` converts an angle in radians to a plain number of degrees. `rad` converts a plain number of degrees
-    to radians.
+    Angles in degrees are plain numbers.
     """
     ratio = Fraction(math.pi) / 180
     factor = literal(1 / ratio if name == "deg" else ratio, span)

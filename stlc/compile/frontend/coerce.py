@@ -15,7 +15,9 @@ from stlc.compile.ir.normal_form import condition
 from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
+from stlc.signature import Column
 from stlc.source import Span
+from stlc.units import same_dims
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +119,17 @@ def as_vector(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
         return value
     message = f"{need.who}; {need.which} is {noun(value)}"
     return scope.fail(Diagnostic("E205", message, expr.span, describe(value)))
+
+
+def require_unit(number: Number, column: Column, expr: ast.Expr, scope: Scope) -> None:
+    """Check that a number, the value of `expr`, has the unit of a column up to a factor.
+
+    Raises:
+        Failed: it has another unit (E203).
+    """
+    if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
+        message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
+        scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
 
 
 def member_number(member: Member, span: Span, scope: Scope) -> Number:

@@ -12,7 +12,7 @@ from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.sweep import swept_distance
 from stlc.compile.frontend.values import (
     REGION_TYPES,
-    Box,
+    BoxRegion,
     Complement,
     Number,
     Operand,
@@ -107,11 +107,9 @@ def _pred(
 
 
 def _compared(*sides: Number) -> Unit:
-    """Return the unit in which the robustness of a comparison is reported.
+    """Return the unit in which the robustness of a comparison of numbers is reported.
 
-    `sides` are the numbers that are compared. If some of them have a unit, those without a unit are ignored.
-    Of the remaining numbers, the first one that varies gives the unit. If all of them are constant, the first
-    one does.
+    It is the unit of the first number that has one and varies, or else of the first that has one.
     """
     measured = [side for side in sides if side.unit.text] or list(sides)
     return next((side.unit for side in measured if side.constant is None), measured[0].unit)
@@ -253,7 +251,7 @@ def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: S
             as_number(value, end, Expectation("`in [lo, hi]` compares numbers", "a bound"), scope)
             for end, value in region
         ]
-        place: Region = Box(VectorValue((ends[0],)), VectorValue((ends[1],)), expr.region.span)
+        place: Region = BoxRegion(VectorValue((ends[0],)), VectorValue((ends[1],)), expr.region.span)
     elif isinstance(region[0].value, REGION_TYPES):
         place = region[0].value
     else:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from stlc.compile.frontend.arithmetic import in_unit, on_scale, rebased
-from stlc.compile.frontend.coerce import Expectation, as_number
+from stlc.compile.frontend.coerce import Expectation, as_number, require_unit
 from stlc.compile.frontend.evaluate import evaluate_all
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.scope import (
@@ -340,9 +340,8 @@ def _stored(exprs: Sequence[ast.Expr], column: Column, unit: Unit, scope: Scope)
         number = as_number(value, expr, Expectation("the ends of a range are numbers"), scope)
         if number.bare:
             number = in_unit(number, unit if unit.text else column.unit, scope)
-        elif not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
-            message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
-            scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
+        else:
+            require_unit(number, column, expr, scope)
         if number.constant is None:
             scope.fail(Diagnostic("E205", "the ends of a range are constants", expr.span))
         number = on_scale(number, column.unit, expr.span, scope)
@@ -527,10 +526,7 @@ def _about(item: ast.Item) -> str:
 
 
 def _read_in(value: Value, unit: Unit) -> Value:
-    """Return the value of a signal converted to `unit`, the unit that the file declares.
-
-    The system may store the signal in another unit.
-    """
+    """Return the value of a signal, which the system may store in another unit, converted to `unit`."""
     if isinstance(value, VectorValue):
         return replace(value, items=tuple(rebased(item, unit) for item in value.items))
     return rebased(value, unit) if isinstance(value, Number) else value

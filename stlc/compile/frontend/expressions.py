@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from stlc.compile.frontend.arithmetic import difference_for_point, in_unit, rebased
-from stlc.compile.frontend.coerce import Expectation, as_formula, loose_number
+from stlc.compile.frontend.coerce import Expectation, as_formula, loose_number, require_unit
 from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.scope import Failed, Scope
 from stlc.compile.frontend.values import (
@@ -27,7 +27,7 @@ from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column
-from stlc.units import Unit, nearest, same_dims
+from stlc.units import Unit, nearest
 
 
 @contextmanager
@@ -208,9 +208,7 @@ def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Num
         )
     if number.bare:
         return in_unit(number, column.unit, scope)
-    if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
-        message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
-        scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
+    require_unit(number, column, expr, scope)
     if column.unit.offset and number.sense == "difference":
         scope.fail(difference_for_point(number, column.unit, expr.span))
     return number

@@ -75,11 +75,7 @@ def _check_constant(entry: Definition, value: Value, scope: Scope) -> None:
 
 
 def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
-    """Return a value in the declared unit; a number without a unit is taken to be in that unit.
-
-    Raises:
-        Failed: a number has another unit (E203).
-    """
+    """Return a value in the declared unit. Raises Failed (E203) if a number has another unit."""
     if isinstance(value, VectorValue):
         items = tuple(_number_in(item, unit, span, scope) for item in value.items)
         return replace(value, items=items)

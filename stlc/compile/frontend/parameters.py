@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from stlc.compile.analysis.ranges import usual_range
 from stlc.compile.frontend.arithmetic import in_unit, on_scale
-from stlc.compile.frontend.coerce import Expectation, loose_number
+from stlc.compile.frontend.coerce import Expectation, loose_number, require_unit
 from stlc.compile.frontend.declare import ends_of
 from stlc.compile.frontend.evaluate import evaluate
 from stlc.compile.frontend.expressions import resolve_numbers, stored
@@ -23,7 +23,7 @@ from stlc.grammar.parse.parser import parse_expr
 from stlc.registry import closest
 from stlc.signature import Column
 from stlc.source import Source
-from stlc.units import Unit, same_dims
+from stlc.units import Unit
 
 
 def read_overrides(
@@ -172,9 +172,7 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
             return stored(in_unit(number, wanted, scope), column.unit)
         factor = wanted.scale / column.unit.scale
         return number.num if factor == 1 else ir.Op("mul", (number.num, ir.Const(factor)))
-    if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
-        message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
-        scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
+    require_unit(number, column, expr, scope)
     return stored(on_scale(number, column.unit, expr.span, scope), column.unit)
 
 

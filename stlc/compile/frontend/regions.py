@@ -14,7 +14,7 @@ from typing import TypeVar
 from stlc.compile.frontend.arithmetic import agree, apply, cross, dot, gap, minus, negated, norm
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
-    Box,
+    BoxRegion,
     Combined,
     Complement,
     Dilated,
@@ -116,7 +116,7 @@ def _is_ear(plain: Sequence[PlanePoint], left: Sequence[int], k: int) -> bool:
 def dimension(region: Region) -> int:
     """Return the number of coordinates of the points of a region."""
     match region:
-        case NormBall(vector) | Box(vector) | HalfSpace(vector):
+        case NormBall(vector) | BoxRegion(vector) | HalfSpace(vector):
             return len(vector.items)
         case Polygon():
             return 2
@@ -144,7 +144,7 @@ def signed_distance(point: VectorValue, region: Region, span: Span, scope: Scope
         case NormBall(center, radius):
             away = norm(minus(point, center, span, scope), span, scope)
             return apply("sub", (radius, away), span, scope)
-        case Box(lower, upper):
+        case BoxRegion(lower, upper):
             return _box(point, lower, upper, span, scope)
         case HalfSpace(normal, offset):
             room = gap(offset, dot(normal, point, span, scope), span, scope)
@@ -242,9 +242,6 @@ def side(point: VectorValue, start: VectorValue, end: VectorValue, span: Span, s
 
 
 def _left_of_all(point: VectorValue, corners: Sequence[VectorValue], span: Span, scope: Scope) -> ir.Formula:
-    """Return a formula that holds if a point is left of every edge of a convex polygon.
-
-    The corners are in counter-clockwise order.
-    """
+    """Return the formula that a point is left of all edges of a polygon; corners counter-clockwise."""
     sides = (side(point, start, end, span, scope) for start, end in edges(corners))
     return ir.BoolOp("and", tuple(ir.Predicate(each.num, span=span) for each in sides), span)

@@ -379,10 +379,9 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
 def _warnings(
     requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
 ) -> list[Diagnostic]:
-    """Return the warnings W502, W503 and W505 about a requirement.
+    """Return the warnings about a requirement.
 
-    W502 reports a requirement with the tag `@safety` that no finite prefix of a trace violates. W503 reports
-    a requirement that is always satisfied, W505 a conjunction that is never satisfied.
+    W502: no finite prefix violates a `@safety` requirement. W503: it always holds. W505: it never holds.
     """
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
     found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]

@@ -343,13 +343,6 @@ def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
     return Number(ir.Const(nearest(exact)), unit, bare, bare, exact, kind)
 
 
-def constant_entries(
-    constants: Mapping[str, tuple[float, Unit]], *, about: str = "constant"
-) -> dict[str, Known]:
-    """Return the name-table entries of constants, given as (value in SI units, unit) by name."""
-    return {name: Known(constant_value(value, unit), about) for name, (value, unit) in constants.items()}
-
-
 def enforced(columns: Iterable[Column]) -> dict[str, Bounds]:
     """Return the ranges that columns never leave, each in the unit of its column.
 

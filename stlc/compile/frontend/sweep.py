@@ -31,7 +31,7 @@ from stlc.compile.frontend.regions import (
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import (
     REGION_TYPES,
-    Box,
+    BoxRegion,
     Combined,
     Complement,
     Dilated,
@@ -103,7 +103,7 @@ class _Sweep:
                 return self.apply(which, *self.at_ends(region), *clearances)
             case NormBall(center, radius) if which == "max":
                 return self.apply("sub", self.apply("max", radius, _later(radius)), self.past(center))
-            case Box() if which == "max":
+            case BoxRegion() if which == "max":
                 return self._over_box(region)
             case Polygon(corners) if which == "max":
                 outside = [self.negative(self.past(corner)) for corner in corners]
@@ -113,7 +113,7 @@ class _Sweep:
 
     # ------------------------------------------------------------------ convex regions
 
-    def _over_box(self, box: Box) -> Number:
+    def _over_box(self, box: BoxRegion) -> Number:
         faces = []
         for axis, sides in enumerate(zip(box.lower.items, box.upper.items, strict=True)):
             for face, sign in zip(sides, (1, -1), strict=True):
@@ -203,10 +203,9 @@ class _Sweep:
         return found
 
     def _passing(self, face: Pair) -> Number:
-        """Return the position in [0, 1] along the segment where the segment crosses a face.
+        """Return the position in [0, 1] at which the segment crosses a face; arbitrary if it does not.
 
-        `face` contains the signed distances of the start and the end of the segment to the face. If the
-        segment does not cross the face, the position is arbitrary.
+        `face`: signed distances of the start and the end of the segment to the face.
         """
         before, after = face
         slope = self.apply("sub", after, before)

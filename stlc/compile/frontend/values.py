@@ -140,8 +140,8 @@ class NormBall:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
-    """Box: region of the points whose components all lie between those of `lower` and `upper`."""
+class BoxRegion:
+    """Region of the points whose components all lie between those of `lower` and `upper`."""
 
     lower: VectorValue
     upper: VectorValue
@@ -191,8 +191,8 @@ class Complement:
     span: Span | None = field(default=None, compare=False, repr=False)
 
 
-Region: TypeAlias = NormBall | Box | Polygon | HalfSpace | Combined | Dilated | Complement
-REGION_TYPES = (NormBall, Box, Polygon, HalfSpace, Combined, Dilated, Complement)
+Region: TypeAlias = NormBall | BoxRegion | Polygon | HalfSpace | Combined | Dilated | Complement
+REGION_TYPES = (NormBall, BoxRegion, Polygon, HalfSpace, Combined, Dilated, Complement)
 Value: TypeAlias = Number | VectorValue | Swept | EnumMember | TimeExpr | Region | typed.Formula
 
 

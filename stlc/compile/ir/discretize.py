@@ -156,6 +156,12 @@ def _note_rounding(time: typed.Time, exact: Fraction, taken: int, grid: Grid, si
     tell(sink, finding)
 
 
+def duration(steps: int, grid: Grid) -> str:
+    """Text of a number of steps, such as `2.5 s = 25 steps`; `25 steps` if no time step is known."""
+    count = f"{steps} step{'' if steps == 1 else 's'}"
+    return count if grid.dt is None else f"{in_words(Fraction(steps), grid)} = {count}"
+
+
 def in_words(steps: Fraction, grid: Grid) -> str:
     """Return the text of a time for messages: in seconds if the time step is known, else in steps."""
     if grid.dt is None:

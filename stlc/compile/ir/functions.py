@@ -167,11 +167,7 @@ def _lengths(combine: Callable[[Sequence[float]], float]) -> RangeRule:
 
 
 def _powers(args: Sequence[Bounds]) -> Bounds:
-    """Return the range of a power with a positive base, which is monotone in both arguments.
-
-    Raises:
-        ValueError: the base may be 0 or negative.
-    """
+    """Range of a power, monotone in both arguments; ValueError unless the base is positive."""
     if args[0][0] <= 0:
         raise ValueError("not monotone")
     return _corners(math.pow)(args)

@@ -210,11 +210,7 @@ _NEVER = IndexRange(0, -1)
 
 
 def _first(read: ir.Offsets, run: IndexRange) -> Instant:
-    """Return the first instant at which a formula reads an operand.
-
-    `run` holds the instants at which the value of the formula is needed. `read` holds offsets in samples: for
-    its value at an instant k, the formula reads the operand from k + `read.first` to k + `read.last`.
-    """
+    """First instant at which a formula with values at the instants `run` reads an operand, by its offsets."""
     return 0 if read.first is None else at_least(run.start + read.first, 0)
 
 

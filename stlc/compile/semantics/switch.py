@@ -87,7 +87,6 @@ class Tanh:
         return weight
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """Return `no + weight * (yes - no)`."""
         return ops.lerp(no, yes, weight)
 
 
@@ -112,5 +111,4 @@ class StraightThrough:
         return ops.settled(weight, truth)
 
     def blend(self, weight: Array, yes: Array | float, no: Array | float, ops: Ops) -> Array:
-        """Return `no + weight * (yes - no)`."""
         return ops.lerp(no, yes, weight)

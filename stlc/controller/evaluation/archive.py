@@ -71,11 +71,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
 
 def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """Actuator commands that belong to the recorded actions, (rows, steps, m).
-
-    With a feedback law around plans, a command is the action plus a correction. Without it, the command is
-    the action.
-    """
+    """Actuator commands of the recorded actions, with the feedback around plans, (rows, steps, m)."""
     states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
     planned = torch.from_numpy(recording.actions)
     return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
@@ -157,11 +153,7 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
 
 
 def _set_in(spec: str, run: Run) -> dict[str, str]:
-    """Values that replaced those written in the specification text `spec`: constant -> value as a text.
-
-    A constant can be replaced when the run is trained, by the scenario, or on the command line of the
-    deployment.
-    """
+    """Values that replaced those in the specification text, in training or deployment: constant -> text."""
     own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
     changed = run.task.system.decl.overrides.items()
     return {name: text for name, text in changed if name in own and name not in run.task.system.names}

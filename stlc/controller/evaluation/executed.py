@@ -81,7 +81,10 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
         zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
     )
     starts = max(recording.steps + 1 - task.horizon, 0)
-    rules = {rule.name: _held(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
+    rules = {
+        rule.name: _margins(whole_run_rule(rule, task), columns, task.horizon) >= -TOLERANCE
+        for rule in task.rules
+    }
     safety = tuple(rule.name for rule in task.compiled.safety)
     found = viable
     if found is None:
@@ -119,11 +122,6 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
     lowered = lower(from_first_sample(rule.typed.formula), task.compiled.grid, [])
     written = simplify(lowered)
     return replace(rule, formula=written, lowered=lowered, reach=reach(written).future, windowed=False)
-
-
-def _held(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Mask:
-    """Verdicts on one requirement, (starts, rows) booleans; see `_margins`."""
-    return _margins(rule, columns, horizon) >= -TOLERANCE
 
 
 def _margins(

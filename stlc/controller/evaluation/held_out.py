@@ -208,13 +208,8 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
     """Estimated share of the states from which a satisfying plan exists.
 
-    Only some of the failing states were searched. The share that was solved among these is assumed for the
-    other failing states.
-
-    Args:
-        known: mask of the states with a known satisfying plan, (n,).
-        searched: mask of the states that the policy solved or that were searched, (n,).
-        failing: indices of the states at which the policy's plan fails, (k,).
+    The share that was solved among the searched failing states is assumed for the other failing states.
+    `known`, `searched`: masks as in `Score`, (n,). `failing`: indices of the failing states, (k,).
     """
     found, tried = int(known[failing].sum()), int(searched[failing].sum())
     left = len(failing) - tried

@@ -67,7 +67,8 @@ class Rules:
     @property
     def docs(self) -> dict[str, str]:
         """Comments on the rules: name of a rule -> text of its `##` comment."""
-        return {item.name: " ".join((item.doc or "").split()) for item in _requirements(self.spec)}
+        rules = (item for item in self.spec.items if isinstance(item, ast.Require))
+        return {item.name: " ".join((item.doc or "").split()) for item in rules}
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,10 +268,6 @@ def _own(spec: ast.Spec, overrides: Mapping[str, str]) -> dict[str, str]:
     """The entries of `overrides` whose names are constants of the specification `spec`."""
     own = {item.name for item in spec.items if isinstance(item, (ast.Const, ast.Param))}
     return {name: text for name, text in overrides.items() if name in own}
-
-
-def _requirements(spec: ast.Spec) -> Iterator[ast.Require]:
-    return (item for item in spec.items if isinstance(item, ast.Require))
 
 
 # ----------------------------------------------------------------------- verdicts

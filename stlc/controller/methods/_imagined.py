@@ -18,8 +18,7 @@ from stlc.controller.methods import Learner
 from stlc.controller.methods._actor import ActorConfig, optimizer_tensors, restore_optimizer
 from stlc.controller.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.problem.environments import MOST, SATISFIED, Environments, Reward
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.environments import MOST, Environments, Reward, reward_at_end
 from stlc.controller.training.checkpoint import below
 from stlc.controller.training.config import bounded
 from stlc.diagnostics import usage
@@ -109,10 +108,7 @@ def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
 
     `kind`: `robustness` or `accuracy`, the two rewards that an episode earns at its end.
     """
-    rho = task.robustness(states)
-    if kind == "accuracy":
-        return SATISFIED * satisfied(rho).to(rho)
-    return torch.nan_to_num(rho, nan=-MOST).clamp(-MOST, MOST)
+    return reward_at_end(kind, torch.nan_to_num(task.robustness(states), nan=-MOST))
 
 
 def step_rewards(task: Task, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
@@ -339,13 +335,11 @@ class ModelLearner(Learner):
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def facts(self) -> dict[str, float | int]:
-        """Numbers that a checkpoint stores in addition to `tensors`."""
         error = {"model_error": self.error} if not math.isnan(self.error) else {}
         own = {"fitted": self.fitted, "environment_steps": self.environment_steps}
         return super().facts() | own | error
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         self.episodes.restore(below(tensors, "episodes"))
         self.ensemble.load_state_dict(below(tensors, "ensemble"))

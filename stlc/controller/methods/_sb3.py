@@ -286,7 +286,6 @@ class SacLearner(ActorLearner):
         return found | {f"random.{name}": value for name, value in self._random.tensors().items()}
 
     def facts(self) -> dict[str, float | int]:
-        """Numbers that a checkpoint stores in addition to `tensors`."""
         model = self.model
         return super().facts() | {
             "transitions": model.num_timesteps,
@@ -295,7 +294,6 @@ class SacLearner(ActorLearner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         model, buffer = self.model, self.model.replay_buffer
         self.actor.load_state_dict(below(tensors, "policy"))

@@ -30,7 +30,7 @@ BOUND = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Batch:
+class TransitionBatch:
     """B transitions; each is one step of an episode.
 
     Attributes:
@@ -47,15 +47,15 @@ class Batch:
     after: Tensor
     ended: Tensor
 
-    def of(self, rows: Tensor) -> Batch:
+    def of(self, rows: Tensor) -> TransitionBatch:
         """The transitions with the indices `rows`, (b,)."""
         parts = (self.seen, self.actions, self.rewards, self.after, self.ended)
-        return Batch(*(part[rows] for part in parts))
+        return TransitionBatch(*(part[rows] for part in parts))
 
-    def joined(self, other: Batch) -> Batch:
+    def joined(self, other: TransitionBatch) -> TransitionBatch:
         """These transitions, followed by those of `other`."""
         names = ("seen", "actions", "rewards", "after", "ended")
-        return Batch(*(torch.cat((getattr(self, name), getattr(other, name))) for name in names))
+        return TransitionBatch(*(torch.cat((getattr(self, name), getattr(other, name))) for name in names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class SoftActorCritic(nn.Module):
         """Draw actions, from -1 to 1, from the actor's distribution for observations: (B, k) -> (B, m)."""
         return self._sampled(self._normalised(seen), generator)[0]
 
-    def learn(self, batch: Batch, generator: torch.Generator) -> Tensor:
+    def learn(self, batch: TransitionBatch, generator: torch.Generator) -> Tensor:
         """Make one gradient step of critics, actor and temperature; return the loss of the critics, ().
 
         The losses are those of Equations 5, 7 and 18 of Haarnoja et al. Each critic values an action; the

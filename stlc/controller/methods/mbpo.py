@@ -24,7 +24,7 @@ from torch import Tensor
 from stlc.controller.methods import Method
 from stlc.controller.methods._actor import ActorPolicy
 from stlc.controller.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
-from stlc.controller.methods._soft_actor_critic import BOUND, Batch, SacOptions, SoftActorCritic
+from stlc.controller.methods._soft_actor_critic import BOUND, SacOptions, SoftActorCritic, TransitionBatch
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers
 from stlc.controller.training.config import base_config, bounded
@@ -188,18 +188,18 @@ class MbpoLearner(ModelLearner):
         episodes = torch.randint(self.episodes.count, (count,), generator=self.generator)
         return episodes, torch.randint(self.task.horizon, (count,), generator=self.generator)
 
-    def _mixed(self, imagined: Batch) -> Batch:
+    def _mixed(self, imagined: TransitionBatch) -> TransitionBatch:
         """Draw a batch: the share `config.observed` from observed transitions, the rest from `imagined`."""
         size = self.config.batch
         real = min(size, round(self.config.observed * size))
         rows = torch.randint(len(imagined.rewards), (size - real,), generator=self.generator)
         return imagined.of(rows).joined(self._observed_batch(real)) if real else imagined.of(rows)
 
-    def _observed_batch(self, count: int) -> Batch:
+    def _observed_batch(self, count: int) -> TransitionBatch:
         """Draw `count` random observed transitions."""
         episodes, steps = self._drawn(count)
         kept, after = self.episodes, steps + 1
-        return Batch(
+        return TransitionBatch(
             self._seen(kept.states[episodes, steps], steps),
             self.acting.shares(kept.actions[episodes, steps]),
             kept.rewards[episodes, steps],
@@ -208,7 +208,7 @@ class MbpoLearner(ModelLearner):
         )
 
     @torch.no_grad()
-    def _imagined(self, count: int) -> Batch:
+    def _imagined(self, count: int) -> TransitionBatch:
         """Imagine at least `count` episodes of up to `length` steps, from random observed states.
 
         `count` is rounded up to a multiple of the number of networks that predict.
@@ -238,7 +238,7 @@ class MbpoLearner(ModelLearner):
             ended = (after == horizon).float()
             parts = (seen, actions, earned, self._seen(moved, after), ended)
             finite = going & torch.isfinite(moved).all(1) & torch.isfinite(earned)
-            found.append(Batch(*parts).of(finite.nonzero()[:, 0]))
+            found.append(TransitionBatch(*parts).of(finite.nonzero()[:, 0]))
             steps = after
         whole = found[0]
         for part in found[1:]:
@@ -271,7 +271,6 @@ class MbpoLearner(ModelLearner):
         return super().tensors() | self.actor_critic.tensors()
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         super().restore(tensors, facts)
         self.actor_critic.restore(tensors)
 

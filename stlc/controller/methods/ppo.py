@@ -223,7 +223,7 @@ def _network(widths: Sequence[int], last: float) -> nn.Sequential:
 
 
 @dataclass(frozen=True, slots=True)
-class Episodes:
+class EpisodeBatch:
     """Transitions of one episode in every environment.
 
     Attributes:
@@ -295,7 +295,7 @@ class PpoLearner(ActorLearner):
         return loss
 
     @torch.no_grad()
-    def _played(self) -> Episodes:
+    def _played(self) -> EpisodeBatch:
         """Play one episode in every environment with controls drawn from the policy."""
         environments, network = self.environments, self.network
         seen, means, raws, rewards = [environments.reset().to(self.device)], [], [], []
@@ -309,7 +309,7 @@ class PpoLearner(ActorLearner):
             seen.append(result.observation.to(self.device))
         raw, noise = torch.stack(raws), torch.stack(noises[:-1])
         density = network.density(torch.stack(means), noise, raw)
-        return Episodes(torch.stack(seen[:-1]), raw, noise, density, torch.stack(rewards))
+        return EpisodeBatch(torch.stack(seen[:-1]), raw, noise, density, torch.stack(rewards))
 
     def _noise(self) -> Tensor:
         """Draw independent standard normal numbers for the raw controls of every environment, (N, w)."""
@@ -334,7 +334,7 @@ class PpoLearner(ActorLearner):
         mean, spread = advantages.mean(), advantages.std()
         return (advantages - mean) / (spread + 1e-8), advantages + values
 
-    def _learnt(self, episodes: Episodes, advantages: Tensor, targets: Tensor) -> float:
+    def _learnt(self, episodes: EpisodeBatch, advantages: Tensor, targets: Tensor) -> float:
         """Make all gradient steps of one training step; stop early if a loss or gradient is not finite.
 
         Args:
@@ -383,7 +383,6 @@ class PpoLearner(ActorLearner):
         return found | optimizer_tensors(self.optimizer, "adam")
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         own = {} if self.ranks.first else {"generator": tensors[f"rank{self.ranks.rank}.generator"]}
         super().restore(tensors | own, facts)
         self.network.load_state_dict(below(tensors, "network"))

@@ -16,7 +16,7 @@ from stlc.controller.methods._actor import ActorPolicy
 from stlc.controller.methods._sac import SacActor, SacConfig
 from stlc.controller.training.config import base_config
 from stlc.controller.training.run import load_weights
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import not_installed
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.ddp import Ranks
@@ -55,10 +55,7 @@ class Sac(Method):
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] not in ("stable_baselines3", "gymnasium"):
                 raise
-            finding = Diagnostic(
-                "R301", "method `sac` needs stable-baselines3", help=("pip install 'stlc[rl]'",)
-            )
-            raise MissingError(finding) from None
+            raise not_installed("method `sac` needs stable-baselines3", "rl") from None
         assert isinstance(config, SacConfig)
         return SacLearner(task, config, steps=steps, device=device, ranks=ranks)
 

@@ -380,7 +380,6 @@ class BestOfKPolicy(Policy):
 
     @torch.no_grad()
     def plan(self, x0: Tensor) -> Tensor:
-        """The selected plan from each state, in physical units: (B, n) -> (B, T, m) in the dtype of `x0`."""
         return self.plan_judged(x0)[0] if len(self.network.changes) else super().plan(x0)
 
     def continuation(self, x0: Tensor) -> Tensor:
@@ -389,7 +388,6 @@ class BestOfKPolicy(Policy):
 
     @torch.no_grad()
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The selected plan from each state, as `plan` returns it, and the verdicts on these plans."""
         plans, judged = super().plan_judged(x0)
         failing = (~satisfied(judged.rho)).nonzero()[:, 0]
         if not len(self.network.changes) or not len(failing):

@@ -320,11 +320,7 @@ class Pace:
         return self._left is not None
 
     def _due(self, left: float) -> bool:
-        """True if it is time to plan the number of steps.
-
-        The first planning is due once enough steps were timed. The next one is due after a certain share of
-        the budget. `left`: remaining seconds.
-        """
+        """True if enough steps were timed, or enough of the budget has passed since the last planning."""
         if self._left is None:
             first = self._marks[0][1]
             return len(self._marks) > FIRST or self._marks[-1][1] - first >= WINDOW * self._seconds

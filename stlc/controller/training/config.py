@@ -311,10 +311,6 @@ def base_config(
 
 
 def _threads(*, searching: bool) -> int:
-    """Return the number of threads for torch.
-
-    It is the number that torch uses at present. If `searching` (a search runs concurrently), it is at most
-    the number of cores less one, so that one core is left to the search.
-    """
+    """Number of threads of torch; if `searching`, one core is left to the concurrent search."""
     most = int(torch.get_num_threads())
     return max(1, min(most, cores() - 1)) if searching else most

@@ -252,6 +252,10 @@ def _at(step: TrainingStep) -> str:
 
 
 STARTS = 64
+PROOF = (
+    f"proved from each of {STARTS} starts, by bounds of the states over everything that the controls can do "
+    "within the horizon"
+)
 TRIES = 4000
 
 
@@ -327,7 +331,7 @@ def _told(
             "nothing that was tried satisfies this",
         )
     else:
-        message = f"no plan was found that satisfies {_listed(names)} together"
+        message = f"no plan was found that satisfies {', '.join(names[:-1])} and {names[-1]} together"
         label = "not together with the others, as far as was tried"
     return Diagnostic(
         "R404",
@@ -340,16 +344,9 @@ def _told(
             "`stlc compile` shows what is asked for in steps",
         ),
         note=(
-            _proof() if proved else _tried(core),
+            PROOF if proved else _tried(core),
             f"the nearest misses by {-float(nearest.rho[row]):.4g}, from {start}",
         ),
-    )
-
-
-def _proof() -> str:
-    return (
-        f"proved from each of {STARTS} starts, by bounds of the states over everything that the controls "
-        "can do within the horizon"
     )
 
 
@@ -363,10 +360,6 @@ def _tried(core: Sequence[CompiledRequirement]) -> str:
         f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
         f"from some of them{rest}; that is no proof that there is none"
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 # --------------------------------------------------------------------------------- proofs
@@ -394,16 +387,13 @@ def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:
     for _ in range(task.horizon):
         facts = {**here, **controls}
         for name, num in step.lets:
-            facts |= _known(name, bounds(num, facts))
+            known = bounds(num, facts)
+            facts |= {} if known is None else {name: known}
         moved = {name: bounds(num, facts) for name, num in step.next.items()}
         steady = {name: known for name, known in here.items() if name not in moved}
         here = steady | {name: known for name, known in moved.items() if known is not None}
         reached.append(here)
     return reached
-
-
-def _known(name: str, reach: Bounds | None) -> dict[str, Bounds]:
-    return {} if reach is None else {name: reach}
 
 
 def _most(formula: ir.Formula, reached: Sequence[Mapping[str, Bounds]]) -> float:

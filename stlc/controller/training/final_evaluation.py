@@ -126,10 +126,7 @@ class FinalEvaluation:
         return self.time.now() - self.trained > self._verdict_seconds
 
     def _late(self) -> bool:
-        """True once the diagnosis of conflicting requirements has to end.
-
-        Its time limit, counted from the end of training, is twice that of the evaluation on held-out states.
-        """
+        """True once the diagnosis has taken twice the time of the evaluation on held-out states."""
         return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property

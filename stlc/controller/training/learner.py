@@ -155,20 +155,13 @@ class Trainer(Learner):
         return self.buffer.count > 0
 
     def torch_reasons(self) -> Mapping[str, str]:
-        """For each part of the training, the reason why this part runs in torch; "" if it runs in C."""
         smooth = self.objective.smoothing is not None
         return self.task.torch_reasons(self.device.type, searches=self.searches, smooth=smooth)
 
     def wait(self, stop: Stop = never) -> bool:
-        """Wait for the end of the concurrent search; return False if `stop` ended the wait, else True."""
         return self.repairing is None or self.repairing.result(stop) is not None
 
     def diagnose(self) -> tuple[StlcError, bool]:
-        """Find the cause of a step whose loss or gradient was not finite on at least one rank (process).
-
-        Returns:
-            The error that describes the cause, and whether the weights before the step gave finite plans.
-        """
         theirs = [part["x0"].to(self.device) for part in self.ranks.gather({"x0": self.learnt})]
         x0 = torch.cat((self.learnt, *theirs))
         step = TrainingStep.of(self.network, self.objective, x0, self.step, self.task)
@@ -347,14 +340,8 @@ class Trainer(Learner):
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
         """Imitation loss of the states for which a search has found a plan, ().
 
-        The loss of a state is the squared distance from the plan found to the nearest proposed plan. It is 0
-        if the network already proposes a satisfying plan. The result is the mean over the states, times the
-        weight `config.imitation`.
-
-        Args:
-            plans: proposed plans, (k, plans, T, m).
-            targets: plans that the search found, (k, T, m).
-            solved: whether a proposed plan satisfies the specification, (k,).
+        The loss of a state is the squared distance from the plan found, (k, T, m), to the nearest plan of
+        `plans`, (k, plans, T, m); it is 0 where a proposed plan is `solved`, (k,).
         """
         half = (0.5 * (self.task.system.control_high - self.task.system.control_low)).to(plans.device)
         distance = ((plans - targets[:, None]) / half).square().mean((2, 3)).amin(1)
@@ -435,7 +422,6 @@ class Trainer(Learner):
         return found
 
     def facts(self) -> dict[str, float | int]:
-        """Numbers that a checkpoint stores in addition to `tensors`, by name."""
         return super().facts() | {
             "solved": self.buffer.count,
             "accuracy": self.accuracy,
@@ -445,7 +431,6 @@ class Trainer(Learner):
         }
 
     def restore(self, tensors: dict[str, Tensor], facts: dict[str, float | int]) -> None:
-        """Restore the state from `tensors` and `facts`, which the methods of these names returned."""
         tensors, facts = self._restored(tensors, facts)
         super().restore(tensors, facts)
         self.accuracy, self.failing = float(facts["accuracy"]), int(facts.get("failing", 0))

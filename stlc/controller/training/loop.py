@@ -410,7 +410,10 @@ class _Session:
         return bool(self.refuted) or (self.exhausted and learner.step >= enough)
 
     def _unjudged(self, *, interrupted: bool) -> TrainingOutcome:
-        """Outcome without evaluation; `interrupted` is stored in it."""
+        """Outcome of a training run that ended before its evaluation.
+
+        `interrupted`: whether the user ended it.
+        """
         learner = self.learner
         run = Run(self.writer.folder, learner.task, learner.policy)
         return TrainingOutcome(

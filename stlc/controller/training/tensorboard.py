@@ -7,7 +7,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import not_installed
 from stlc.escape import markdown, tag
 
 if TYPE_CHECKING:
@@ -72,11 +72,5 @@ def find_writer() -> Opener:
     elif find_spec("tensorboard") is not None:
         module = "torch.utils.tensorboard"
     else:
-        raise MissingError(
-            Diagnostic(
-                "R301",
-                "`--log tensorboard` needs tensorboardX, which is not installed",
-                help=("pip install 'stlc[log]'",),
-            )
-        )
+        raise not_installed("`--log tensorboard` needs tensorboardX, which is not installed", "log")
     return lambda run: TensorBoardLogger(import_module(module).SummaryWriter(str(run / FOLDER)))

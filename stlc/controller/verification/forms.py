@@ -11,7 +11,7 @@ Values are computed in float64 without outward rounding. `SLACK` covers the roun
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast, final
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.interval import Belief, Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.namespace import Ops
+from stlc.compile.backends.array.namespace import FloatConstants, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -39,8 +39,8 @@ class Forms:
         centre: (batch,).
         generators: (symbols, batch); a form may have fewer than others, the missing ones are 0.
         rest: radius of the remainder, (batch,).
-        floor: values that are known to be no greater, (batch,); None if none are known. What follows a
-            `relu` is 0 at least, although its form may reach below.
+        floor: lower bounds that are known in addition to the form, (batch,); None if none are known. The
+            result of `relu`, for example, is at least 0, although its form may extend below 0.
     """
 
     centre: Floats
@@ -114,10 +114,10 @@ def _combined(a: Floats, b: Floats) -> Floats:
 
 
 @final
-class FormOps:
+class FormOps(FloatConstants):
     """The part of `stlc.compile.backends.array.namespace.Ops` that one step of a system needs.
 
-    Other operations go by the range of the form and lose the symbols.
+    Other operations are computed on the range of the form, and their results share no symbols.
     """
 
     name = "forms"
@@ -277,14 +277,6 @@ class FormOps:
         """Array of a constant."""
         return Forms.point(np.full(shape, value))
 
-    def kind(self, like: Forms) -> Hashable:  # noqa: ARG002
-        """Return None: constants are Python floats."""
-        return None
-
-    def constant(self, value: float, like: Forms) -> float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
-
     def quiet(self) -> AbstractContextManager[object]:
         """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""
         return NUMPY.quiet()
@@ -299,7 +291,10 @@ class FormOps:
 
 
 def tanh(x: Forms) -> Forms:
-    """Hyperbolic tangent: its least slope over the range, and half of what is left (Singh et al. 2018)."""
+    """Hyperbolic tangent: a line with the least slope over the range, and the deviation from it.
+
+    Source: Singh et al. 2018.
+    """
     bound = x.range
     first, last = np.tanh(bound.low), np.tanh(bound.high)
     slope = np.minimum(1.0 - first**2, 1.0 - last**2)

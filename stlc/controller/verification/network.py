@@ -1,8 +1,9 @@
 """Bounds on the plans of a network over boxes of initial states.
 
-All neurons of a layer are affine forms in the same symbols. A neuron has a symbol of its own for what a line
-cannot follow of its ReLU (Singh et al. 2018). The network computes in float32: a sum of n products, in any
-order, is within n 2^-24 / (1 - n 2^-24) of the sum of the magnitudes (Higham 2002, section 3.1).
+All neurons of a layer are affine forms in the same symbols. Each neuron has a symbol of its own for the
+deviation of its ReLU from a line (Singh et al. 2018). The network computes in float32: the error of a sum of
+n products, in any order, is at most n 2^-24 / (1 - n 2^-24) times the sum of their magnitudes (Higham 2002,
+section 3.1).
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class PlanBounds:
     """Bounds on single plans of a network, with weights in float64.
 
     Raises:
-        ValueError: the network folds states, or squashes its outputs other than by tanh.
+        ValueError: the network uses a mirror symmetry, or squashes its outputs other than by tanh.
     """
 
     def __init__(self, network: PlanNetwork, task: Task) -> None:

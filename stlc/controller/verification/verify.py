@@ -1,4 +1,4 @@
-"""Branch and bound over the initial states of a trained policy: proofs, counterexamples, and what is left.
+"""Branch and bound over the initial states of a trained policy: proofs, counterexamples, and undecided boxes.
 
 A box of initial states is *proved* if one fixed proposal of the network satisfies the specification from
 every state in it, by bounds on plan, motion and robustness. The policy selects a plan that satisfies the
@@ -165,7 +165,7 @@ class Verifier:
         """Return the result after at most about `seconds` of wall time.
 
         The mode with the largest box is next, so that all modes are divided into boxes of about one size.
-        `boxes` is the number of boxes of each mode that are examined at most.
+        `boxes` is the maximum number of boxes that are examined per mode.
         """
         begun = time.monotonic()
         most = math.inf if boxes is None else boxes

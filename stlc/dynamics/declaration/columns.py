@@ -413,11 +413,7 @@ def _even(column: Column) -> tuple[ir.Num, str]:
 
 
 def _ranged(column: Column, assigns: tuple[Assign, ...]) -> Column:
-    """Return `column` with a range that covers nearly all of its random values.
-
-    `assigns` holds the distributions of the columns. A column that declares a range is returned unchanged,
-    and so is a column without a distribution.
-    """
+    """Return a random column without a declared range with the range of nearly all its values."""
     draw = next((assign.value for assign in assigns if assign.name == column.name), None)
     ends = None if draw is None or column.low is not None else usual_range(draw)
     return column if ends is None or ends[0] == ends[1] else replace(column, low=ends[0], high=ends[1])

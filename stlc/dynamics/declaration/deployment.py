@@ -123,10 +123,7 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
 
 @reads(EXPRESSION)
 def _instant(cx: Context, node: Node, label: str) -> int | None:
-    """Read an instant of the deployment, given as a time or in steps; return it in steps from the start.
-
-    Returns None if the instant is invalid. `label` names the instant in messages.
-    """
+    """Read an instant of a deployment in steps from the start; None if it is invalid."""
     return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
 
 

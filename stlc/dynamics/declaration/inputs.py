@@ -339,7 +339,7 @@ def _present(decl: InputDecl, dt: Fraction) -> ir.Num:
 def _piece(points: Sequence[ir.Num], passed: Sequence[ir.Num]) -> ir.Num:
     """Return the value of the present piece, by bisection.
 
-    `passed` has a number for each piece but the first, which is not negative from its beginning on.
+    `passed` has one number for each piece but the first: negative before the piece begins, then 0 or more.
     """
     if not passed:
         return points[0]
@@ -349,10 +349,7 @@ def _piece(points: Sequence[ir.Num], passed: Sequence[ir.Num]) -> ir.Num:
 
 
 def _passed(decl: InputDecl, dt: Fraction) -> tuple[ir.Num, ...]:
-    """Return numbers that are not negative at samples at or after the times at which pieces begin.
-
-    There is one for each piece but the first.
-    """
+    """Return one number for each piece but the first: negative before the piece begins, then 0 or more."""
     count = ir.Signal(CLOCK)
     if not decl.free_times:
         return tuple(_minus(count, ir.Const(float(math.ceil(end / dt)))) for end in decl.ends[1:-1])

@@ -63,10 +63,7 @@ def _absolute(cx: Context, node: Node, label: str) -> ir.Num | None:
 
 
 def _term_label(found: Mapping[str, Node]) -> str:
-    """Return the name of a performance term in messages, such as "the term `effort`".
-
-    If the term has no name, its expression is used instead. `found` holds the values of the term by key.
-    """
+    """Name of a performance term in messages; its expression if it has no name."""
     name = found.get("name")
     shown = name.text if isinstance(name, Scalar) and not name.is_null else written(found.get("expr"))
     return f"the term `{shown}`"
@@ -109,10 +106,7 @@ def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
 
 
 def _at_start(number: Number) -> Number:
-    """Return a number in which each state is replaced by its value at the start of the plan.
-
-    The state `x` becomes the column `x_start`.
-    """
+    """Replace each state `x` in a number by the column `x_start`, its value at the start of the plan."""
     table = {name: ir.Signal(name + START) for name in names_in(number.num)}
     return replace(number, num=substitute(number.num, table))
 

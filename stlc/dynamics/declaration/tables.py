@@ -35,7 +35,7 @@ class TableDecl:
         points: the points of each argument, in its unit; they increase.
         values: values at the points, in `unit`: a row for each point of the first of two arguments, or one
             row for a single argument.
-        extrapolate: what follows outside the points: the line of the outermost cell, or the value at the end.
+        extrapolate: values outside of the points: on the line of the outermost cell, or the value at the end.
     """
 
     name: str
@@ -167,10 +167,12 @@ def _checked(table: TableDecl, keys: TableKeys, cx: Context) -> TableDecl | None
 def body(table: TableDecl) -> ir.Body:
     """Return the table as a function of its arguments in SI units; its value is in the table's unit.
 
-    Along an argument, the value is that at the first point, plus for each cell the share of it that is passed
-    times the increase over it. This is exact, has the derivative of the cell, and needs no branches.
+    Along an argument, the value is computed as a sum: the value at the first point, plus for each cell its
+    increase times the share of the cell that lies below the argument. The sum is exact, has the derivative of
+    the cell, and needs no branches.
 
-    The first argument comes first: if it is constant within a step, its part is computed once for all stages.
+    The table is interpolated along the first argument first. If that is constant within a step, this part is
+    computed once for all stages of the integrator.
     """
     lets: list[tuple[str, ir.Num]] = []
 
@@ -199,7 +201,7 @@ def body(table: TableDecl) -> ir.Body:
 
 
 def _limited(share: ir.Num, cell: int, cells: int, extrapolate: Extrapolate) -> ir.Num:
-    """Limit the passed share of a cell to [0, 1], except where the line of an outermost cell goes on."""
+    """Limit the share of a cell below the argument to [0, 1], except where an outermost cell extrapolates."""
     goes_on = extrapolate == "linear"
     if not (goes_on and cell == 0):
         share = ir.Op("max", (share, ir.Const(0.0)))

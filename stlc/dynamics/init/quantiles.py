@@ -44,7 +44,7 @@ class QuantileRows(Rows):
         return max([self._next, *(branch.used for branch in self._branches)])
 
     def uniforms(self) -> Tensor:
-        """Next coordinate of each point, below 1, (count,)."""
+        """Next coordinate of each point as a number in [0, 1), (count,)."""
         place = self.used
         self._next = place + 1
         if place >= self.points.shape[1]:

@@ -139,11 +139,7 @@ def _place(node: ast.Quantity) -> str:
 
 
 def _scaled(number: Number, factor: ir.Num) -> Number:
-    """Multiply a number by a factor.
-
-    A number whose unit has an arbitrary zero (such as degC) is returned unchanged, because its relative error
-    has no meaning.
-    """
+    """Multiply a number by a factor; one on a scale such as degC has no relative error and stays as it is."""
     if number.unit.offset:
         return number
     return replace(number, num=multiply(number.num, factor), exact=None)

@@ -219,10 +219,7 @@ def _comma(text: Text, start: int, end: int) -> int:
 
 
 def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
-    """Return the layout elements of one entry of a bracket, the tokens from `start` to `end`.
-
-    An entry is an expression, or `name = expression`.
-    """
+    """Layout elements of an entry of a bracket: an expression, or `name = expression`."""
     if end - start > 2 and text.tokens[start].kind == "NAME" and text.tokens[start + 1].text == "=":
         return (*words(text, start, start + 2), BLANK, *expression(text, start + 2, end))
     return expression(text, start, end)

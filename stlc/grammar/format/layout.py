@@ -142,10 +142,7 @@ def _width(doc: Word | Blank | Line) -> int:
 
 
 def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
-    """True if the line ends at a layout element: a word with a comment, or a line break.
-
-    If `flat`, the text is printed on one line, so possible line breaks do not count.
-    """
+    """True for a word with a comment, and for a line break unless the text is printed `flat`."""
     if isinstance(doc, Word):
         return bool(doc.before) or doc.after is not None
     return isinstance(doc, Line) and not flat

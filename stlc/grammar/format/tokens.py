@@ -115,10 +115,7 @@ def _hugs_left(text: Text, index: int) -> bool:
 
 
 def _typed(text: Text, index: int) -> bool:
-    """True if the colon at `index` precedes a type, as in `signal x : Type`.
-
-    Such a colon has a blank before it.
-    """
+    """True if the colon at `index` precedes a type, as in `signal x : Type`; it has a blank before it."""
     declared = any(token.kind in ("_SIGNAL", "_CONST", "_PARAM") for token in text.tokens[:2])
     return declared and not any(token.text == "=" for token in text.tokens[:index])
 

@@ -81,10 +81,7 @@ def _read(text: bytes | None) -> lark.Lark | None:
 
 
 def _with_numbers(value: dict[str, Any]) -> dict[str | int, Any]:
-    """Return an object read from JSON, with every key that consists of digits converted to an integer.
-
-    JSON stores integer keys as strings.
-    """
+    """Return a JSON object with keys of digits as integers, which JSON stores as strings."""
     return {int(key) if key.isdigit() else key: item for key, item in value.items()}
 
 

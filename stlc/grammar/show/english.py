@@ -120,7 +120,8 @@ def _when(interval: ast.Interval | None, *, past: bool) -> str:
     if interval is None:
         return "so far" if past else "from now on"
     low, high = show_expr(interval.lo), show_expr(interval.hi)
-    edge = " (" + " and ".join(_ends(interval)) + " excluded)" if interval.lo_open or interval.hi_open else ""
+    ends = [name for name, open_ in (("the start", interval.lo_open), ("the end", interval.hi_open)) if open_]
+    edge = f" ({' and '.join(ends)} excluded)" if ends else ""
     if interval.clock == "start":
         return f"between {low} and {high} of the mission{edge}"
     if high in ("end", "inf"):
@@ -129,10 +130,6 @@ def _when(interval: ast.Interval | None, *, past: bool) -> str:
     if low in ("0", "0 s", "0 steps"):
         return f"in the {'last' if past else 'next'} {high}{edge}"
     return f"between {low} and {high} {'ago' if past else 'from now'}{edge}"
-
-
-def _ends(interval: ast.Interval) -> list[str]:
-    return [*(["the start"] if interval.lo_open else []), *(["the end"] if interval.hi_open else [])]
 
 
 # ----------------------------------------------------------------------------- logic

@@ -109,8 +109,7 @@ def _logic(expr: ast.Logic) -> str:
 def _temporal(expr: ast.Temporal | ast.Until) -> str:
     """Return the text of a temporal operator with its operands.
 
-    Without an interval, an operand that begins with a vector gets parentheses, since `[a, b]` would be read
-    as the interval.
+    An operand that begins with a vector gets parentheses if it could be read as the interval.
     """
     interval = "" if expr.interval is None else show_interval(expr.interval)
     left = f"{show_at(expr.left, Level.PREFIX)} " if isinstance(expr, ast.Until) else ""

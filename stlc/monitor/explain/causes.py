@@ -371,10 +371,7 @@ class CauseFinder:
         return found
 
     def _unknown(self, formula: typed.Formula, sample: int, wanted: bool) -> bool:
-        """True if the trace ends too early to decide the truth value of `formula` at `sample`.
-
-        The upper bound that `_margin` returns is then +inf.
-        """
+        """True if the trace ends before `formula` is decided at `sample`: its upper bound is then +inf."""
         return self._margin(formula, sample, wanted) == math.inf
 
     def _found(self, lowered: ir.Formula, instants: range) -> Floats | None:
@@ -574,11 +571,7 @@ class CauseFinder:
         return not instants or instants[-1] < sample + lowered.window.hi
 
     def _unless(self, formula: typed.Until, sample: int, wanted: bool) -> CauseNode:
-        """Return the tree that explains why `left unless right` does not have the truth value `wanted`.
-
-        The interval of `unless` is [a, b]. The formula is rewritten as `always[0, b] left or left until[a, b]
-        right`.
-        """
+        """Tree of causes of `left unless[a, b] right`, as `always[0, b] left or left until[a, b] right`."""
         whole = replace(formula.interval, lo=typed.Time(), lo_open=False)
         held = typed.Temporal(formula.span, "always", whole, formula.left)
         met = typed.Until(formula.span, "until", formula.interval, formula.left, formula.right)

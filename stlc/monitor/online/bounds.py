@@ -29,7 +29,7 @@ class TrackingOptions:
     begin: int = 0
 
 
-class Bounds(NamedTuple):
+class RobustnessBounds(NamedTuple):
     """Least and greatest robustness at consecutive instants, (instants,) each."""
 
     low: Floats
@@ -60,10 +60,10 @@ class Tracker(Protocol):
     def settled(self) -> int:
         """Index of the first instant that is not settled yet."""
 
-    def live(self, start: int, stop: int) -> Bounds:
+    def live(self, start: int, stop: int) -> RobustnessBounds:
         """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
 
-    def ended(self, starts: range) -> Bounds:
+    def ended(self, starts: range) -> RobustnessBounds:
         """Final bounds on the robustness at the instants `starts`, now that the trace has ended.
 
         A window that extends to the end of the trace now ends with the last sample.

@@ -119,7 +119,7 @@ class _Watched:
         begin = max(self.needs(), first)  # a constant number of samples: its schedule is cached
         starts = range(self.next - begin, stop - begin)
         self.whole.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
-        shape = (len(starts), _traces(env))
+        shape = (len(starts), next(iter(env.values())).shape[1])
         low, high = (np.broadcast_to(end, shape) for end in self.whole.of_all(starts))
         fails, holds = high < -TOLERANCE, low >= -TOLERANCE
         if len(self.violated) != low.shape[1]:
@@ -145,11 +145,7 @@ class _Watched:
         return whole if self.everywhere else min(whole, 1)
 
     def _shown(self, samples: int) -> int:
-        """Return how many samples, counted from sample `next` on, the margin no longer considers.
-
-        A sample is no longer considered if the window that starts there ends before the latest sample.
-        `samples` is the number of samples received.
-        """
+        """Number of samples after `next` whose windows have ended; the margin leaves them out."""
         if not self.everywhere or self.ahead is None:
             return 0
         return max(samples - 1 - self.ahead - self.next, 0)
@@ -196,7 +192,3 @@ class Margins:
             self._found, self._evaluated = dict(zip(self.requirements, found, strict=True)), self.samples
             self._history.forget(min([each.needs() for each in self._watched], default=self.samples))
         return self._found
-
-
-def _traces(env: Mapping[str, Floats]) -> int:
-    return int(next(iter(env.values())).shape[1])

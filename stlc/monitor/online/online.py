@@ -16,10 +16,10 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
-from stlc.monitor.online.bounds import Bounds, Tracker, TrackingOptions
+from stlc.monitor.online.bounds import RobustnessBounds, Tracker, TrackingOptions
 from stlc.monitor.online.history import ColumnHistory
 from stlc.monitor.online.paced import PacedTracker
-from stlc.monitor.online.tally import Flags, JudgedInstants, Tally
+from stlc.monitor.online.tally import Flags, JudgedInstants, RequirementSummary
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
 from stlc.monitor.online.trackers import Trackers
 from stlc.monitor.signals import Gap, Need, arrange, needs_of, not_finite
@@ -100,7 +100,7 @@ class Watched:
     values: Tracker
     truths: Tracker | None
     tolerance: float
-    tally: Tally = field(default_factory=Tally)
+    tally: RequirementSummary = field(default_factory=RequirementSummary)
     decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     @property
@@ -133,7 +133,7 @@ class Watched:
         """Return bounds and verdicts at the instants `starts` once the trace has ended."""
         return self._judged(*(tracker.ended(starts) for tracker in self.trackers))
 
-    def _judged(self, bounds: Bounds, truths: Bounds | None = None) -> JudgedInstants:
+    def _judged(self, bounds: RobustnessBounds, truths: RobustnessBounds | None = None) -> JudgedInstants:
         low, high = bounds
         if truths is None:
             return JudgedInstants(low, high, low >= -self.tolerance, high < -self.tolerance)
@@ -183,7 +183,7 @@ class Online:
             for truth in ((False, True) if self.how.tolerance == 0 else (False,))
         ]
         truths = trackers[1] if trackers[1:] else None
-        tally = Tally(low_at=begin, high_at=begin, first=begin)
+        tally = RequirementSummary(low_at=begin, high_at=begin, first=begin)
         return Watched(rule, everywhere, trackers[0], truths, self.how.tolerance, tally)
 
     # ------------------------------------------------------------------------ samples
@@ -365,14 +365,14 @@ class Online:
         bounds = watched.values.live(start, min(stop, self.samples))
         return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
 
-    def standing(self, name: str) -> Tally:
+    def standing(self, name: str) -> RequirementSummary:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.
 
         Where the robustness may still change, the summary uses its lower and its upper bound.
         """
         return self._standing(self._find(name))
 
-    def _standing(self, watched: Watched) -> Tally:
+    def _standing(self, watched: Watched) -> RequirementSummary:
         if watched.over or not self.samples:
             return watched.tally
         watched.grow(self._history)
@@ -389,7 +389,7 @@ class Online:
             return False
         return True if found <= {"satisfied"} else None
 
-    def finish(self) -> dict[str, Tally]:
+    def finish(self) -> dict[str, RequirementSummary]:
         """End the trace, and return the summary of each requirement by name.
 
         The summaries agree with the verdicts of `Monitor.check`.
@@ -399,7 +399,7 @@ class Online:
         """
         if not self.samples:
             raise TraceError(Diagnostic("E605", "there are no samples"))
-        found: dict[str, Tally] = {}
+        found: dict[str, RequirementSummary] = {}
         refused: list[Diagnostic] = []
         for watched in self._watched:
             starts = self._starts(watched)
@@ -414,7 +414,7 @@ class Online:
     def _starts(self, watched: Watched) -> range:
         return starts_of(watched.rule, self.samples, self.compiled.grid.horizon, self.how.at)
 
-    def _ended(self, watched: Watched, starts: range) -> Tally:
+    def _ended(self, watched: Watched, starts: range) -> RequirementSummary:
         """Summary of a requirement at the instants `starts` if the trace ends now."""
         watched.grow(self._history)
         rest = range(min(watched.tally.next, starts.stop), starts.stop)

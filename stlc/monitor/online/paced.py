@@ -16,7 +16,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, reach
 from stlc.compile.ir.traverse import map_children, nodes, operands
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.monitor.online.bounds import Bounds, Floats, Tracker
+from stlc.monitor.online.bounds import Floats, RobustnessBounds, Tracker
 from stlc.monitor.prefix_bounds import FAR, own_span
 
 WIDE = 1 << 13
@@ -209,12 +209,10 @@ class PacedTracker:
         """Index of the first instant whose value later samples may still change."""
         return self._inner.settled
 
-    def live(self, start: int, stop: int) -> Bounds:
-        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
+    def live(self, start: int, stop: int) -> RobustnessBounds:
         return self._inner.live(start, stop)
 
-    def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
+    def ended(self, starts: range) -> RobustnessBounds:
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:

@@ -32,7 +32,7 @@ class JudgedInstants(NamedTuple):
 
 
 @dataclass(slots=True)
-class Tally:
+class RequirementSummary:
     """Summary of a requirement at consecutive instants of one trace.
 
     Attributes:
@@ -80,7 +80,7 @@ class Tally:
         """The instant after the last counted one."""
         return self.first + self.instants
 
-    def with_more(self, judged: JudgedInstants) -> Tally:
+    def with_more(self, judged: JudgedInstants) -> RequirementSummary:
         """Return a copy to which the instants of `judged` are added."""
         more = replace(self)
         more.add(judged, len(judged.low))

@@ -18,7 +18,7 @@ from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
-from stlc.monitor.online.bounds import Bounds, Ending, Floats, Tracker, TrackingOptions
+from stlc.monitor.online.bounds import Ending, Floats, RobustnessBounds, Tracker, TrackingOptions
 from stlc.monitor.online.columns import Beyond, ColumnPlans, ColumnReader, End, Side, shareable
 from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, PacedWork, span
 from stlc.monitor.online.streams import (
@@ -107,7 +107,7 @@ class _CutTracker(ABC):
         """True if windows are clipped at the end of the trace."""
 
     @abstractmethod
-    def certain(self, starts: range) -> Bounds:
+    def certain(self, starts: range) -> RobustnessBounds:
         """Return bounds at the instants `starts`, with windows clipped at the last sample.
 
         The method is for settled instants, whose value no later sample can change, and for a trace that has
@@ -115,13 +115,13 @@ class _CutTracker(ABC):
         """
 
     @abstractmethod
-    def either(self, start: int, stop: int) -> Bounds:
+    def either(self, start: int, stop: int) -> RobustnessBounds:
         """Return bounds at the instants from `start` to `stop` (exclusive), with windows of full length.
 
         Samples outside the trace are unknown.
         """
 
-    def live(self, start: int, stop: int) -> Bounds:
+    def live(self, start: int, stop: int) -> RobustnessBounds:
         """Return bounds at the instants `start` to `stop` (exclusive), over all continuations of the trace.
 
         A predicate that reads a signal before the first sample is false if windows are clipped at the end of
@@ -131,10 +131,9 @@ class _CutTracker(ABC):
         if not self.cuts or middle <= start:
             return self.either(start, stop)
         known, rest = self.certain(range(start, middle)), self.either(middle, stop)
-        return Bounds(*map(np.concatenate, zip(known, rest, strict=True)))
+        return RobustnessBounds(*map(np.concatenate, zip(known, rest, strict=True)))
 
-    def ended(self, starts: range) -> Bounds:
-        """Return final bounds on the robustness at the instants `starts`, now that the trace has ended."""
+    def ended(self, starts: range) -> RobustnessBounds:
         return self.certain(starts) if self.cuts else self.either(starts.start, starts.stop)
 
 
@@ -167,14 +166,13 @@ class _ColumnTracker(_CutTracker):
     def cuts(self) -> bool:
         return self.options.ending == "truncate"
 
-    def certain(self, starts: range) -> Bounds:
-        return Bounds(*(self._values(which, starts.start, starts.stop) for which in (2, 3)))
+    def certain(self, starts: range) -> RobustnessBounds:
+        return RobustnessBounds(*(self._values(which, starts.start, starts.stop) for which in (2, 3)))
 
-    def either(self, start: int, stop: int) -> Bounds:
-        return Bounds(self._values(0, start, stop), self._values(1, start, stop))
+    def either(self, start: int, stop: int) -> RobustnessBounds:
+        return RobustnessBounds(self._values(0, start, stop), self._values(1, start, stop))
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; return the index of the first sample still needed."""
         for side in self._sides:
             side.drop(start - self._back)
         return first_needed(self.planned, self.samples)
@@ -215,15 +213,11 @@ class BoundedTracker(_ColumnTracker):
         return max(self.samples - self._ahead - self.planned.lag, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         for side in self._sides:
             side.grow(signals, first, samples)
         self.samples = samples
 
-    def ended(self, starts: range) -> Bounds:
+    def ended(self, starts: range) -> RobustnessBounds:
         last = copy(self)
         last._sides = [side.over() for side in self._sides]
         return _CutTracker.ended(last, starts)
@@ -318,7 +312,6 @@ class IntervalTracker:
 
     @property
     def samples(self) -> int:
-        """Number of samples received."""
         return self.shared.samples
 
     @property
@@ -327,19 +320,14 @@ class IntervalTracker:
         return max(self.shared.samples - self.ahead, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         self.shared.grow(signals, first, samples)
 
-    def live(self, start: int, stop: int) -> Bounds:
-        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
+    def live(self, start: int, stop: int) -> RobustnessBounds:
         if stop <= start:
-            return Bounds(np.zeros(0), np.zeros(0))
-        return Bounds(*self.shared.values(self.which, start, stop).T)
+            return RobustnessBounds(np.zeros(0), np.zeros(0))
+        return RobustnessBounds(*self.shared.values(self.which, start, stop).T)
 
-    def ended(self, starts: range) -> Bounds:
+    def ended(self, starts: range) -> RobustnessBounds:
         """Final bounds on the robustness at the instants `starts`, now that the trace has ended.
 
         If the formula reads samples after the end of the trace, these stay unknown.
@@ -373,7 +361,7 @@ class PlanningWindowTracker(_ColumnTracker):
 
     window: int = field(kw_only=True)
     _beyond: int = field(default=0, init=False)
-    _complete: list[Bounds] = field(default_factory=list, init=False)
+    _complete: list[RobustnessBounds] = field(default_factory=list, init=False)
     _first: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
@@ -389,10 +377,6 @@ class PlanningWindowTracker(_ColumnTracker):
         return max(self.samples - self.window, 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         for now in range(self.samples + 1, samples + 1) if self._beyond else (samples,):
             known = {name: values[: now - first] for name, values in signals.items()}
             for side in self._sides:
@@ -401,12 +385,12 @@ class PlanningWindowTracker(_ColumnTracker):
             if self._beyond and self.settled:
                 self._complete.append(_ColumnTracker.either(self, self.settled - 1, self.settled))
 
-    def either(self, start: int, stop: int) -> Bounds:
+    def either(self, start: int, stop: int) -> RobustnessBounds:
         if not self._beyond:
             return _ColumnTracker.either(self, start, stop)
         middle = min(max(self.settled, start), stop)
         complete = self._complete[start - self._first : middle - self._first]
-        return Bounds(
+        return RobustnessBounds(
             *map(np.concatenate, zip(*complete, _ColumnTracker.either(self, middle, stop), strict=True))
         )
 
@@ -486,28 +470,22 @@ class UnboundedTracker:
         return 0
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         self.samples = samples
         for front in self._fronts:
             front.side.grow(signals, first, samples)
             front.advance(samples - self._lag)
 
-    def live(self, start: int, stop: int) -> Bounds:
-        """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
+    def live(self, start: int, stop: int) -> RobustnessBounds:
         if stop <= start:
-            return Bounds(np.zeros(0), np.zeros(0))
+            return RobustnessBounds(np.zeros(0), np.zeros(0))
         low, high = self._fronts[:2]
-        return Bounds(low.value(self.samples)[0], high.value(self.samples)[0])
+        return RobustnessBounds(low.value(self.samples)[0], high.value(self.samples)[0])
 
-    def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
+    def ended(self, starts: range) -> RobustnessBounds:
         fronts = self._fronts[-2:]
         last = [replace(front, side=front.side.over()) for front in fronts]
         found = [front.ended(front.side.plan.formula, self.samples)[0] for front in last]
-        return Bounds(found[0][: len(starts)], found[1][: len(starts)])
+        return RobustnessBounds(found[0][: len(starts)], found[1][: len(starts)])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - only the first instant is evaluated
         """Free the samples that later evaluations do not need; return the index of the first one needed.
@@ -552,25 +530,21 @@ class RecomputeTracker(_CutTracker):
         return max(self.samples - ahead - looks_on(self.rule.formula), 0)
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:  # noqa: ARG002
-        """Add new samples.
-
-        `signals` maps each signal to its stored samples, from sample `first` to sample `samples` - 1.
-        """
         self._signals, self.samples = signals, samples
 
     @property
     def cuts(self) -> bool:
         return self.ending == "truncate"
 
-    def certain(self, starts: range) -> Bounds:
+    def certain(self, starts: range) -> RobustnessBounds:
         return self.ended(starts)
 
-    def either(self, start: int, stop: int) -> Bounds:
+    def either(self, start: int, stop: int) -> RobustnessBounds:
         if stop <= start:
-            return Bounds(np.zeros(0), np.zeros(0))
+            return RobustnessBounds(np.zeros(0), np.zeros(0))
         starts = range(start, stop)
         low, high = self.of_all(starts)
-        return Bounds(low[:, 0], high[:, 0])
+        return RobustnessBounds(low[:, 0], high[:, 0])
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
         """Return the least and the greatest robustness over all continuations of the traces.
@@ -593,10 +567,9 @@ class RecomputeTracker(_CutTracker):
             high = window_bounds(upper, record, starts, window, "open")[1]
         return np.asarray(low), np.asarray(high)
 
-    def ended(self, starts: range) -> Bounds:
-        """Final bounds on the robustness at the instants `starts`, now that the trace has ended."""
+    def ended(self, starts: range) -> RobustnessBounds:
         low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
-        return Bounds(low[:, 0], high[:, 0])
+        return RobustnessBounds(low[:, 0], high[:, 0])
 
     def drop(self, start: int) -> int:  # noqa: ARG002
         """Return 0: all samples, from the first one on, are still needed."""

@@ -183,10 +183,7 @@ def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Form
 
 
 def _neutral(origin: DelayedFormula) -> float:
-    """Value of an unbounded operator if its window contains no sample.
-
-    It is +inf for `always` and `release`, -inf for `eventually` and `until`.
-    """
+    """Value of an unbounded operator on an empty window: +inf for `always` and `release`, else -inf."""
     assert isinstance(origin.formula, (ir.Temporal, ir.Until))
     return math.inf if origin.formula.op in ("always", "release") else -math.inf
 

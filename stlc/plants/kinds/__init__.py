@@ -67,7 +67,7 @@ class ControllerLayout:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Everything that the process of a plant is told when it starts.
+    """Data with which the process of a plant starts.
 
     Attributes:
         kind: name of the kind of plant.
@@ -156,7 +156,7 @@ class PlantKind:
 
     Attributes:
         record: dataclass of the keys of its mapping in a plant file.
-        main: the key that a plain text gives.
+        main: key that is meant if the plant file has a text in place of the mapping.
         open: function that opens a plant in its process. It raises `UnfitError` if the plant lacks what the
             layout names.
         sources: function that returns the name in the plant of the i-th port of a section, if the plant file

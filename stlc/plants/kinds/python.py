@@ -53,13 +53,13 @@ class PythonKeys:
     tolerance: float = key(number(), "of a `flow` with `scipy`: relative tolerance", 1e-8)
 
 
-def open_python(layout: Layout) -> PythonObject | PythonFunction:
+def open_python(layout: Layout) -> PythonObject | StateFunction:
     """Import the target and return the plant. Raises UnfitError if it cannot be loaded."""
     target = _target(str(layout.options["target"]), layout)
     form = layout.options.get("form") or _form(target)
     if form == "class":
         return PythonObject(target, layout)
-    return PythonFunction(target, layout, flow=form == "flow")
+    return StateFunction(target, layout, flow=form == "flow")
 
 
 def _target(text: str, layout: Layout) -> Callable[..., Any]:
@@ -152,7 +152,7 @@ class PythonObject:
 
 
 @final
-class PythonFunction:
+class StateFunction:
     """A plant that is a function of its state; the outputs are states."""
 
     def __init__(self, function: Callable[..., Any], layout: Layout, *, flow: bool) -> None:

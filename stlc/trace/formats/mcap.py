@@ -245,10 +245,7 @@ def write(path: Path | str, trace: Trace) -> None:
 
 
 def _cell(value: float) -> str:
-    """JSON text of a number.
-
-    NaN becomes null. Infinity becomes a number beyond the range of floats, such as 1e999.
-    """
+    """JSON text of a number: `null` for NaN, and a number beyond all floats such as 1e999 for infinity."""
     if math.isnan(value):
         return "null"
     return repr(value) if math.isfinite(value) else "1e999" if value > 0 else "-1e999"

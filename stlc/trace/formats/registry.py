@@ -19,7 +19,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError, not_installed
 
 MAX_BYTES = 4_000_000_000
 _ROOM = 500_000_000
@@ -93,7 +93,7 @@ def needed(module: str) -> Any:
         package = module.partition(".")[0]
         extra = next((each.extra for each in FORMATS if package in each.packages), "all")
         message = f"this needs the package `{_PACKAGES.get(package, package)}`, which is not installed"
-        raise MissingError(Diagnostic("R301", message, help=(f"pip install 'stlc[{extra}]'",))) from None
+        raise not_installed(message, extra) from None
 
 
 def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:

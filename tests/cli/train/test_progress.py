@@ -10,7 +10,7 @@ from rich.console import Console
 
 from stlc.cli.train.progress import (
     BLOCKS,
-    Progress,
+    TrainingDisplay,
     clock_text,
     engine_text,
     final_screen,
@@ -73,7 +73,7 @@ class Clock:
 def piped(**options):
     stream, clock = io.StringIO(), Clock()
     console = Console(file=stream, width=120, **options)
-    return Progress(console, clock=clock), stream, clock
+    return TrainingDisplay(console, clock=clock), stream, clock
 
 
 def panel_of(progress, width=130):
@@ -156,7 +156,7 @@ def test_a_pipe_gets_a_line_every_30_seconds():
 
 def test_a_terminal_is_redrawn_in_place_and_left_clean():
     stream = Terminal()
-    progress = Progress(Console(file=stream, width=100, force_terminal=True))
+    progress = TrainingDisplay(Console(file=stream, width=100, force_terminal=True))
     progress.start(*INFO)
     progress.update(ROW)
     progress.stop()
@@ -212,7 +212,7 @@ def test_the_closing_screen_can_go_elsewhere():
 
 def test_a_terminal_without_unicode_gets_ascii():
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
-    progress = Progress(Console(file=stream, width=120), clock=Clock())
+    progress = TrainingDisplay(Console(file=stream, width=120), clock=Clock())
     progress.start(*INFO)
     progress.update(ROW)
     progress.update({**ROW, "accuracy": 0.5})

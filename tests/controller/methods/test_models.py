@@ -14,7 +14,7 @@ from stlc import Run
 from stlc.cli.framework.app import main
 from stlc.controller.methods import _imagined as imagined
 from stlc.controller.methods._ensemble import Predictor
-from stlc.controller.methods._soft_actor_critic import Batch, SacOptions, SoftActorCritic
+from stlc.controller.methods._soft_actor_critic import SacOptions, SoftActorCritic, TransitionBatch
 from stlc.controller.methods.mbpo import MbpoLearner
 from stlc.controller.methods.pets import PetsLearner, PetsPolicy
 from stlc.controller.parallel.ddp import ALONE, Ranks
@@ -202,7 +202,7 @@ def test_soft_actor_critic_prefers_the_rewarded_action() -> None:
         seen = torch.rand(64, 2, generator=generator)
         actions = 2.0 * torch.rand(64, 1, generator=generator) - 1.0
         earned = -(actions[:, 0] - 0.5).abs()
-        learner.learn(Batch(seen, actions, earned, seen, torch.ones(64)), generator)
+        learner.learn(TransitionBatch(seen, actions, earned, seen, torch.ones(64)), generator)
     assert abs(float(learner(torch.rand(50, 2, generator=generator)).detach().mean()) - 0.5) < 0.2
 
 

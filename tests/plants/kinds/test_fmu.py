@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from stlc.monitor.verdict import Monitor
 from stlc.plants.kinds import UnfitError
 from stlc.plants.plant import Plant
-from stlc.plants.worker import Simulator
+from stlc.plants.worker import ControlledPlant
 from stlc.toolchain import compiler
 
 pytest.importorskip("fmpy")
@@ -122,7 +122,7 @@ def test_a_truth_value_is_a_parameter(folder, tmp_path, interface):
 
 
 def test_instances_are_independent(folder, tmp_path):
-    simulator = Simulator(read(BALL.format(interface="model exchange"), folder).layout(str(tmp_path)))
+    simulator = ControlledPlant(read(BALL.format(interface="model exchange"), folder).layout(str(tmp_path)))
     rows = []
     for h in (1.0, 1.7, 1.0):
         simulator.start({"seed": 0}, np.array([[h, 0.7, 1e6, 0.0, 0.0]]))
@@ -132,7 +132,7 @@ def test_instances_are_independent(folder, tmp_path):
 
 
 def test_units_are_those_of_the_fmu(folder, tmp_path):
-    units = Simulator(read(BALL.format(interface="co-simulation"), folder).layout(str(tmp_path))).units
+    units = ControlledPlant(read(BALL.format(interface="co-simulation"), folder).layout(str(tmp_path))).units
     assert units == {"h": "m^1", "v": "m^1*s^-1"}
 
 

@@ -11,7 +11,7 @@ directions, hence `_ULPS` = 8. Elementary operations and the square root are rou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial, reduce
 from typing import Any, cast, final
@@ -38,7 +38,7 @@ from stlc.compile.backends.array.interval import (
     widened,
     within,
 )
-from stlc.compile.backends.array.namespace import Ops, Sliding
+from stlc.compile.backends.array.namespace import FloatConstants, Ops, Sliding
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir.functions import FUNCTIONS
@@ -61,7 +61,7 @@ _WINDOWS = Windows(Exact(), NUMPY)
 
 
 @final
-class IntervalOps:
+class IntervalOps(FloatConstants):
     """Implementation of `stlc.compile.backends.array.namespace.Ops` for `Intervals`, without gradients."""
 
     name = "intervals"
@@ -125,20 +125,16 @@ class IntervalOps:
         return Intervals(np.where(crossing, -_PI, found.low), np.where(crossing, _PI, found.high))
 
     def axpy(self, a: Operand, b: Intervals, factor: float) -> Intervals:
-        """`a + factor * b`."""
         return add(a, mul(b, factor))
 
     def addcmul(self, a: Operand, b: Intervals, c: Intervals, factor: float) -> Intervals:
-        """`a + factor * b * c`."""
         product = mul(b, c)
         return add(a, product if factor == 1.0 else mul(product, factor))
 
     def clamp(self, x: Intervals, low: float | None, high: float | None) -> Intervals:
-        """Clamp `x` to [low, high]."""
         return x.each(lambda end: np.clip(end, low, high))
 
     def norm(self, *components: Operand) -> Intervals:
-        """Euclidean norm of a vector given by its components."""
         sizes = [magnitudes(part) for part in components]
         low = np.sqrt(reduce(np.add, (np.square(size.low) for size in sizes)))
         error = (len(sizes) + 3.0) * EPSILON
@@ -205,12 +201,10 @@ class IntervalOps:
     # --------------------------------------------------------------------------------- truth
 
     def gt(self, a: Operand, b: Operand) -> Belief:
-        """`a > b`."""
         (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
         return Belief(np.greater(a_low, b_high), np.greater(a_high, b_low))
 
     def ge(self, a: Operand, b: Operand) -> Belief:
-        """`a >= b`."""
         (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
         return Belief(np.greater_equal(a_low, b_high), np.greater_equal(a_high, b_low))
 
@@ -260,11 +254,9 @@ class IntervalOps:
     # ---------------------------------------------------------------------------- along time
 
     def amin(self, x: Intervals) -> Intervals:
-        """Minimum over axis 0, which is kept with length 1."""
         return x.each(NUMPY.amin)
 
     def amax(self, x: Intervals) -> Intervals:
-        """Maximum over axis 0, which is kept with length 1."""
         return x.each(NUMPY.amax)
 
     def sum(self, x: Intervals) -> Intervals:
@@ -275,11 +267,9 @@ class IntervalOps:
         return known(low - error, high + error)
 
     def cummin(self, x: Intervals) -> Intervals:
-        """Running minimum along axis 0."""
         return x.each(NUMPY.cummin)
 
     def cummax(self, x: Intervals) -> Intervals:
-        """Running maximum along axis 0."""
         return x.each(NUMPY.cummax)
 
     def softmax(self, x: Intervals, k: float) -> Intervals:  # noqa: ARG002
@@ -295,7 +285,6 @@ class IntervalOps:
         return self.softmax(a, k)
 
     def join(self, items: Sequence[Intervals], pick: Pick) -> Intervals:
-        """Exact elementwise minimum or maximum of one or more arrays."""
         low = NUMPY.join([item.low for item in items], pick)
         if all(item.is_point for item in items):
             return Intervals(low, low)
@@ -313,16 +302,7 @@ class IntervalOps:
 
     # ------------------------------------------------------------------- constants and shapes
 
-    def kind(self, like: Intervals) -> Hashable:  # noqa: ARG002
-        """Return None: all arrays are of float64, and constants are Python floats."""
-        return None
-
-    def constant(self, value: float, like: Intervals) -> float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
-
     def full(self, shape: tuple[int, ...], value: float, like: Intervals) -> Intervals:  # noqa: ARG002
-        """Array of a constant."""
         return Intervals.point(np.full(shape, value))
 
     def counted(self, first: int, count: int, like: Intervals) -> Intervals:
@@ -334,29 +314,23 @@ class IntervalOps:
         return Intervals(np.empty(shape), np.empty(shape))
 
     def cat(self, parts: Sequence[Intervals]) -> Intervals:
-        """Concatenate arrays along axis 0."""
         return _gathered(np.concatenate, parts)
 
     def stack(self, parts: Sequence[Intervals]) -> Intervals:
-        """Stack arrays along a new axis 0."""
         return _gathered(np.stack, parts)
 
     def flip(self, x: Intervals) -> Intervals:
-        """Reverse `x` along axis 0."""
         return x[::-1]
 
     def rows(self, keep: Bools, x: Intervals, value: float) -> Intervals:
-        """Copy of `x` with `value` in the rows where `keep` is False."""
         return x.each(lambda end: NUMPY.rows(keep, end, value))
 
     def columns(self, x: Intervals) -> Sequence[Intervals]:
-        """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""
         lows = NUMPY.columns(x.low)
         highs = lows if x.is_point else NUMPY.columns(x.high)
         return [Intervals(low, high) for low, high in zip(lows, highs, strict=True)]
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""
         return NUMPY.quiet()
 
 

@@ -222,3 +222,17 @@ class Ops(Protocol):
 
     def quiet(self) -> AbstractContextManager[object]:
         """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""
+
+
+class FloatConstants:
+    """Base of array libraries in which a Python float is the fastest constant, whatever the array."""
+
+    __slots__ = ()
+
+    def kind(self, like: Array) -> Hashable:  # noqa: ARG002
+        """Return None for every array, so that all arrays share converted constants."""
+        return None
+
+    def constant(self, value: float, like: Array) -> float:  # noqa: ARG002
+        """Return the float itself."""
+        return value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import reduce
 from typing import Any, cast, final
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.kernel import Strided, window_kernel
-from stlc.compile.backends.array.namespace import Array, Mask, Ops, Sliding
+from stlc.compile.backends.array.namespace import Array, FloatConstants, Mask, Ops, Sliding
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.schedule.schedule import Pick
 
@@ -27,7 +27,7 @@ _LARGE_KERNEL = 1 << 16
 
 
 @final
-class NumpyOps:
+class NumpyOps(FloatConstants):
     """Implementation of `stlc.compile.backends.array.namespace.Ops` for NumPy arrays, without gradients."""
 
     name = "numpy"
@@ -50,20 +50,16 @@ class NumpyOps:
     stack = staticmethod(np.stack)
 
     def axpy(self, a: Array, b: Array, factor: float) -> Array:
-        """`a + factor * b`."""
         return a + factor * b
 
     def addcmul(self, a: Array, b: Array, c: Array, factor: float) -> Array:
-        """`a + factor * b * c`."""
         product = b * c
         return a + (product if factor == 1.0 else factor * product)
 
     def clamp(self, x: Array, low: float | None, high: float | None) -> Array:
-        """Clamp `x` to [low, high]."""
         return np.clip(x, low, high)
 
     def norm(self, *components: Array | float) -> Array:
-        """Euclidean norm of a vector given by its components."""
         return np.sqrt(reduce(operator.add, (np.square(part) for part in components)))
 
     def settled(self, weight: Array, mask: Mask) -> Array:
@@ -71,16 +67,13 @@ class NumpyOps:
         return np.broadcast_to(np.asarray(mask, dtype=weight.dtype), weight.shape)
 
     def number(self, mask: Mask, like: Array) -> Array:
-        """Array that is 1 where `mask` is True, else 0."""
         return mask.astype(like.dtype)
 
     def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
-        """`no + weight (yes - no)`, exact if `weight` is 0 or 1."""
         span = yes - no
         return np.where(weight < 0.5, no + weight * span, yes - span * (1.0 - weight))
 
     def infinite(self, mask: Mask, like: Array) -> Array:
-        """Array that is +inf where `mask` is True, else -inf."""
         return np.where(mask, np.inf, -np.inf).astype(like.dtype)
 
     def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:  # noqa: ARG002
@@ -88,27 +81,21 @@ class NumpyOps:
         return self.number(rho > 0 if strict else rho >= 0, rho)
 
     def amin(self, x: Array) -> Array:
-        """Minimum over axis 0, which is kept with length 1."""
         return x.min(axis=0, keepdims=True)
 
     def amax(self, x: Array) -> Array:
-        """Maximum over axis 0, which is kept with length 1."""
         return x.max(axis=0, keepdims=True)
 
     def sum(self, x: Array) -> Array:
-        """Sum over axis 0, which is kept with length 1."""
         return x.sum(axis=0, keepdims=True)
 
     def cummin(self, x: Array) -> Array:
-        """Running minimum along axis 0."""
         return np.minimum.accumulate(x, axis=0)
 
     def cummax(self, x: Array) -> Array:
-        """Running maximum along axis 0."""
         return np.maximum.accumulate(x, axis=0)
 
     def join(self, items: Sequence[Array], pick: Pick) -> Array:
-        """Exact elementwise minimum or maximum of one or more arrays."""
         choose = np.minimum if pick == "min" else np.maximum
         return choose(*items) if len(items) == 2 else reduce(choose, items)
 
@@ -147,19 +134,7 @@ class NumpyOps:
         """`1 / (1 + exp(-x))`."""
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
-    def kind(self, like: Array) -> Hashable:  # noqa: ARG002
-        """Return None for every array, so that all arrays share converted constants.
-
-        A converted constant is just a Python float, which suits every array.
-        """
-        return None
-
-    def constant(self, value: float, like: Array) -> Array | float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
-
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:
-        """Array of a constant."""
         return np.full(shape, value, dtype=like.dtype)
 
     def counted(self, first: int, count: int, like: Array) -> Array:
@@ -168,23 +143,18 @@ class NumpyOps:
         return np.broadcast_to(numbers.reshape(-1, *(1,) * (like.ndim - 1)), (count, *like.shape[1:]))
 
     def empty(self, shape: tuple[int, ...], like: Array) -> Array:
-        """Uninitialized array."""
         return np.empty(shape, dtype=like.dtype)
 
     def flip(self, x: Array) -> Array:
-        """Reverse `x` along axis 0."""
         return x[::-1]
 
     def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        """Copy of `x` with `value` in the rows where `keep` is False."""
         return np.where(keep.reshape(-1, *(1,) * (x.ndim - 1)), x, np.asarray(value, dtype=x.dtype))
 
     def columns(self, x: Array) -> Sequence[Array]:
-        """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""
         return list(np.ascontiguousarray(x.transpose(2, 1, 0)))
 
     def quiet(self) -> AbstractContextManager[object]:
-        """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""
         context: Any = np.errstate(all="ignore")
         return context  # type: ignore[no-any-return]
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from stlc.compile.backends.c.emit import HEAD, Motion, state_index
+from stlc.compile.backends.c.emit import HEAD, Motion, place_in_step, state_index
 from stlc.compile.backends.c.numbers import NumberWriter
-from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 
 
@@ -56,30 +55,13 @@ def _function(name: str, more: str, body: Sequence[str]) -> list[str]:
     return [head, "  LANE {", *(f"    {line}" for line in body), "  }", "}"]
 
 
-def _writer(motion: Motion) -> NumberWriter:
-    """Writer of C expressions that read states from the C array `x` and controls from the C array `u`.
-
-    Several state vectors are computed side by side. The expressions are for vector `j`.
-    """
-    index = state_index(motion)
-
-    def place(leaf: Leaf) -> str | None:
-        if not isinstance(leaf, ir.Signal):
-            return None
-        if leaf.name in index:
-            return f"x[{index[leaf.name]}][j]"
-        return f"u[{motion.controls.index(leaf.name)}][j]"
-
-    return NumberWriter(place)
-
-
 def _step(motion: Motion, commands: Mapping[str, ir.Num]) -> list[str]:
     """C statements of a time step: they compute the next states and the actuator commands.
 
     The C arrays `x` and `u` hold the states and the controls. The next states are stored in `y`, the commands
     in `c`.
     """
-    index, writer = state_index(motion), _writer(motion)
+    index, writer = state_index(motion), NumberWriter(place_in_step(motion, sample=""))
     given = [writer.number(commands.get(name, ir.Signal(name))) for name in motion.controls]
     for name, num in motion.lets:
         writer.bound[name] = writer.number(num)
@@ -93,7 +75,7 @@ def _numbers(motion: Motion, numbers: Sequence[ir.Num]) -> list[str]:
 
     The expressions may read states from the C array `x`, and actuator commands from the C array `u`.
     """
-    writer = _writer(motion)
+    writer = NumberWriter(place_in_step(motion, sample=""))
     values = [writer.number(num) for num in numbers]
     return [*writer.lines, *(f"y[{i}][j] = {value};" for i, value in enumerate(values))]
 

@@ -185,11 +185,14 @@ CHECK = Frame(
 )
 
 
-def place_in_step(motion: Motion, *, first: frozenset[str] = frozenset()) -> Callable[[Leaf], str | None]:
+def place_in_step(
+    motion: Motion, *, first: frozenset[str] = frozenset(), sample: str = "[k]"
+) -> Callable[[Leaf], str | None]:
     """Return the function that maps a state or control to its C expression in a step.
 
     The C expression is for sample `k` and trajectory `j`; for the states in `first`, it is for the first
-    sample. For anything but a state or control, such as a function call, the returned function gives None.
+    sample. With `sample` = "", the arrays hold a single sample. For anything but a state or control, such as
+    a function call, the returned function gives None.
     """
     index = state_index(motion)
 
@@ -197,8 +200,8 @@ def place_in_step(motion: Motion, *, first: frozenset[str] = frozenset()) -> Cal
         if not isinstance(leaf, ir.Signal):
             return None
         if leaf.name in index:
-            return f"x[{index[leaf.name]}][{0 if leaf.name in first else 'k'}][j]"
-        return f"u[{motion.controls.index(leaf.name)}][k][j]"
+            return f"x[{index[leaf.name]}]{'[0]' if leaf.name in first else sample}[j]"
+        return f"u[{motion.controls.index(leaf.name)}]{sample}[j]"
 
     return place
 

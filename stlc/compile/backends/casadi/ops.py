@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import reduce
@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.backends.array.namespace import Ops, Sliding
+from stlc.compile.backends.array.namespace import FloatConstants, Ops, Sliding
 from stlc.compile.schedule.schedule import Pick
 
 ROUNDING = 1e-3
@@ -135,7 +135,7 @@ def _each(*functions: Any) -> list[Any]:
 
 
 @final
-class CasadiOps:
+class CasadiOps(FloatConstants):
     """Implementation of `stlc.compile.backends.array.namespace.Ops` for CasADi expressions."""
 
     name = "casadi"
@@ -158,11 +158,9 @@ class CasadiOps:
     minimum = _elementwise(lambda a, b: _rounded(a, b, -1.0))
 
     def axpy(self, a: Operand, b: SymbolicColumn, factor: float) -> SymbolicColumn:
-        """`a + factor * b`."""
         return b * factor + a
 
     def addcmul(self, a: Operand, b: SymbolicColumn, c: SymbolicColumn, factor: float) -> SymbolicColumn:
-        """`a + factor * b * c`."""
         return b * c * factor + a
 
     def clamp(self, x: SymbolicColumn, low: float | None, high: float | None) -> SymbolicColumn:
@@ -172,7 +170,6 @@ class CasadiOps:
         return held
 
     def norm(self, *components: Operand) -> SymbolicColumn:
-        """Euclidean norm of a vector given by its components."""
         total = sum(part * part for part in map(_entries, components))
         return SymbolicColumn(casadi.sqrt(total + TINY))
 
@@ -187,7 +184,6 @@ class CasadiOps:
         return mask
 
     def lerp(self, no: Operand, yes: Operand, weight: SymbolicColumn) -> SymbolicColumn:
-        """`no + weight (yes - no)`."""
         return weight * (yes - no) + no
 
     def infinite(self, mask: SymbolicColumn, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
@@ -268,17 +264,6 @@ class CasadiOps:
         """Return None: there is no special method for `until`."""
 
     # ------------------------------------------------------ constants and shapes
-
-    def kind(self, like: SymbolicColumn) -> Hashable:  # noqa: ARG002
-        """Return None for every array, so that all arrays share converted constants.
-
-        A converted constant is just a Python float, which suits every array.
-        """
-        return None
-
-    def constant(self, value: float, like: SymbolicColumn) -> float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
 
     def full(self, shape: tuple[int, ...], value: float, like: SymbolicColumn) -> SymbolicColumn:  # noqa: ARG002
         """Time series of a constant."""

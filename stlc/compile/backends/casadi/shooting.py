@@ -77,7 +77,7 @@ class Eased:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class ShootingDynamics:
     """Dynamics of a system, in which the expressions of a step do not include the clamps of states.
 
     Attributes:
@@ -137,7 +137,12 @@ class Shooting:
     """
 
     def __init__(
-        self, motion: Motion, demands: Sequence[ScaledFormula], *, smoothing: float, sharpness: float
+        self,
+        motion: ShootingDynamics,
+        demands: Sequence[ScaledFormula],
+        *,
+        smoothing: float,
+        sharpness: float,
     ) -> None:
         """Build the program.
 
@@ -316,11 +321,7 @@ def _names(num: ir.Num | ir.Formula) -> set[str]:
 
 
 def _initial(num: ir.Num) -> set[str]:
-    """Names of the signals whose initial value an expression reads.
-
-    The initial value is the value at the first sample of the plan, at whatever sample the expression is
-    evaluated.
-    """
+    """Names of the signals whose value at the first sample of the plan an expression reads."""
     read = (leaf for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal))
     return {leaf.name for leaf in read if leaf == ir.at_first(ir.Signal(leaf.name))}
 

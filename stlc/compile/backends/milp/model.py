@@ -160,10 +160,6 @@ class Model:
         """Add a binary variable; return it as an affine form."""
         return self.variable(0.0, 1.0, integer=True)
 
-    def is_binary(self, index: int) -> bool:
-        """True if the variable with this index is binary."""
-        return self._integer[index] and self._lower[index] == 0.0 and self._upper[index] == 1.0
-
     def bounds(self, form: Affine) -> tuple[float, float]:
         """Least and greatest value of an affine form within the bounds of the variables."""
         low = high = form.const

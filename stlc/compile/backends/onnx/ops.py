@@ -65,11 +65,9 @@ class OnnxOps:
     # ----------------------------------------------------------------- arithmetic
 
     def axpy(self, a: Number, b: Value, factor: float) -> Value:
-        """`a + factor * b`."""
         return _two("Add", a, b * factor)
 
     def addcmul(self, a: Number, b: Value, c: Value, factor: float) -> Value:
-        """`a + factor * b * c`."""
         product = b * c
         return _two("Add", a, product if factor == 1.0 else product * factor)
 
@@ -78,7 +76,6 @@ class OnnxOps:
         return x * x
 
     def mod(self, a: Number, b: Number) -> Value:
-        """Floored modulo: the result has the sign of `b`."""
         like = _like(a, b)
         divisor = like.beside(b)
         dividend = like.beside(a)
@@ -88,7 +85,6 @@ class OnnxOps:
         return self.where(other, rest + divisor, rest)
 
     def norm(self, *components: Number) -> Value:
-        """Euclidean norm of a vector given by its components."""
         first, *rest = components
         total = self.mul(first, first) if isinstance(first, Value) else first * first
         for part in rest:
@@ -127,7 +123,6 @@ class OnnxOps:
         return self.atan2(((1.0 - x) * (1.0 + x)).apply("Sqrt"), x)
 
     def atan2(self, a: Number, b: Number) -> Value:
-        """Angle of the point (b, a), in radians."""
         like = _like(a, b)
         y, x = like.beside(a), like.beside(b)
         tall, wide = y.apply("Abs"), x.apply("Abs")
@@ -142,21 +137,17 @@ class OnnxOps:
     # ------------------------------------------------------------------- truth
 
     def number(self, mask: Value, like: Value) -> Value:
-        """Array that is 1 where `mask` is True, else 0."""
         return mask.cast(like.kind)
 
     def where(self, mask: Value, yes: Number, no: Number) -> Value:
-        """Elements of `yes` where `mask` is True, else of `no`."""
         kind: Kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "float64")
         parts = [each if isinstance(each, Value) else mask.sheet.constant(each, kind) for each in (yes, no)]
         return mask.apply("Where", *parts, kind=kind)
 
     def infinite(self, mask: Value, like: Value) -> Value:  # noqa: ARG002
-        """Array that is +inf where `mask` is True, else -inf."""
         return self.where(mask, math.inf, -math.inf)
 
     def clamp(self, x: Value, low: float | None, high: float | None) -> Value:
-        """Clamp `x` to [low, high]."""
         if low is not None and high is not None:
             return x.apply("Clip", low, high)
         x = x if low is None else x.apply("Max", low)
@@ -165,24 +156,19 @@ class OnnxOps:
     # -------------------------------------------------------------- along time
 
     def join(self, items: Sequence[Value], pick: Pick) -> Value:
-        """Exact elementwise minimum or maximum of one or more arrays."""
         first, *rest = items
         return first.apply("Min" if pick == "min" else "Max", *rest) if rest else first
 
     def amin(self, x: Value) -> Value:
-        """Minimum over axis 0, which is kept with length 1."""
         return self.join(x.rows(), "min")
 
     def amax(self, x: Value) -> Value:
-        """Maximum over axis 0, which is kept with length 1."""
         return self.join(x.rows(), "max")
 
     def cummin(self, x: Value) -> Value:
-        """Running minimum along axis 0."""
         return _running(x, "Min")
 
     def cummax(self, x: Value) -> Value:
-        """Running maximum along axis 0."""
         return _running(x, "Max")
 
     def extrema(self, x: Value, pick: Pick, window: Sliding) -> None:
@@ -218,12 +204,10 @@ class OnnxOps:
         return numbers.expand(count, *(1 if length == BATCH else length for length in like.shape[1:]))
 
     def cat(self, parts: Sequence[Value]) -> Value:
-        """Concatenate arrays along axis 0."""
         widest = max(parts, key=lambda part: part.shape[-1])
         return joined([part.expand(part.shape[0], *widest.shape[1:], like=widest) for part in parts])
 
     def flip(self, x: Value) -> Value:
-        """Reverse `x` along axis 0."""
         return x[::-1] if x.shape[0] > 1 else x
 
     def quiet(self) -> AbstractContextManager[object]:

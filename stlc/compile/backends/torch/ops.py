@@ -151,20 +151,16 @@ class TorchOps:
     where = staticmethod(torch.where)
 
     def sqrt(self, x: Tensor) -> Tensor:
-        """Square root; its gradient at 0 is 0."""
         root: Tensor = _SafeSqrt.apply(x)  # type: ignore[no-untyped-call]
         return root
 
     def atan2(self, a: Tensor | float, b: Tensor | float) -> Tensor:
-        """Angle of the point (b, a), in radians."""
         return torch.atan2(*_pair(a, b))
 
     def axpy(self, a: Tensor | float, b: Tensor, factor: float) -> Tensor:
-        """`a + factor * b`."""
         return torch.add(a, b, alpha=factor) if isinstance(a, Tensor) else b * factor + a
 
     def addcmul(self, a: Tensor | float, b: Tensor, c: Tensor, factor: float) -> Tensor:
-        """`a + factor * b * c`."""
         return torch.addcmul(_pair(a, b)[0], b, c, value=factor)
 
     def clamp(self, x: Tensor, low: float | None, high: float | None) -> Tensor:
@@ -172,7 +168,6 @@ class TorchOps:
         return torch.clamp(x, low, high)
 
     def norm(self, *components: Tensor | float) -> Tensor:
-        """Euclidean norm of a vector given by its components; its gradient at 0 is 0."""
         like = next(part for part in components if isinstance(part, Tensor))
         first, *others = (_pair(part, like)[0] for part in components)
         total = first * first
@@ -184,16 +179,13 @@ class TorchOps:
         return torch.where(positive, torch.where(positive, total, 1.0).sqrt(), total)
 
     def settled(self, weight: Tensor, mask: Mask) -> Tensor:
-        """Array that is 1 where `mask` is True, else 0; its gradient is that of `weight`."""
         return weight + (self.number(mask, weight) - weight.detach())
 
     def number(self, mask: Mask, like: Tensor) -> Tensor:
-        """Array that is 1 where `mask` is True, else 0."""
         out: Tensor = mask.to(like.dtype)
         return out
 
     def lerp(self, no: Tensor | float, yes: Tensor | float, weight: Tensor) -> Tensor:
-        """`no + weight (yes - no)`, exact if `weight` is 0 or 1."""
         return torch.lerp(*_pair(no, yes), weight)
 
     def infinite(self, mask: Mask, like: Tensor) -> Tensor:
@@ -201,11 +193,6 @@ class TorchOps:
         return torch.where(mask, self.constant(torch.inf, like), self.constant(-torch.inf, like))
 
     def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
-        """Array that is 1 where the condition with robustness `rho` holds, else 0, with a smooth gradient.
-
-        The condition is `rho > 0` if `strict`, and `rho >= 0` otherwise. The gradient is that of
-        `(1 + tanh(slope rho)) / 2`.
-        """
         hard = torch.heaviside(rho.detach(), self.constant(0.0 if strict else 1.0, rho))
         if not rho.requires_grad:
             return hard
@@ -221,15 +208,12 @@ class TorchOps:
         return reduction(x, "max")
 
     def sum(self, x: Tensor) -> Tensor:
-        """Sum over axis 0, which is kept with length 1."""
         return x.sum(dim=0, keepdim=True)
 
     def cummin(self, x: Tensor) -> Tensor:
-        """Running minimum along axis 0."""
         return torch.cummin(x, dim=0).values
 
     def cummax(self, x: Tensor) -> Tensor:
-        """Running maximum along axis 0."""
         return torch.cummax(x, dim=0).values
 
     def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
@@ -286,11 +270,9 @@ class TorchOps:
         return self.constant(value, like).expand(shape).clone()
 
     def cat(self, parts: Sequence[Tensor]) -> Tensor:
-        """Concatenate arrays along axis 0."""
         return torch.cat(list(parts))
 
     def stack(self, parts: Sequence[Tensor]) -> Tensor:
-        """Stack arrays along a new axis 0."""
         return torch.stack(list(parts))
 
     def counted(self, first: int, count: int, like: Tensor) -> Tensor:
@@ -304,11 +286,9 @@ class TorchOps:
             return like.new_empty(shape)
 
     def flip(self, x: Tensor) -> Tensor:
-        """Reverse `x` along axis 0."""
         return x.flip(0)
 
     def rows(self, keep: NDArray[np.bool_], x: Tensor, value: float) -> Tensor:
-        """Copy of `x` with `value` in the rows where `keep` is False."""
         if keep.all():
             return x
         if torch.compiler.is_exporting():

@@ -28,15 +28,12 @@ class Exact(Associative):
     bounded: ClassVar[bool] = True
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
-        """Return the minimum or maximum (`pick`) of two values, elementwise."""
         return ops.join([a, b], pick)
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:
-        """Return the minimum or maximum (`pick`) of one or more values, elementwise."""
         return ops.join(items, pick)
 
     def reduce(self, x: Array, pick: Pick, ops: Ops) -> Array:
-        """Return the minimum or maximum (`pick`) over time: `(time, batch)` -> `(1, batch)`."""
         return ops.amin(x) if pick == "min" else ops.amax(x)
 
 

@@ -36,7 +36,6 @@ class LogSumExp(Associative):
     bounded: ClassVar[bool] = True
 
     def pair(self, a: Array, b: Array, pick: Pick, ops: Ops) -> Array:
-        """Return the smooth minimum or maximum (`pick`) of two values, elementwise."""
         return ops.softmax2(a, b, self.k if pick == "max" else -self.k)
 
     def join(self, items: Sequence[Array], pick: Pick, ops: Ops) -> Array:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import not_installed
 
 if TYPE_CHECKING:
     from stlc.controller.planning.planner import PlanSearch, Solver
@@ -40,8 +40,7 @@ class Cma:
         try:
             import cma
         except ModuleNotFoundError:
-            finding = Diagnostic("R301", "planner `cma` needs cma", help=("pip install 'stlc[plan]'",))
-            raise MissingError(finding) from None
+            raise not_installed("planner `cma` needs cma", "plan") from None
         return partial(self._run, strategy=cma.CMAEvolutionStrategy)
 
     def _run(self, search: PlanSearch, strategy: Any) -> None:

@@ -24,7 +24,7 @@ from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableEr
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.feasibility import extremes
 from stlc.controller.training.local_search import Searcher
-from stlc.diagnostics import Diagnostic, MissingError, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, not_installed
 from stlc.native import Stop
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ class Milp:
         try:
             import highspy
         except ModuleNotFoundError:
-            finding = Diagnostic("R301", "planner `milp` needs highspy", help=("pip install 'stlc[plan]'",))
-            raise MissingError(finding) from None
+            raise not_installed("planner `milp` needs highspy", "plan") from None
         for state in task.sample(8, seed=0, dtype=torch.float64):
             _encoded(task, state, 0.0, tight=True)
         return partial(self._run, highs=highspy)

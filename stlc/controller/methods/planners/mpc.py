@@ -19,7 +19,7 @@ from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.training.local_search import Searcher
-from stlc.diagnostics import Diagnostic, MissingError, usage
+from stlc.diagnostics import not_installed, usage
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
@@ -72,8 +72,7 @@ class Mpc:
         try:
             import casadi
         except ModuleNotFoundError:
-            finding = Diagnostic("R301", "planner `mpc` needs casadi", help=("pip install 'stlc[mpc]'",))
-            raise MissingError(finding) from None
+            raise not_installed("planner `mpc` needs casadi", "mpc") from None
         shooting = self._shooting(task)
         options: dict[str, Any] = {
             "print_time": False,
@@ -90,7 +89,12 @@ class Mpc:
         return partial(self._run, shooting=shooting, solve=solver)
 
     def _shooting(self, task: Task) -> Shooting:
-        from stlc.compile.backends.casadi.shooting import Motion, NotSmoothError, ScaledFormula, Shooting
+        from stlc.compile.backends.casadi.shooting import (
+            NotSmoothError,
+            ScaledFormula,
+            Shooting,
+            ShootingDynamics,
+        )
         from stlc.compile.semantics.kinds.smooth import LogSumExp
 
         system = task.system
@@ -98,7 +102,7 @@ class Mpc:
         bounds = zip(system.control_low.tolist(), system.control_high.tolist(), strict=True)
         step = {**free.next, **{timer.name: timer.update for timer in system.timers}}
         named = dict(zip(system.control_names, bounds, strict=True))
-        motion = Motion(free.lets, step, system.decl.clamps, named, system.horizon)
+        motion = ShootingDynamics(free.lets, step, system.decl.clamps, named, system.horizon)
         rules = [ScaledFormula(rule.under(LogSumExp()), rule.weight / rule.scale) for rule in task.rules]
         try:
             return Shooting(motion, rules, smoothing=self.smoothing, sharpness=self.sharpness)

@@ -189,10 +189,9 @@ class _Attempts:
         return torch.from_numpy(needed[order[: options.schedules]])
 
     def _nearest(self, needed: Tensor) -> Tensor:
-        """Select a plan for each of the k schedules `needed`: (k, T, m).
+        """Select a plan for each of the k schedules `needed`, (k, T, m).
 
-        For each schedule, some plans of the library are drawn at random. The one that comes nearest to
-        meeting the schedule is selected.
+        It is the plan nearest to meeting the schedule, among some plans of the library drawn at random.
         """
         missed = needed.flatten(1).double() @ self._missed
         seen = torch.rand(missed.shape, generator=self._search.generator) < SEEN
