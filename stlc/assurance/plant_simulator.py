@@ -218,6 +218,10 @@ class PlantSimulator:
         found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]
         return _together([replace(each, margin=np.nan) if each.failed else each for each in found])
 
+    def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
+        """None: a black box has no gradient."""
+        return None
+
     @cached_property
     def _finer_judging(self) -> _Judging:
         assert self._finer is not None
