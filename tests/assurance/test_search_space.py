@@ -119,7 +119,7 @@ def test_a_climb_begins_at_the_best_points_that_others_have_found_and_moves_whol
     for value in range(20):
         strategy.observe(good if value % 2 else LONG.middle(), -1.0 if value % 2 else 1.0)
     moved = [np.flatnonzero(strategy.propose() != good) for _ in range(60)]
-    assert float(np.mean([len(each) for each in moved])) < 20
+    assert float(np.mean([len(each) for each in moved])) < 40
     assert sum(len(each) == 20 for each in moved) > 10
 
 
