@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.documents import Plans, PlanTubes
 from stlc.cli.framework.options import (
     FailUnderOption,
     PlannerOptionsOption,
@@ -18,6 +17,7 @@ from stlc.cli.framework.options import (
     planner_choice,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
+from stlc.cli.framework.plan_documents import Plans, PlanTubes
 from stlc.cli.framework.program import command
 from stlc.diagnostics import usage
 from stlc.registry import PLANNERS

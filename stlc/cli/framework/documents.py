@@ -27,6 +27,7 @@ from stlc.cli.framework.assured import (
     UncertainSignal,
     Verified,
 )
+from stlc.cli.framework.plan_documents import Plans
 from stlc.cli.framework.plant_documents import PlantSimulation
 from stlc.registry import GuardName
 
@@ -373,51 +374,6 @@ class LintedFiles(TypedDict):
     files: list[str]
     findings: int
     fixed: int
-
-
-class PlanRobustness(TypedDict):
-    least: float | str
-    median: float | str
-    greatest: float | str
-
-
-class PlanSeconds(TypedDict):
-    mean: float
-    median: float
-    most: float
-
-
-class GuaranteedRobustness(TypedDict):
-    """Bounds on the robustness of a requirement over all initial states, and the plans that satisfy it."""
-
-    low: float | str
-    high: float | str
-    guaranteed: int
-
-
-class PlanTubes(TypedDict):
-    """Bounds for all errors of a scenario; normal noise is bounded at a number of standard deviations."""
-
-    scenario: str
-    deviations: float | None
-    guaranteed: int
-    robustness: list[float | str]
-    requirements: dict[str, GuaranteedRobustness]
-
-
-class Plans(TypedDict):
-    spec: str
-    system: str
-    method: str
-    budget: float
-    starts: int
-    satisfied: int
-    infeasible: int
-    robustness: PlanRobustness
-    seconds: PlanSeconds
-    evaluations: float
-    tube: NotRequired[PlanTubes]
-    trace: str
 
 
 class PlottedTrace(TypedDict):
