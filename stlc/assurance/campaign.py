@@ -186,7 +186,7 @@ class Difference:
 
 
 @dataclass(frozen=True, slots=True)
-class Verification:
+class CertificateVerification:
     """Comparison of a certificate with the present state of what it is about.
 
     Attributes:
@@ -207,13 +207,13 @@ class Verification:
 
 def compared(
     document: Mapping[str, Any], inputs: Mapping[str, Any], packages: Sequence[str] = ()
-) -> Verification:
+) -> CertificateVerification:
     """Compare a certificate with the present inputs, and with the present versions of packages.
 
     Raises:
         KeyError, TypeError, ValueError: the document is no certificate.
     """
-    return Verification(
+    return CertificateVerification(
         _different(document["inputs"], inputs),
         tuple(wrong_numbers(document)),
         _different(document["versions"], versions(*packages)),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from stlc.assurance.campaign import Verification, compared, seed_ranges
+from stlc.assurance.campaign import CertificateVerification, compared, seed_ranges
 from stlc.assurance.certificate import Judged, Sample, together
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
@@ -250,7 +250,9 @@ def _file_hash(path: Path) -> str:
     return sha256(path.read_bytes()) if path.is_file() else MISSING
 
 
-def verify_draws(document: Mapping[str, Any], spec: str | None, system: str | None) -> Verification:
+def verify_draws(
+    document: Mapping[str, Any], spec: str | None, system: str | None
+) -> CertificateVerification:
     """Compare a certificate with the present files of its specification and of its plant or system.
 
     Nothing is simulated, and nothing that the files name is run.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from stlc.assurance.campaign import Verification, compared, seed_ranges
+from stlc.assurance.campaign import CertificateVerification, compared, seed_ranges
 from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.semantics import TOLERANCE
@@ -210,7 +210,7 @@ def inputs_of(folder: RunDir, task: Task, rules: Rules | None) -> dict[str, str 
     }
 
 
-def verify(document: Mapping[str, Any], folder: RunDir) -> Verification:
+def verify(document: Mapping[str, Any], folder: RunDir) -> CertificateVerification:
     """Compare a certificate with the present state of a run's folder and of the software.
 
     The policy is not loaded, so that a changed checkpoint is a difference and not an error.

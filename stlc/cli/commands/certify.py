@@ -41,7 +41,7 @@ from stlc.files import find_spec, read_source, write_atomic
 from stlc.registry import guard_named
 
 if TYPE_CHECKING:
-    from stlc.assurance.campaign import Campaign, Progress, Subject, Verification
+    from stlc.assurance.campaign import Campaign, CertificateVerification, Progress, Subject
     from stlc.assurance.drives import PolicyDrives
 
 FILE = "eval/certificate.json"
@@ -382,7 +382,7 @@ def _verified(path: Path, name: str | None, what: Drawing, runs: Path) -> Answer
 
 def _compared(
     document: Mapping[str, Any], name: str | None, what: Drawing, runs: Path
-) -> tuple[str, Verification]:
+) -> tuple[str, CertificateVerification]:
     """Return what a certificate is compared with, as it is shown, and the comparison."""
     if "kind" in document:
         from stlc.assurance.draws import verify_draws
