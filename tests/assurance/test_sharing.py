@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stlc.assurance.falsify import Falsification, SearchBudget, SearchOrder, falsify_each
-from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.controller.parallel.workers import LocalProcesses
@@ -49,6 +49,9 @@ class Bowl:
 
     def graded(self, requirement: int) -> bool:  # noqa: ARG002
         return True
+
+    def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
+        return None
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         assert len(points) <= max(self.batch, 1)
