@@ -10,11 +10,12 @@ import pytest
 from helpers.documents import misfits
 
 from benchmarks.__main__ import main as measure
-from benchmarks.deployments import GUARDS, picked
+from benchmarks.deployments import picked
 from benchmarks.tables.schema import document_schema
 from benchmarks.timing import Times
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.simulator import DeploymentRecording
+from stlc.registry import GUARDS
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
