@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
+from stlc.assurance.sensitive import SensitiveClimbing
 from stlc.assurance.strategies import (
     ConstantVertices,
     CovarianceAdaptation,
@@ -157,7 +158,8 @@ class Proposal:
 class Portfolio:
     """The strategies of a search, in turn: constant vertices first, then the others.
 
-    Every other turn goes to the strategy that has found the least robust point.
+    Every other turn goes to the strategy that has found the least robust point. In a space most of whose
+    coordinates have no effect, `SensitiveClimbing` is the only strategy.
 
     While the robustness is flat, that is, hardly ever changes, nothing can be learnt from it: then points are
     uniform.
@@ -168,7 +170,9 @@ class Portfolio:
         self._uniform = UniformSampling(space, generator)
         self._first: Strategy | None = None
         self._turns: list[Strategy] = []
-        if not random and space.dim:
+        if not random and space.sparse:
+            self._turns = [SensitiveClimbing(space, generator)]
+        elif not random and space.dim:
             self._first = ConstantVertices(space, generator)
             self._turns = [VertexSampling(space, generator), HillClimbing(space, generator)]
             if CovarianceAdaptation.available(space):
@@ -202,6 +206,11 @@ class Portfolio:
         return (
             Proposal(self._uniform, self._uniform.propose()) if point is None else Proposal(strategy, point)
         )
+
+    def observe(self, point: Point, value: float) -> None:
+        """Report the guidance value at a point that no strategy proposed."""
+        for each in self._turns:
+            each.observe(point, value)
 
     def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others."""

@@ -26,6 +26,7 @@ from stlc.controller.problem.task import rank, satisfied
 from stlc.controller.training.checkpoint import below
 from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.exploration import EFFORTS, Exploration
+from stlc.controller.training.failures import FailureBank
 from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
 from stlc.controller.training.objective import loss
 from stlc.controller.training.run import load_weights
@@ -64,6 +65,8 @@ NEAREST = 0.75
 """Share of the states of a search round that are chosen because their plans fail by the least amount."""
 COUNTS = ("accuracy", "solved", "barren", "effort", "failing")
 """Facts of which every rank (process) has its own, in the order in which a checkpoint stores them."""
+DRIVEN = 4
+"""States of failing drives in a search round: one for so many fresh ones, beside them."""
 EXPLORED = 4
 """Number of initial states that are explored before a search round."""
 RISE = 30
@@ -103,6 +106,8 @@ class Trainer(Learner):
         self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy, self.failing = 0.0, 0
         self.learnt = torch.empty(0, len(task.system.names), device=device)
+        if config.falsify:
+            self.failures = FailureBank(torch.empty(0, len(task.system.names), device=device))
 
     def advance(self) -> float:
         """Make one gradient step and return its loss.
@@ -228,7 +233,8 @@ class Trainer(Learner):
         failing, repaired, before = self._take_repaired()
         feasible = None if before is None else max(before, accuracy)
         bad = self._to_repair(judged.rho, ~good)
-        self.repairing = self._begin(x0[bad], plans[bad])
+        x0, plans = self._with_failures(x0[bad], plans[bad])
+        self.repairing = self._begin(x0, plans)
         self.failing = int((~good).sum())
         self.accuracy = accuracy
         self.barren = repaired < BARREN * failing and accuracy < LEARNT and not self.exhausted
@@ -256,6 +262,21 @@ class Trainer(Learner):
         first = rows[rho[rows].argsort(descending=True, stable=True)[:near]]
         chosen[first] = True
         return torch.cat((first, rows[~chosen[rows]]))[:most]
+
+    def _with_failures(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
+        """Append states of failing drives from which the policy still fails, and its plans from there.
+
+        Args:
+            x0: states of a search round, (k, n).
+            plans: the policy's plans, (k, T, m).
+        """
+        if self.failures is None or not len(self.failures.states):
+            return x0, plans
+        kept = self.failures.drawn(self.config.pool // DRIVEN, self.generator)
+        tried, judged = BestOfKPolicy(self.task, self.network).plan_judged(kept)
+        rows = (~satisfied(judged.rho)).nonzero()[:, 0][: max(self._effort[0] // DRIVEN, 1)]
+        self.failures.repairing = len(rows)
+        return torch.cat((x0, kept[rows])), torch.cat((plans, tried[rows].to(plans)))
 
     def _nearest(self, failing: int) -> int:
         """Number of states that a search round chooses by their robustness, out of `failing` states."""
@@ -296,6 +317,9 @@ class Trainer(Learner):
         solved = found.solved
         self.buffer.add(found.states[solved], found.plans[solved])
         self.supply.follow(found.states[solved], found.plans[solved])
+        if self.failures is not None:  # the estimate is that of the fresh states
+            solved = solved[: len(solved) - self.failures.repairing]
+            self.failures.repairing = 0
         near = min(self._nearest(self.failing), len(solved))
         nearest, others = solved[:near], solved[near:]
         of_others = float(others.double().mean()) if len(others) else 0.0
@@ -307,6 +331,8 @@ class Trainer(Learner):
     def _loss(self) -> Tensor:
         config = self.config
         fresh = self.training.take(config.batch)
+        if self.failures is not None:
+            fresh = self.failures.mixed(fresh, self.generator)
         hard = config.hard if len(self.buffer) else 0
         x0, targets = fresh, fresh.new_zeros(0)
         if hard:
@@ -432,6 +458,8 @@ class Trainer(Learner):
             found.update({f"searching.{name}": value for name, value in pending.items()})
             found["searching.seed"] = torch.tensor(self.repairing.seed)
         found["buffer.states"], found["buffer.plans"] = self.buffer.states[:count], self.buffer.plans[:count]
+        if self.failures is not None:
+            found.update({f"failures.{name}": value for name, value in self.failures.tensors().items()})
         return found
 
     def facts(self) -> dict[str, float | int]:
@@ -466,6 +494,8 @@ class Trainer(Learner):
         self.buffer.plans[:count] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
         self.supply.restore(below(tensors, "supply"))
+        if self.failures is not None:
+            self.failures.restore(below(tensors, "failures"))
         if isinstance(self.training, FixedSet):
             self.training.restore(below(tensors, "training"))
         if known := below(tensors, "repairing"):
@@ -503,6 +533,7 @@ class NetworkMethod(Method):
     """
 
     learns = Trainer
+    falsifies = True
     searches = False
     mirrored = False
 
