@@ -23,6 +23,8 @@ from stlc.controller.training.failures import SearchRound
 from stlc.controller.training.run import Run
 from stlc.native import Stop
 
+DRIVE_SEARCH_VERSION = 1
+"""Version of the search; results of older versions are recomputed."""
 ROUND = 16
 """Simulations side by side in a round of a training."""
 EARLIER = 3
@@ -50,8 +52,7 @@ class SearchedDrives:
     @property
     def failing(self) -> NDArray[np.bool_]:
         """Whether each drive violates a requirement, (count, agents)."""
-        violated: NDArray[np.bool_] = (self.margins < -TOLERANCE).any(2)
-        return violated
+        return np.asarray((self.margins < -TOLERANCE).any(2))
 
     @property
     def least(self) -> float:

@@ -102,7 +102,8 @@ class DriveSimulator:
 
     def margins(self, recording: DeploymentRecording) -> NDArray[np.float64]:
         """Least robustness of the agents of each simulation, (count, requirements)."""
-        return self.margins_of_agents(recording).min(1)
+        least: NDArray[np.float64] = self.margins_of_agents(recording).min(1)
+        return least
 
     def margins_of_agents(self, recording: DeploymentRecording) -> NDArray[np.float64]:
         """Robustness of each agent of each simulation, (count, agents, requirements)."""

@@ -42,6 +42,8 @@ REJECTED = 1000
 """Successive points without an admissible initial state after which a search ends."""
 DIGITS = (0, 1, 2, 3)
 """Decimal digits, in the unit cube, to which values of a counterexample are rounded, the fewest first."""
+SPLIT = (1, 2, 4, 8, 16)
+"""Numbers of parts of a space, most of whose coordinates have no effect, that are shrunk as wholes."""
 MOST_SHRUNK = 60
 """Coordinates at most that are shrunk one by one."""
 
@@ -270,6 +272,8 @@ def falsify(
             least = min(least, margin)
             portfolio.tell(each, float(outcome.guidance[index, requirement]))
             if margin < -TOLERANCE and found is None:
+                margin = _alone(simulator, requirement, points[index], margin)
+            if margin < -TOLERANCE and found is None:
                 candidate = _candidate(simulator, requirement, points[index], margin, name, len(tried))
                 if candidate.spurious:
                     spurious.append(candidate)
@@ -289,6 +293,16 @@ def falsify(
         perf_counter() - began,
         counts,
     )
+
+
+def _alone(simulator: Simulator, requirement: int, point: Point, margin: float) -> float:
+    """Robustness of a drive that is simulated alone, as a replay does; of other simulations, `margin`.
+
+    The rounding of a policy's plans depends on the number of drives that are simulated side by side.
+    """
+    if not simulator.space.sparse or simulator.batch == 1:
+        return margin
+    return float(simulator.simulate(point[None]).margins[0, requirement])
 
 
 def _candidate(
@@ -327,7 +341,15 @@ Values: TypeAlias = Callable[[Point], Sequence[float]]
 
 
 def _changes(space: SearchSpace) -> Iterator[tuple[tuple[int, ...], Values]]:
-    """Yield coordinates to change together: whole inputs, equal neighbours, other numbers, rounded values."""
+    """Yield coordinates to change together: whole inputs, equal neighbours, other numbers, rounded values.
+
+    In a space most of whose coordinates have no effect, these are halves, quarters, and so on, of all.
+    """
+    for parts in SPLIT if space.sparse else ():
+        for each in np.array_split(np.arange(space.dim), parts):
+            yield tuple(each.tolist()), lambda _: (0.5,)
+    if space.sparse:
+        return
     for block in space.blocks:
         yield block.values, lambda _: (1.0, 0.0, 0.5)
         for left, right in pairwise(block.values):

@@ -1,9 +1,9 @@
 """Search for drives: climbing that learns which of the many random numbers of a world matter.
 
 A world draws hundreds of random numbers, most of which change nothing: rejected candidates, or obstacles that
-are never reached. If a change of some coordinates leaves the robustness as it was, bit for bit, none of
-them matters to that drive. So the changed coordinates of every simulation are a group test (Dorfman 1943),
-from which the strategy learns the share of each coordinate in the changes to come.
+are never reached. A change of some coordinates that leaves the robustness as it was makes it likely that none
+of them matters. So every simulation is a group test (Dorfman 1943) of the coordinates that it changes, from
+which the strategy learns the probability that a coordinate matters (Bayes).
 """
 
 from __future__ import annotations
@@ -17,18 +17,24 @@ from numpy.typing import NDArray
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.strategies import Strategy
 
-KEPT = 12
+KEPT = 4
 """Least robust points from which changed points are made."""
-FRESH = 0.25
+FRESH = 0.15
 """Share of the proposals that are uniform, so that the search goes on elsewhere too."""
 FIRST = 24
 """Uniform points before the first change."""
-LEAST, MOST = 0.01, 8.0
-"""Bounds of the weight of a coordinate, which is 1 at first."""
-FADED, RISEN = 0.6, 1.5
-"""Factors of the weights of changed coordinates, after a simulation without and with an effect."""
-GROWTH = 1.15
-"""Factor by which the number of changed coordinates grows after a simulation without an effect."""
+SUSPECTED = 20.0
+"""Number of coordinates that are expected to matter at first."""
+LEAST, MOST = 0.02, 0.9
+"""Bounds of the probability that a coordinate matters; the lower one is a share of the first probability."""
+MASKED = 0.5
+"""Probability that a change of a coordinate that matters has no effect on the robustness."""
+CHANGED = 1.2
+"""Expected number of coordinates that matter among those that are changed, on average."""
+EVEN = 0.15
+"""Share of the changes whose coordinates are chosen evenly, so that each is tested now and then."""
+SAME = 1e-5
+"""Difference of robustness that counts as rounding, absolute or relative."""
 WIDTHS = (0.02, 0.1, 0.3)
 """Standard deviations of changes, in the unit cube."""
 REDRAWN = 0.4
@@ -37,7 +43,7 @@ TIRED = 40
 """Changed points without progress after which a kept point is given up."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Kept:
     """Point with a small robustness, and the number of its changed copies since the last better one."""
 
@@ -62,8 +68,8 @@ class SensitiveClimbing(Strategy):
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
-        self._weights = np.ones(space.dim)
-        self._size = max(1.0, 0.05 * space.dim)
+        self._prior = min(SUSPECTED / max(space.dim, 1), 0.5)
+        self._matters = np.full(space.dim, self._prior)
         self._kept: list[_Kept] = []
         self._open: dict[int, _Change] = {}
         self._made = 0
@@ -85,13 +91,9 @@ class SensitiveClimbing(Strategy):
         if change is None:
             self._keep(point, value)
             return
-        parent, effect = change.parent, value != change.parent.value
-        factor = RISEN if effect else FADED
-        weights = self._weights[change.coordinates]
-        if effect:  # one of the coordinates is the cause, so each gets its part of the rise
-            factor = 1.0 + (RISEN - 1.0) / math.sqrt(len(weights))
-        self._weights[change.coordinates] = np.clip(weights * factor, LEAST, MOST)
-        self._size = min(max(self._size * (1.0 / GROWTH if effect else GROWTH), 1.0), self.space.dim)
+        parent = change.parent
+        effect = not math.isclose(value, parent.value, rel_tol=SAME, abs_tol=SAME)
+        self._learn(change.coordinates, effect=effect)
         parent.tried += 1
         if value < parent.value:
             parent.point, parent.value, parent.tried = point, value, 0
@@ -104,9 +106,18 @@ class SensitiveClimbing(Strategy):
         self._keep(point, value)
 
     @property
-    def weights(self) -> NDArray[np.float64]:
-        """Weight of each coordinate in the choice of changes, (dim,)."""
-        return self._weights
+    def matters(self) -> NDArray[np.float64]:
+        """Probability that a coordinate matters to the robustness of the kept points, (dim,)."""
+        return self._matters
+
+    def _learn(self, changed: NDArray[np.int64], *, effect: bool) -> None:
+        """Update the probabilities of the changed coordinates by Bayes' rule."""
+        before = self._matters[changed]
+        if effect:  # any of them may be the cause
+            now = before * (1.0 - MASKED) / (1.0 - np.prod(1.0 - before * (1.0 - MASKED))) + before * MASKED
+        else:
+            now = before * MASKED / (1.0 - before * (1.0 - MASKED))
+        self._matters[changed] = np.clip(now, LEAST * self._prior, MOST)
 
     def _parent(self) -> _Kept:
         """One of the kept points; the least robust half of them is chosen more often."""
@@ -115,10 +126,14 @@ class SensitiveClimbing(Strategy):
         return self._kept[int(self.generator.choice(len(ranks), p=share / share.sum()))]
 
     def _coordinates(self) -> NDArray[np.int64]:
-        """Coordinates to change, about `_size` of them, by their weights."""
-        count = min(max(1, int(self.generator.poisson(self._size))), self.space.dim)
-        keys = np.log(self.generator.random(self.space.dim)) / self._weights  # Efraimidis and Spirakis 2006
-        return np.argpartition(keys, -count)[-count:]
+        """Coordinates to change: as many as are expected to contain a few that matter."""
+        random = np.log(self.generator.random(self.space.dim))
+        if self.generator.random() >= EVEN:
+            random /= self._matters  # drawn without replacement, by weight (Efraimidis and Spirakis 2006)
+        order = np.argsort(-random)
+        expected = np.cumsum(self._matters[order])
+        count = int(np.searchsorted(expected, self.generator.exponential(CHANGED))) + 1
+        return order[:count]
 
     def _changed(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """New values for some coordinates: drawn anew, or moved by one of three widths."""

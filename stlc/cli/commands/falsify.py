@@ -166,7 +166,8 @@ class _Target:
         run = Run.open(self.name, root=runs, overrides=overrides, scenario=self.scenario)
         test = run.task.system.decl.test
         size = self.agents or test.agents, self.steps or test.steps
-        return DriveSimulator(run, _mode(self.guard), Setting((self.seed,), *size, test.replan))
+        setting = Setting((self.seed,), *size, test.replan, limit=None)  # a limit of time cannot be replayed
+        return DriveSimulator(run, _mode(self.guard), setting)
 
     def _black_box(self, plant: Path, overrides: Mapping[str, str]) -> PlantSimulator:
         from stlc.assurance.plant_simulator import PlantSimulator

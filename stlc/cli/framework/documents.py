@@ -24,6 +24,8 @@ from stlc.cli.framework.assured import (
     Assurance,
     Certificate,
     CertificateCheck,
+    ClosedLoopRecord,
+    FalsificationRounds,
     FalsifiedSystem,
     ReplayedCounterexample,
     UncertainSignal,
@@ -663,29 +665,6 @@ class SystemFacts(TypedDict):
     driven: NotRequired[DrivenSteps]
 
 
-class GuardResult(TypedDict):
-    guard: Literal["none", "paper", "full"]
-    drives: int
-    satisfied: int
-    share: Num
-    interval: list[Num]
-    safe: Num | None
-    compared: int
-    gained: int
-    lost: int
-
-
-class ClosedLoopRecord(TypedDict):
-    recommended: Literal["none", "paper", "full", None]
-    share: Num | None
-    interval: list[Num] | None
-    guards: list[GuardResult]
-    seed: int
-    steps: int
-    judge: str | None
-    why: str
-
-
 class Training(TypedDict):
     accuracy: NotRequired[float]
     interval: NotRequired[list[float]]
@@ -695,6 +674,7 @@ class Training(TypedDict):
     searched: NotRequired[int]
     judged_seconds: NotRequired[float]
     closed_loop: NotRequired[ClosedLoopRecord]
+    falsification: NotRequired[FalsificationRounds]
     verdict: NotRequired[TrainingVerdict]
     steps: NotRequired[int | None]
     schedule: NotRequired[str | None]

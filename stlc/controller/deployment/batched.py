@@ -205,8 +205,8 @@ class Worlds:
         first = self.truths[0]
         if all(each is first for each in self.truths):
             return first.step(torch.cat(tuple(before)), torch.cat(tuple(acts)))
-        moved = [truth.step(*each) for truth, *each in zip(self.truths, before, acts, strict=True)]
-        return torch.cat(moved)
+        each = zip(self.truths, before, acts, strict=True)
+        return torch.cat([truth.step(state, act) for truth, state, act in each])
 
     def options(self, x: Tensor) -> Tensor | None:
         """Return the states that the agents would have under each option.

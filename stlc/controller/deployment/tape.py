@@ -27,8 +27,8 @@ class Tape:
 
     While the tape is in effect, `torch.rand`, `randn`, `randint` and `randperm` are replaced in the module
     `torch`. They still draw from their generators; then the numbers for which the simulation's point has
-    coordinates are replaced by the quantiles at these. The numbers of one simulation are numbered in the order
-    of its calls. A generator that a world makes by `numpy.random.default_rng(SEED)` is replaced by a
+    coordinates are replaced by the quantiles at these. The numbers of one simulation are numbered in the
+    order of its calls. A generator that a world makes by `numpy.random.default_rng(SEED)` is replaced by a
     `TapedGenerator`; numbers of other libraries are drawn as usual.
 
     Attributes:
@@ -88,9 +88,7 @@ class Tape:
         found: NDArray[np.float64] = self.points[row, first : first + count].clamp(0.0, BELOW).numpy()
         return found
 
-    def _read(
-        self, name: str, drawn: Tensor, args: tuple[Any, ...], options: Mapping[str, Any]
-    ) -> Tensor:
+    def _read(self, name: str, drawn: Tensor, args: tuple[Any, ...], options: Mapping[str, Any]) -> Tensor:
         """Numbers of one call, with those replaced for which the simulation's point has coordinates."""
         generator = options.get("generator")
         row = self._row if generator is None else self._owners.get(id(generator), self._row)
