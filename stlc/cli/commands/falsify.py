@@ -86,9 +86,10 @@ def falsify(
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
     the random numbers of the world in which its policy drives. Inputs that are constant at the ends of their
     ranges come first. Then random vertices, hill climbing, CMA-ES (if the package `cma` is installed) and
-    periodic inputs take turns. A violation counts only if it remains at half the time step. It is written as
-    a trace, in a simpler form where one violates the requirement too, with a file for --replay. If nothing is
-    found, that is no proof. Exit code: 1 if a requirement is violated, else 0.
+    periodic inputs take turns; the numbers of a world are changed where this has an effect. A violation
+    counts only if it remains at half the time step. It is written as a trace, in a simpler form where one
+    violates the requirement too, with a file for --replay. If nothing is found, that is no proof. Exit code:
+    1 if a requirement is violated, else 0.
     """
     from stlc.assurance.falsify import SearchBudget
     from stlc.assurance.falsify import falsify as search
