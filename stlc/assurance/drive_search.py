@@ -147,7 +147,7 @@ def round_of(
         The states and the worst points; None if `stop` ended the search.
     """
     test = run.task.system.decl.test
-    setting = Setting((seed,), test.agents, test.steps, test.replan)
+    setting = Setting((0,), test.agents, test.steps, test.replan)
     count = max(round(decisions * test.replan / (test.agents * test.steps)), 2)
     simulator = DriveSimulator(run, "none", setting, batch=min(ROUND, max(count // 2, 1)))
     kept: list[NDArray[np.float64]] = []
@@ -166,6 +166,7 @@ def round_of(
     except _StoppedError:
         return None
     states = torch.from_numpy(np.concatenate(kept))
+    states = states[run.task.alive(states)]  # from others, no plan satisfies the specification
     failing = found.failing
     return SearchRound(states, found.worst(len(found.points)), failing.size, int(failing.sum()))
 

@@ -346,8 +346,8 @@ def _changes(space: SearchSpace) -> Iterator[tuple[tuple[int, ...], Values]]:
     In a space most of whose coordinates have no effect, these are halves, quarters, and so on, of all.
     """
     for parts in SPLIT if space.sparse else ():
-        for each in np.array_split(np.arange(space.dim), parts):
-            yield tuple(each.tolist()), lambda _: (0.5,)
+        for part in np.array_split(np.arange(space.dim), parts):
+            yield tuple(part.tolist()), lambda _: (0.5,)
     if space.sparse:
         return
     for block in space.blocks:

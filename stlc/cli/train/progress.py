@@ -330,7 +330,8 @@ def final_screen(
 def rounds_text(found: FalsificationRounds) -> str:
     """Text on the rounds of a training with `--falsify`."""
     last = f"{percent(found['last_share'])} of the last round's failed"
-    return f"{found['rounds']} rounds, {found['drives']:,} drives, {last}; {found['states']:,} states kept"
+    rounds = f"{found['rounds']} round{'' if found['rounds'] == 1 else 's'}"
+    return f"{rounds}, {found['drives']:,} drives, {last}; {found['states']:,} states kept"
 
 
 def _emphasised(line: str) -> Text:

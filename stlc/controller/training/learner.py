@@ -65,7 +65,7 @@ NEAREST = 0.75
 """Share of the states of a search round that are chosen because their plans fail by the least amount."""
 COUNTS = ("accuracy", "solved", "barren", "effort", "failing")
 """Facts of which every rank (process) has its own, in the order in which a checkpoint stores them."""
-DRIVEN = 4
+DRIVEN = 8
 """States of failing drives in a search round: one for so many fresh ones, beside them."""
 EXPLORED = 4
 """Number of initial states that are explored before a search round."""
