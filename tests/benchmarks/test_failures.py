@@ -47,6 +47,7 @@ def test_the_second_training_differs_by_the_option_alone(tmp_path: Path) -> None
     assert set(ORDER) == {"traffic", "ship_safe", "manipulation", "navigation", "reach_n_avoid", "ship_track"}
 
 
+@pytest.mark.slow
 def test_drives_of_a_run_fill_a_row_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
