@@ -22,6 +22,7 @@ from stlc.assurance.drive_simulator import DriveSimulator
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.guard.candidates import Mode
+from stlc.controller.training.failures import FAILURES_VERSION
 from stlc.controller.training.run import Run
 from stlc.rundir import RunDir
 
@@ -33,7 +34,9 @@ GUARDS: tuple[Mode, ...] = ("none", "paper")
 BATCH = 16
 SEARCHED, FRESH = 0, 4_000_000
 """Seeds of the searches, and of the fresh drives, on which nothing is tuned."""
-FALSIFYING = {"falsify": "falsify"}
+FALSIFYING = {"falsify": f"falsify{FAILURES_VERSION}"}
+AFTER = f"guided:falsify{FAILURES_VERSION}"
+"""Name of the second training in results."""
 _TRAINING, _OUTPUT = Training(clock="processor", seeds="0"), Output(Path("docs/falsification.md"))
 TEXT = """\
 Written by `python -m benchmarks failures` from `benchmarks/results/failures.json`. `random` and `falsify`:
@@ -57,7 +60,7 @@ class Drives:
         agents: agents of each simulation.
         steps: steps of each drive at most; None: as the system file says.
         seed: seed of the search.
-        trained: `guided` or `guided:falsify`.
+        trained: `guided`, or `AFTER`.
     """
 
     folder: RunDir
@@ -253,7 +256,7 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
             if not all(each in kept for each in first):
                 continue
             random, searched, before = (kept[each] for each in first)
-            after = kept.get((benchmark, guard, "guided:falsify", "fresh"))
+            after = kept.get((benchmark, guard, AFTER, "fresh"))
             key = searched["key"]
             rows.append(
                 Row(

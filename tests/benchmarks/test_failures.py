@@ -11,7 +11,7 @@ from helpers.documents import misfits
 from benchmarks.__main__ import main as measure
 from benchmarks.options import Training
 from benchmarks.store import ResultStore
-from benchmarks.tables.failures import FALSIFYING, FRESH, ORDER, _cells, rows_of
+from benchmarks.tables.failures import AFTER, FALSIFYING, FRESH, ORDER, _cells, rows_of
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Length, Place, _job
 from stlc.cli.framework.app import main
@@ -30,7 +30,7 @@ def test_a_row_needs_both_searches_and_fresh_drives() -> None:
     assert rows_of(results[:2]) == []
     (row,) = rows_of(results)
     assert (row.failing_random, row.failing_falsify, row.before, row.after) == (1, 7, 4, None)
-    (row,) = rows_of([*results, _result("fresh", "guided:falsify", failing=2)])
+    (row,) = rows_of([*results, _result("fresh", AFTER, failing=2)])
     assert row.after == 2
 
 
@@ -43,7 +43,7 @@ def test_the_second_training_differs_by_the_option_alone(tmp_path: Path) -> None
         "--falsify",
     ]
     assert after.options == FALSIFYING
-    assert after.contender == "guided:falsify"
+    assert after.contender == AFTER
     assert set(ORDER) == {"traffic", "ship_safe", "manipulation", "navigation", "reach_n_avoid", "ship_track"}
 
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from stlc.controller.training.run import Run
     from stlc.native import Stop
 
+FAILURES_VERSION = 1
+"""Version of the rounds and of the use of their states; results of older versions are recomputed."""
 MOMENTS = (0.25, 0.4, 0.55, 0.7, 0.82)
 """Shares of the planned steps after which a round is due."""
 WORK = 0.06
@@ -35,7 +37,7 @@ KEPT = 8192
 """States kept at most; the oldest are dropped."""
 POINTS = 8
 """Points of the least robust drives that the next round simulates first."""
-MIXED = 0.25
+MIXED = 0.125
 """Part of the fresh states of a step that kept states replace."""
 
 
@@ -127,11 +129,15 @@ class FailureBank:
 
     def mixed(self, fresh: Tensor, generator: torch.Generator) -> Tensor:
         """The states `fresh`, (batch, n), of which kept states replace the last ones."""
-        count = int(MIXED * len(fresh))
-        if not len(self.states) or not count:
+        count = self.count(len(fresh))
+        if not count:
             return fresh
         chosen = torch.randint(len(self.states), (count,), generator=generator).to(fresh.device)
         return torch.cat((fresh[: len(fresh) - count], self.states[chosen]))
+
+    def count(self, batch: int) -> int:
+        """Number of kept states among `batch` states of a step."""
+        return int(MIXED * batch) if len(self.states) else 0
 
     def drawn(self, count: int, generator: torch.Generator) -> Tensor:
         """At most `count` different kept states in random order, (k, n)."""

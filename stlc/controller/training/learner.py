@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.methods import Learner, Method, Validation
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
@@ -106,8 +107,10 @@ class Trainer(Learner):
         self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy, self.failing = 0.0, 0
         self.learnt = torch.empty(0, len(task.system.names), device=device)
+        self.safety: Task | None = None
         if config.falsify:
             self.failures = FailureBank(torch.empty(0, len(task.system.names), device=device))
+            self.safety = safety_task(task) if task.compiled.safety else None
 
     def advance(self) -> float:
         """Make one gradient step and return its loss.
@@ -350,9 +353,30 @@ class Trainer(Learner):
             value = (
                 value + config.share * loss(self.task, self.objective, x0[some], plans[some, other]).mean()
             )
+        if self.failures is not None and self.safety is not None:
+            value = value + self._unsafe(self.safety, x0[: config.batch], plans[: config.batch])
         if hard:
             value = value + self._imitation(plans[-hard:], targets, good[-hard:])
         return value
+
+    def _unsafe(self, safety: Task, x0: Tensor, plans: Tensor) -> Tensor:
+        """Safety loss of every proposed plan from the states of failing drives, ().
+
+        From many of these states no plan satisfies the whole specification, but one is safe. The robustness
+        of the whole specification does not say which: it is that of the requirement that cannot be satisfied.
+
+        Args:
+            safety: the task with the requirements tagged `@safety` only.
+            x0: fresh states of a step, the last of which are from failing drives, (B, n).
+            plans: proposed plans, (B, plans, T, m).
+        """
+        assert self.failures is not None
+        count = self.failures.count(len(x0))
+        if not count:
+            return plans.new_zeros(())
+        states = x0[-count:].repeat_interleave(plans.shape[1], 0)
+        objective = replace(self.objective, performance_weight=0.0)
+        return loss(safety, objective, states, plans[-count:].flatten(0, 1)).mean()
 
     @torch.no_grad()
     def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:

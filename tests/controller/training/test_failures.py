@@ -13,6 +13,7 @@ from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.failures import MIXED, MOMENTS, POINTS, FailureBank, SearchRound
 from stlc.controller.training.launch import Launch, open_folder
+from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
 from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import UsageError
@@ -100,6 +101,24 @@ def test_a_resumed_run_with_rounds_equals_an_uninterrupted_one(car_task: Task, t
     assert first.record()["falsification"] == {
         **{"rounds": 2, "drives": 80, "failing": 20, "last_share": 0.25, "states": 60}
     }
+
+
+def test_every_plan_from_kept_states_is_trained_to_be_safe(car_task: Task) -> None:
+    config = resolve_config(car_task, TrainConfig(method="gradient", batch=16, steps=9, falsify=True))
+    trainer = Trainer(car_task, config, steps=9, device=torch.device("cpu"))
+    assert trainer.safety is not None
+    assert [rule.name for rule in trainer.safety.rules] == ["no_collision", "give_way", "red_light"]
+    assert trainer.failures is not None
+    x0 = car_task.sample(200, generator=torch.Generator().manual_seed(0))
+    unsafe = trainer.safety.judge(x0, trainer.network(x0).detach()[:, 0]).rho.argsort(descending=True)
+    x0 = x0[unsafe[-16:]]
+    plans = trainer.network(x0).detach().requires_grad_()
+    assert float(trainer._unsafe(trainer.safety, x0, plans)) == 0.0
+    trainer.failures.states = x0[:3]
+    trainer._unsafe(trainer.safety, x0, plans).backward()
+    moved = plans.grad.abs().sum((1, 2, 3)) > 0.0
+    assert not moved[:14].any()
+    assert moved[14:].all()  # the last ones are kept states
 
 
 def test_without_the_option_a_checkpoint_holds_no_such_states(car_task: Task, tmp_path: Path) -> None:
