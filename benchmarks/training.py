@@ -76,8 +76,8 @@ class Cell:
         axis: hyperparameter that an ablation varies in this run; "" outside of ablations.
         value: value of that hyperparameter.
         overrides: name of a field in the system file -> new value.
-        options: options of the method, as on a command line. `reward` becomes `--reward`, and any other
-            becomes `--option`.
+        options: options of the method, as on a command line. `reward` becomes `--reward`, `falsify` becomes
+            `--falsify`, and any other becomes `--option`.
     """
 
     benchmark: str
@@ -324,11 +324,7 @@ def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
         arguments: tuple[str, ...] = ("--resume", str(run.path), "--no-pictures")
     else:
         overrides = [word for key, value in cell.overrides.items() for word in ("--set", f"{key}={value}")]
-        own = [
-            word
-            for key, value in cell.options.items()
-            for word in (("--reward", value) if key == "reward" else ("--option", f"{key}={value}"))
-        ]
+        own = [word for key, value in cell.options.items() for word in _option(key, value)]
         arguments = (
             str(spec_path(cell.benchmark)),
             *("--method", cell.method, "--seed", str(cell.seed), *cell.length.options),
@@ -339,6 +335,13 @@ def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
         return Job(cell.name, arguments)
     read = input_files(spec_path(cell.benchmark), overrides=cell.overrides)
     return Job(cell.name, arguments, read if run is None else (run.path,), runs)
+
+
+def _option(key: str, value: str) -> tuple[str, ...]:
+    """Words of the command line for an option of a cell."""
+    if key == "falsify":
+        return ("--falsify",)
+    return ("--reward", value) if key == "reward" else ("--option", f"{key}={value}")
 
 
 def collect(run: RunDir, *, cores: int | None = None) -> Result:

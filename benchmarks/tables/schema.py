@@ -19,7 +19,7 @@ from benchmarks.formulas import Timing
 from benchmarks.plannings import PlanRow
 from benchmarks.repairs import Mended
 from benchmarks.steps import Speed, StepTiming
-from benchmarks.tables import ablation, certificates, falsify, family, latency, paper, uncertain
+from benchmarks.tables import ablation, certificates, failures, falsify, family, latency, paper, uncertain
 from stlc.cli.framework.documents import DocumentRecord, Num, schema_of
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
@@ -53,6 +53,7 @@ ROWS: dict[str, dict[str, type]] = {
         **{"plans": PlanRow, "drives": DriveRow, "claims": Claim},
     },
     "ablation": {"rows": ablation.Row},
+    "failures": {"rows": failures.Row},
     "falsify": {"rows": falsify.Row},
     "family": {"rows": family.Row},
     "worlds": {"rows": DeploymentRow},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -13,8 +12,9 @@ from numpy.typing import NDArray
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
 from stlc.controller.deployment.simulator import simulate as run_worlds
+from stlc.controller.deployment.tape import BELOW
 from stlc.controller.evaluation.archive import trace_of
 from stlc.controller.evaluation.rules import Rules, rules_of, verdict_on_runs
 from stlc.controller.guard.candidates import Limits, Mode
@@ -26,18 +26,22 @@ if TYPE_CHECKING:
     from stlc.monitor.judgement import Verdict
     from stlc.trace import Trace
 
-MOST_COORDINATES = 2000
-"""Random numbers of a drive at most that are searched; later ones keep the values that the seed gives."""
+MOST_COORDINATES = 4000
+"""Random numbers of a drive at most that are searched; later ones are drawn."""
+SEEDS = 2**31
+"""Number of seeds from which the numbers without a coordinate may be drawn."""
 
 
 @dataclass(frozen=True)
 class DriveSimulator:
     """Simulator of drives: one world per point, whose random numbers are read from the point.
 
+    The last coordinate of a point chooses the seed of all numbers for which there are no further coordinates.
+
     Attributes:
         run: the trained policy, with its scenario.
         guard: kind of guard.
-        setting: agents, steps and replanning period; its only seed draws what the points do not give.
+        setting: agents, steps and replanning period, and a first seed.
         batch: number of worlds that are simulated side by side.
     """
 
@@ -67,7 +71,8 @@ class DriveSimulator:
         worlds = Worlds(self.run.task, world_type(self.run.task.system.decl), self._at(point[None]))
         worlds.reset()
         first = 0 if worlds.tape is None else worlds.tape.used[0]
-        return SearchSpace(min(max(2 * first, first + 4 * self.setting.steps, 1), MOST_COORDINATES))
+        dim = min(max(2 * first, first + 4 * self.setting.steps), MOST_COORDINATES) + 1
+        return SearchSpace(dim, sparse=True)
 
     @cached_property
     def requirements(self) -> tuple[str, ...]:
@@ -87,18 +92,27 @@ class DriveSimulator:
         margins = self.margins(self.drive(points))[:, focus.requirement]
         return Simulations.unscaled(margins, np.ones(len(points), dtype=bool))
 
-    def drive(self, points: NDArray[np.float64]) -> DeploymentRecording:
-        """Simulate `points`, (count, dim), side by side, and return the recorded drives."""
+    def drive(self, points: NDArray[np.float64], watch: Watch | None = None) -> DeploymentRecording:
+        """Simulate `points`, (count, dim), side by side, and return the recorded drives.
+
+        `watch` is called at every step.
+        """
         recorder = Recorder(self.setting.agents, pictured=False)
-        run_worlds(self._guard, world_type(self.run.task.system.decl), self._at(points), recorder)
+        world = world_type(self.run.task.system.decl)
+        run_worlds(self._guard, world, self._at(points), recorder, watch)
         recording = recorder.recording()
         assert recording is not None
         return recording
 
     def margins(self, recording: DeploymentRecording) -> NDArray[np.float64]:
         """Least robustness of the agents of each simulation, (count, requirements)."""
-        each = [judgement.high.min(0) for judgement in self._verdict(recording)]
-        return np.stack([rho.reshape(-1, self.setting.agents).min(1) for rho in each], 1)
+        least: NDArray[np.float64] = self.margins_of_agents(recording).min(1)
+        return least
+
+    def margins_of_agents(self, recording: DeploymentRecording) -> NDArray[np.float64]:
+        """Robustness of each agent of each simulation, (count, agents, requirements)."""
+        each = np.stack([judgement.high.min(0) for judgement in self._verdict(recording)], 1)
+        return each.reshape(-1, self.setting.agents, each.shape[1])
 
     def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
         """None: a drive has no gradient."""
@@ -120,5 +134,6 @@ class DriveSimulator:
         return verdict_on_runs(self._rules, self.run.task, recording)
 
     def _at(self, points: NDArray[np.float64]) -> Setting:
-        seeds: Sequence[int] = self.setting.seeds * len(points)
-        return replace(self.setting, seeds=tuple(seeds), draws=tuple(points))
+        (first,) = self.setting.seeds
+        seeds = (first + int(min(each, BELOW) * SEEDS) for each in points[:, -1])
+        return replace(self.setting, seeds=tuple(seeds), draws=tuple(points[:, :-1]))

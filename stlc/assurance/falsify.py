@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from stlc.assurance.guidance import SAMPLES, scales_of
 from stlc.assurance.search_space import Point, SearchSpace
+from stlc.assurance.sensitive import SensitiveClimbing
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus, Simulations, Simulator
 from stlc.assurance.strategies import (
@@ -52,6 +53,8 @@ REJECTED = 1000
 """Successive points without an admissible initial state after which a search ends."""
 DIGITS = (0, 1, 2, 3)
 """Decimal digits, in the unit cube, to which values of a counterexample are rounded, the fewest first."""
+SPLIT = (1, 2, 4, 8, 16)
+"""Numbers of parts of a space, most of whose coordinates have no effect, that are shrunk as wholes."""
 MOST_SHRUNK = 60
 """Coordinates at most that are shrunk one by one."""
 
@@ -130,7 +133,8 @@ class Portfolio:
 
     After that every other turn goes to the strategy that has found the least robust point. If the robustness
     takes few values, as that of conditions on gears does, nothing can be learnt from it: then points are
-    drawn at random.
+    drawn at random. In a space most of whose coordinates have no effect, `SensitiveClimbing` is the only
+    strategy, and points are uniform while the robustness hardly ever changes.
     """
 
     def __init__(
@@ -156,8 +160,10 @@ class Portfolio:
         self._first: list[Strategy] = []
         self._samplers: list[Strategy] = []
         self._turns: list[Strategy] = []
-        self._random, self._graded = random, graded
-        if not random and graded and space.dim:
+        self._random, self._graded, self._sparse = random, graded, space.sparse
+        if not random and space.sparse:
+            self._turns = [SensitiveClimbing(space, generator)]
+        elif not random and graded and space.dim:
             vertices, uniform = VertexSampling(space, generator), self._uniform
             self._samplers = [vertices, uniform]
             if any(len(block.values) > PIECES for block in space.blocks):
@@ -200,6 +206,8 @@ class Portfolio:
         """The strategy whose turn it is, after the first points."""
         if not self._turns:
             return self._uniform if self._random or self._graded else self._discrete
+        if self._sparse:
+            return self._uniform if self.flat else self._turns[0]
         if self.flat:
             return self._discrete
         self._turn += 1
@@ -211,6 +219,11 @@ class Portfolio:
             return min(self._turns, key=lambda each: each.best)
         self._turns = [*self._turns[1:], self._turns[0]]
         return self._turns[0]
+
+    def observe(self, point: Point, value: float) -> None:
+        """Report the guidance value at a point that no strategy proposed."""
+        for each in self._turns:
+            each.observe(point, value)
 
     def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others."""
@@ -310,7 +323,16 @@ class Search:
                 told[index] = self._examined(points[index], margin, name)
 
     def _examined(self, point: Point, margin: float, name: str) -> float:
-        """Examine a violation at half the time step, and return the guidance there, which may be positive."""
+        """Examine a violation at half the time step, and return the guidance there, which may be positive.
+
+        A drive is simulated alone first, as a replay does: the rounding of a policy's plans depends on the
+        number of drives that are simulated side by side.
+        """
+        simulator = self._simulator
+        if simulator.space.sparse and simulator.batch > 1:
+            margin = float(simulator.simulate(point[None], self.focus).margins[0])
+            if margin >= -TOLERANCE:
+                return margin
         half = self._simulator.at_half_step(point[None], self.focus)
         at_half = None if half is None else float(half.margins[0])
         candidate = Counterexample(point, margin, at_half, name, self.tried)
@@ -463,7 +485,15 @@ Values: TypeAlias = Callable[[Point], Sequence[float]]
 
 
 def _changes(space: SearchSpace) -> Iterator[tuple[tuple[int, ...], Values]]:
-    """Yield coordinates to change together: whole inputs, equal neighbours, other numbers, rounded values."""
+    """Yield coordinates to change together: whole inputs, equal neighbours, other numbers, rounded values.
+
+    In a space most of whose coordinates have no effect, these are halves, quarters, and so on, of all.
+    """
+    for parts in SPLIT if space.sparse else ():
+        for part in np.array_split(np.arange(space.dim), parts):
+            yield tuple(part.tolist()), lambda _: (0.5,)
+    if space.sparse:
+        return
     for block in space.blocks:
         yield block.values, lambda _: (1.0, 0.0, 0.5)
         for left, right in pairwise(block.values):

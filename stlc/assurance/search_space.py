@@ -43,10 +43,12 @@ class SearchSpace:
     Attributes:
         dim: number of coordinates.
         blocks: input signals.
+        sparse: whether most coordinates have no effect on most simulations.
     """
 
     dim: int
     blocks: tuple[SignalBlock, ...] = ()
+    sparse: bool = False
 
     @property
     def rest(self) -> tuple[int, ...]:
@@ -85,7 +87,7 @@ class SearchSpace:
             )
             for block in blocks
         )
-        return PartOfSpace(SearchSpace(len(kept), moved), tuple(kept), self.dim)
+        return PartOfSpace(SearchSpace(len(kept), moved, self.sparse), tuple(kept), self.dim)
 
     def middle(self) -> Point:
         """Centre of the cube, (dim,); free switching times are evenly spread."""

@@ -176,9 +176,10 @@ def _sentence(advice: str) -> Html:
 def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     accuracy, feasible = result.get("accuracy"), result.get("feasible")
     part = accuracy / feasible if accuracy is not None and feasible else None
-    executed = result.get("closed_loop")
+    executed, rounds = result.get("closed_loop"), result.get("falsification")
     return [
         (share(executed.get("share")) if isinstance(executed, Mapping) else "", "of drives satisfied"),
+        (share(rounds.get("last_share")) if isinstance(rounds, Mapping) else "", "of the last search failed"),
         (share(accuracy), "plan accuracy"),
         (share(part), "of what is known feasible"),
         (seconds(result.get("seconds")), "of training and verdict"),

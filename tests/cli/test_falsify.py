@@ -78,7 +78,7 @@ def test_gusts_that_push_the_cart_out_are_found_and_replayed(capsys, tmp_path):
 def test_a_baseline_draws_as_declared(capsys, tmp_path):
     searched = found(capsys, "--require", "far", "-o", str(tmp_path))
     sampled = found(capsys, "--require", "far", "--random", "-o", str(tmp_path))
-    assert len(searched["requirements"][0]["strategies"]) > 2
+    assert "sensitive climbing" in searched["requirements"][0]["strategies"]
     assert sampled["requirements"][0]["strategies"] == {"uniform": 64}
     assert misfits(searched, load_schema("falsify")["properties"]["result"]) == []
 

@@ -107,12 +107,12 @@ def falsify(
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
     the random numbers of the world in which its policy drives. Inputs that are constant at the ends of their
     ranges come first, and inputs of few pieces. Then random points, hill climbing, CMA-ES (if the package
-    `cma` is installed), gradients and periodic inputs take turns. A violation counts only if it remains at
-    half the time step. It is written as a trace, simplified as far as it still violates the requirement, with
-    a file for --replay. If nothing is found, that is no proof. The same --seed and --batch give the same
-    simulations, whatever processes there are. Of a plant, simulations that fail are written, too. Exit code:
-    1 if a requirement is violated or a simulation fails; else 5 if simulations were lost with their
-    processes, three times each; else 0.
+    `cma` is installed), gradients and periodic inputs take turns; the numbers of a world are changed where
+    this has an effect. A violation counts only if it remains at half the time step. It is written as a
+    trace, simplified as far as it still violates the requirement, with a file for --replay. If nothing is
+    found, that is no proof. The same --seed and --batch give the same simulations, whatever processes there
+    are. Of a plant, simulations that fail are written, too. Exit code: 1 if a requirement is violated or a
+    simulation fails; else 5 if simulations were lost with their processes, three times each; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 
@@ -204,7 +204,8 @@ class _Target:
         run = Run.open(self.name, root=runs, overrides=overrides, scenario=self.scenario)
         test = run.task.system.decl.test
         size = self.agents or test.agents, self.steps or test.steps
-        return DriveSimulator(run, guard_named(self.guard), Setting((self.seed,), *size, test.replan))
+        setting = Setting((self.seed,), *size, test.replan, limit=None)  # a limit of time cannot be replayed
+        return DriveSimulator(run, guard_named(self.guard), setting)
 
     def _black_box(self, plant: Path, overrides: Mapping[str, str], jobs: int) -> PlantSimulator:
         from stlc.assurance.plant_simulator import PlantSimulator

@@ -124,6 +124,10 @@ def train(
         int | None,
         typer.Option(min=0, help="Closed-loop runs after the training, at most, per guard; 400, 0: none."),
     ] = None,
+    falsify: Annotated[
+        bool,
+        typer.Option("--falsify", help="Also train on the states of drives that falsification makes fail."),
+    ] = False,
     log: Annotated[
         str | None, typer.Option(metavar="tensorboard", help="Also write the curves for TensorBoard.")
     ] = None,
@@ -141,7 +145,7 @@ def train(
         **{"--system": system, "--seed": seed, "--seeds": seeds, "--method": method, "--name": name},
         **{"--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch, "--set": set_},
         **{"--held-out": held_out, "--drives": drives, "--cluster": cluster},
-        **{"--reward": reward, "--option": option},
+        **{"--reward": reward, "--option": option, "--falsify": falsify or None},
     }
     _check_together(specs, jobs, {**given, "--budget": budget, "--steps": steps})
     logger = _logger(log)
@@ -170,6 +174,7 @@ def train(
         drives=DRIVES if drives is None else drives,
         reward=reward,
         options=parse_pairs(option, "--option", "NAME=VALUE", "environments=256"),
+        falsify=falsify,
     )
     launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
     drawn = parse_seeds(seeds) if seeds is not None else (seed,)
@@ -277,6 +282,7 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | Non
 
     `launch` gives the place and the name of the run folder; `logger` opens an additional logger, if any.
     """
+    from stlc.assurance.drive_search import round_of
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.launch import open_folder
@@ -287,7 +293,7 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | Non
         made = str(open_folder(task, config, launch).path) if ranks.first else ""
         folder = RunDir(Path(ranks.agree_text(made)))
         with Session(folder, logger=logger, writes=ranks.first) as session:
-            session.outcome = train(task, config, folder, session.watch, ranks=ranks)
+            session.outcome = train(task, config, folder, session.watch, ranks=ranks, failures=round_of)
     return session
 
 
@@ -299,13 +305,20 @@ def _resume(
     `steps` is the total number of steps after which the training ends. `more` is the remaining training time
     in seconds. If both are None, the training ends where it was planned to end.
     """
+    from stlc.assurance.drive_search import round_of
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.loop import resume
 
     with joined(device) as ranks, Session(folder, logger=logger, writes=ranks.first) as session:
         session.outcome = resume(
-            folder, steps=steps, budget=more, device=device, watch=session.watch, ranks=ranks
+            folder,
+            steps=steps,
+            budget=more,
+            device=device,
+            watch=session.watch,
+            ranks=ranks,
+            failures=round_of,
         )
     return session
 

@@ -302,3 +302,40 @@ class Verified(TypedDict):
     refuted: Num
     open: Num
     modes: list[VerifiedMode]
+
+
+class GuardResult(TypedDict):
+    """Drives under one guard after a training; see `stlc.controller.evaluation.closed_loop.Share`."""
+
+    guard: Literal["none", "paper", "full"]
+    drives: int
+    satisfied: int
+    share: Num
+    interval: list[Num]
+    safe: Num | None
+    compared: int
+    gained: int
+    lost: int
+
+
+class ClosedLoopRecord(TypedDict):
+    """Closed-loop results of a training; see `stlc.controller.evaluation.closed_loop.ClosedLoop`."""
+
+    recommended: Literal["none", "paper", "full", None]
+    share: Num | None
+    interval: list[Num] | None
+    guards: list[GuardResult]
+    seed: int
+    steps: int
+    judge: str | None
+    why: str
+
+
+class FalsificationRounds(TypedDict):
+    """Rounds of `stlc train --falsify`; see `stlc.controller.training.failures.FailureBank`."""
+
+    rounds: int
+    drives: int
+    failing: int
+    last_share: float
+    states: int

@@ -23,13 +23,14 @@ from typing import (
 from stlc.cli.framework.assured import (
     Assurance,
     CertifyResult,
+    ClosedLoopRecord,
+    FalsificationRounds,
     FalsifyResult,
     UncertainSignal,
     Verified,
 )
 from stlc.cli.framework.plan_documents import Plans
 from stlc.cli.framework.plant_documents import PlantSimulation
-from stlc.registry import GuardName
 
 if TYPE_CHECKING:
     from stlc.view.learning import Learning
@@ -637,29 +638,6 @@ class SystemFacts(TypedDict):
     driven: NotRequired[DrivenSteps]
 
 
-class GuardResult(TypedDict):
-    guard: GuardName
-    drives: int
-    satisfied: int
-    share: Num
-    interval: list[Num]
-    safe: Num | None
-    compared: int
-    gained: int
-    lost: int
-
-
-class ClosedLoopRecord(TypedDict):
-    recommended: GuardName | None
-    share: Num | None
-    interval: list[Num] | None
-    guards: list[GuardResult]
-    seed: int
-    steps: int
-    judge: str | None
-    why: str
-
-
 class Training(TypedDict):
     accuracy: NotRequired[float]
     interval: NotRequired[list[float]]
@@ -669,6 +647,7 @@ class Training(TypedDict):
     searched: NotRequired[int]
     judged_seconds: NotRequired[float]
     closed_loop: NotRequired[ClosedLoopRecord]
+    falsification: NotRequired[FalsificationRounds]
     verdict: NotRequired[TrainingVerdict]
     steps: NotRequired[int | None]
     schedule: NotRequired[str | None]

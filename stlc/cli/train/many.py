@@ -109,7 +109,8 @@ class Many:
         changed = [word for key, value in launch.overrides.items() for word in ("--set", f"{key}={value}")]
         own = [word for key, value in config.options.items() for word in ("--option", f"{key}={value}")]
         drawn = () if self.pictures else ("--no-pictures",)
-        arguments = (operand(str(part.spec)), *given, *own, *changed, *drawn)
+        driven = ("--falsify",) if config.falsify else ()
+        arguments = (operand(str(part.spec)), *given, *own, *changed, *driven, *drawn)
         if self.cluster is None:
             return Job(self.name(part), arguments)
         from stlc.controller.parallel.bundle import input_files

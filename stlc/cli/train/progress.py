@@ -12,6 +12,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from stlc.cli.framework.assured import FalsificationRounds
 from stlc.cli.framework.documents import TrainedRun
 from stlc.cli.framework.output import console as open_console
 from stlc.view.learning import driven_lines
@@ -294,6 +295,8 @@ def final_screen(
     """
     low, high = result["interval"]
     rows = [("closed loop", line) for line in driven_lines(result)]
+    if rounds := result.get("falsification"):
+        rows.append(("falsification", rounds_text(rounds)))
     accuracy = f"{result['accuracy']:.3f}   95 % interval [{low:.3f}, {high:.3f}]"
     starts = f" on {result['held_out']:,} held-out starts" + (f"   {spark}" if spark else "")
     rows.append(("plan accuracy", accuracy + starts))
@@ -322,6 +325,13 @@ def final_screen(
         for above, (label, text) in zip(labels, rows, strict=False)
     ]
     return lines if verdict is None else [*lines, "", f"Next:  {verdict['next']}"]
+
+
+def rounds_text(found: FalsificationRounds) -> str:
+    """Text on the rounds of a training with `--falsify`."""
+    last = f"{percent(found['last_share'])} of the last round's failed"
+    rounds = f"{found['rounds']} round{'' if found['rounds'] == 1 else 's'}"
+    return f"{rounds}, {found['drives']:,} drives, {last}; {found['states']:,} states kept"
 
 
 def _emphasised(line: str) -> Text:

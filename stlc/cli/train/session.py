@@ -169,6 +169,9 @@ class Session:
             result["verdict"] = verdict_record(learning)
         record = folder.record()
         result |= {"steps": record.get("steps"), "schedule": record.get("schedule")}
+        rounds: Any = record.get("falsification")
+        if rounds is not None:
+            result["falsification"] = rounds
         reasons = () if outcome.why is None else (outcome.why,)
 
         def show() -> None:

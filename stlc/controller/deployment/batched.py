@@ -5,7 +5,7 @@ An error in a world's code is reported with its location in the world's file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -188,15 +188,26 @@ class Worlds:
         with self.drawing():
             acted = self.disturbance.acted(self.system.commanded(x, action).clone())
         acts = torch.split(self.system.planned(x, acted), self.parts)
-        alone = [truth.step(state, act) for truth, state, act in zip(self.truths, before, acts, strict=True)]
+        alone = self._alone(before, acts)
         for row, (world, state, act) in enumerate(zip(self.worlds, before, acts, strict=True)):
             with blamed(world, "advance", f"take step {step}"), self.drawing(row):
                 given.append(world.advance(state, act))
         reached = self._checked("advance", given, step)
-        self.eventless = ((reached - torch.cat(alone)).abs() <= SURPRISE).all(1)
+        self.eventless = ((reached - alone).abs() <= SURPRISE).all(1)
         with self.drawing():
             moved = self.disturbance.pushed(reached, known, step)
         return torch.cat((moved, self.system.added_later(x)), 1)
+
+    def _alone(self, before: Sequence[Tensor], acts: Sequence[Tensor]) -> Tensor:
+        """Next states by the true dynamics alone, without the worlds, (rows, n).
+
+        `before`, `acts`: states and actions of each seed. Seeds with the same dynamics are stepped at once.
+        """
+        first = self.truths[0]
+        if all(each is first for each in self.truths):
+            return first.step(torch.cat(tuple(before)), torch.cat(tuple(acts)))
+        each = zip(self.truths, before, acts, strict=True)
+        return torch.cat([truth.step(state, act) for truth, state, act in each])
 
     def options(self, x: Tensor) -> Tensor | None:
         """Return the states that the agents would have under each option.

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import PlanVerdicts, Task
     from stlc.controller.training.config import TrainConfig
+    from stlc.controller.training.failures import FailureBank
     from stlc.diagnostics import StlcError
     from stlc.native import Stop
     from stlc.rundir import RunDir
@@ -45,8 +46,10 @@ class Method(ABC):
             `ResolvedConfig`, whose added fields are int, float or str and have defaults.
         learns: class of the learner; None if the method plans without training, or if the subclass defines
             the function `learner` itself.
+        falsifies: whether the method can train on states of failing closed-loop drives (`--falsify`).
     """
 
+    falsifies: ClassVar[bool] = False
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
     learns: ClassVar[type[Learner] | None] = None
 
@@ -158,7 +161,11 @@ class Learner(ABC):
         searching: whether such a search is running now.
         solved: whether any search has found a satisfying plan.
         exhausted: whether exploration has found no plan, even with its largest effort.
+        failures: states of failing closed-loop drives, which are mixed into the training; None without
+            `--falsify`.
     """
+
+    failures: FailureBank | None = None
 
     searches: bool = False
     searching: bool = False

@@ -247,6 +247,10 @@ class Pace:
         self._apart += seconds
         self._since_validation += seconds
 
+    def searched_drives(self, seconds: float) -> None:
+        """Record that a round of falsification took `seconds`."""
+        self._apart += seconds
+
     def validated(self, step: int, seconds: float) -> None:
         """Record that a search round at `step` took `seconds`, and that its search, if any, runs now."""
         self.saved(seconds)

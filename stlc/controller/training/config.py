@@ -72,6 +72,7 @@ class TrainConfig:
         reward: name of the reward, for a method that learns from rewards; None leaves the choice to the
             method.
         options: options that only this method has, name -> text.
+        falsify: whether states of failing closed-loop drives are mixed into the training.
     """
 
     method: str | None = None
@@ -89,6 +90,7 @@ class TrainConfig:
     planner: PlannerChoice | None = None
     reward: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
+    falsify: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +132,8 @@ class ResolvedConfig:
         ranks: number of processes that train together, each with its own batch.
         drives: maximum number of closed-loop simulations after the training, for each kind of guard (a guard
             checks plans at run time).
+        falsify: whether states of failing closed-loop drives are mixed into the training; see
+            `stlc.controller.training.failures`.
     """
 
     method: str
@@ -157,6 +161,7 @@ class ResolvedConfig:
     clock: Clock = "wall"
     ranks: int = 1
     drives: int = DRIVES
+    falsify: bool = False
 
 
 _MOST = {
@@ -226,8 +231,12 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
         UsageError: U101, there is no such method or option, or a value is invalid.
     """
     name = config.method or task.system.decl.train.method or METHODS.default
-    found: ResolvedConfig = METHODS.get(name).resolve(task, config)
-    return _with_own(replace(found, method=name), config)
+    method = METHODS.get(name)
+    found: ResolvedConfig = method.resolve(task, config)
+    if config.falsify and not method.falsifies:
+        able = ", ".join(each for each in METHODS if METHODS.get(each).falsifies)
+        raise usage(f"method `{name}` cannot train with `--falsify`", f"methods that can: {able}")
+    return _with_own(replace(found, method=name, falsify=config.falsify), config)
 
 
 def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:

@@ -104,6 +104,8 @@ class FinalEvaluation:
         if why is not None:
             found |= {"why": why.message, "proved": refuted(self.task)}
         found |= {} if simulated is None else {"closed_loop": simulated.summary()}
+        if self.config.falsify and (rounds := self.writer.folder.record().get("falsification")):
+            found["falsification"] = rounds
         self.writer.close("finished", {**result.summary(), **found})
         seconds, ranks = self.time.spent, self.config.ranks
         return TrainingOutcome(run, result, seconds, False, ranks, why=why, steps=steps, simulated=simulated)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.methods import Learner, Method, Validation
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
@@ -26,6 +27,7 @@ from stlc.controller.problem.task import rank, satisfied
 from stlc.controller.training.checkpoint import below
 from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.exploration import EFFORTS, Exploration
+from stlc.controller.training.failures import FailureBank
 from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
 from stlc.controller.training.objective import loss
 from stlc.controller.training.run import load_weights
@@ -64,6 +66,8 @@ NEAREST = 0.75
 """Share of the states of a search round that are chosen because their plans fail by the least amount."""
 COUNTS = ("accuracy", "solved", "barren", "effort", "failing")
 """Facts of which every rank (process) has its own, in the order in which a checkpoint stores them."""
+DRIVEN = 8
+"""States of failing drives in a search round: one for so many fresh ones, beside them."""
 EXPLORED = 4
 """Number of initial states that are explored before a search round."""
 RISE = 30
@@ -103,6 +107,10 @@ class Trainer(Learner):
         self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy, self.failing = 0.0, 0
         self.learnt = torch.empty(0, len(task.system.names), device=device)
+        self.safety: Task | None = None
+        if config.falsify:
+            self.failures = FailureBank(torch.empty(0, len(task.system.names), device=device))
+            self.safety = safety_task(task) if task.compiled.safety else None
 
     def advance(self) -> float:
         """Make one gradient step and return its loss.
@@ -221,7 +229,8 @@ class Trainer(Learner):
         failing, repaired, before = self._take_repaired()
         feasible = None if before is None else max(before, accuracy)
         bad = self._to_repair(judged.rho, ~good)
-        self.repairing = self._begin(x0[bad], plans[bad])
+        x0, plans = self._with_failures(x0[bad], plans[bad])
+        self.repairing = self._begin(x0, plans)
         self.failing = int((~good).sum())
         self.accuracy = accuracy
         self.barren = repaired < BARREN * failing and accuracy < LEARNT and not self.exhausted
@@ -249,6 +258,21 @@ class Trainer(Learner):
         first = rows[rho[rows].argsort(descending=True, stable=True)[:near]]
         chosen[first] = True
         return torch.cat((first, rows[~chosen[rows]]))[:most]
+
+    def _with_failures(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
+        """Append states of failing drives from which the policy still fails, and its plans from there.
+
+        Args:
+            x0: states of a search round, (k, n).
+            plans: the policy's plans, (k, T, m).
+        """
+        if self.failures is None or not len(self.failures.states):
+            return x0, plans
+        kept = self.failures.drawn(self.config.pool // DRIVEN, self.generator)
+        tried, judged = BestOfKPolicy(self.task, self.network).plan_judged(kept)
+        rows = (~satisfied(judged.rho)).nonzero()[:, 0][: max(self._effort[0] // DRIVEN, 1)]
+        self.failures.repairing = len(rows)
+        return torch.cat((x0, kept[rows])), torch.cat((plans, tried[rows].to(plans)))
 
     def _nearest(self, failing: int) -> int:
         """Number of states that a search round chooses by their robustness, out of `failing` states."""
@@ -289,6 +313,9 @@ class Trainer(Learner):
         solved = found.solved
         self.buffer.add(found.states[solved], found.plans[solved])
         self.supply.follow(found.states[solved], found.plans[solved])
+        if self.failures is not None:  # the estimate is that of the fresh states
+            solved = solved[: len(solved) - self.failures.repairing]
+            self.failures.repairing = 0
         near = min(self._nearest(self.failing), len(solved))
         nearest, others = solved[:near], solved[near:]
         of_others = float(others.double().mean()) if len(others) else 0.0
@@ -300,6 +327,8 @@ class Trainer(Learner):
     def _loss(self) -> Tensor:
         config = self.config
         fresh = self.training.take(config.batch)
+        if self.failures is not None:
+            fresh = self.failures.mixed(fresh, self.generator)
         hard = config.hard if len(self.buffer) else 0
         x0, targets = fresh, fresh.new_zeros(0)
         if hard:
@@ -317,9 +346,30 @@ class Trainer(Learner):
             value = (
                 value + config.share * loss(self.task, self.objective, x0[some], plans[some, other]).mean()
             )
+        if self.failures is not None and self.safety is not None:
+            value = value + self._unsafe(self.safety, x0[: config.batch], plans[: config.batch])
         if hard:
             value = value + self._imitation(plans[-hard:], targets, good[-hard:])
         return value
+
+    def _unsafe(self, safety: Task, x0: Tensor, plans: Tensor) -> Tensor:
+        """Safety loss of every proposed plan from the states of failing drives, ().
+
+        From many of these states no plan satisfies the whole specification, but one is safe. The robustness
+        of the whole specification does not say which: it is that of the requirement that cannot be satisfied.
+
+        Args:
+            safety: the task with the requirements tagged `@safety` only.
+            x0: fresh states of a step, the last of which are from failing drives, (B, n).
+            plans: proposed plans, (B, plans, T, m).
+        """
+        assert self.failures is not None
+        count = self.failures.count(len(x0))
+        if not count:
+            return plans.new_zeros(())
+        states = x0[-count:].repeat_interleave(plans.shape[1], 0)
+        objective = replace(self.objective, performance_weight=0.0)
+        return loss(safety, objective, states, plans[-count:].flatten(0, 1)).mean()
 
     @torch.no_grad()
     def _winner(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
@@ -419,6 +469,8 @@ class Trainer(Learner):
             found.update({f"searching.{name}": value for name, value in pending.items()})
             found["searching.seed"] = torch.tensor(self.repairing.seed)
         found["buffer.states"], found["buffer.plans"] = self.buffer.states[:count], self.buffer.plans[:count]
+        if self.failures is not None:
+            found.update({f"failures.{name}": value for name, value in self.failures.tensors().items()})
         return found
 
     def facts(self) -> dict[str, float | int]:
@@ -451,6 +503,8 @@ class Trainer(Learner):
         self.buffer.plans[:count] = tensors["buffer.plans"]
         self.buffer.count = int(facts["solved"])
         self.supply.restore(below(tensors, "supply"))
+        if self.failures is not None:
+            self.failures.restore(below(tensors, "failures"))
         if isinstance(self.training, FixedSet):
             self.training.restore(below(tensors, "training"))
         if known := below(tensors, "repairing"):
@@ -488,6 +542,7 @@ class NetworkMethod(Method):
     """
 
     learns = Trainer
+    falsifies = True
     searches = False
     mirrored = False
 

@@ -22,7 +22,7 @@ from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve
 from stlc.controller.training.diagnose import check_mirror, refuted
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.run import Run, RunWriter, load_config, spec_hash, system_hash, task_of_run
-from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError
+from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError, usage
 from stlc.native import never
 from stlc.registry import METHODS
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.methods import Learner, Method, Validation
     from stlc.controller.problem.task import Task
+    from stlc.controller.training.failures import FailureSearch
     from stlc.rundir import RunDir
 
 DEFAULT_BUDGET = 60.0
@@ -97,6 +98,7 @@ def train(
     watch: Watch | None = None,
     *,
     ranks: Ranks = ALONE,
+    failures: FailureSearch | None = None,
 ) -> TrainingOutcome:
     """Train a policy in a new run folder that already holds its specification and system.
 
@@ -107,9 +109,11 @@ def train(
         watch: functions that are called during the run; see `Watch`.
         ranks: processes that train together. All of them call this function at the same time; only the first
             writes files.
+        failures: search for failing drives; needed if `config.falsify` is True.
 
     Raises:
-        UsageError: U101, the system has no control.
+        UsageError: U101, the system has no control, or `config.falsify` is True and the method, the number of
+            ranks or the arguments do not allow it.
         SystemFileError: S301, hardly any initial state is admissible; S302, predicted states are not finite;
             S304, the declared mirror is not a symmetry of the system or the specification.
         MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, the process
@@ -122,6 +126,7 @@ def train(
     started = now()
     keep_freed_memory()
     resolved = replace(resolve_config(task, config), ranks=ranks.size)
+    _require_search(resolved, failures)
     watch = watch or Watch()
     declared = task.system.decl.train
     fixed = config.steps or (declared.steps if config.budget is None else None)
@@ -140,7 +145,7 @@ def train(
     if learner is None:
         return _without_steps(method, task, resolved, writer, allowed, watch)
     writer.note({"margin": learner.margin})
-    return _Session(writer, learner, watch, allowed, schedule).finish()
+    return _Session(writer, learner, watch, allowed, schedule, failures).finish()
 
 
 def resume(
@@ -151,6 +156,7 @@ def resume(
     device: str = "cpu",
     watch: Watch | None = None,
     ranks: Ranks = ALONE,
+    failures: FailureSearch | None = None,
 ) -> TrainingOutcome:
     """Resume an interrupted run; its weights become the same as without the interruption, bit for bit.
 
@@ -162,6 +168,7 @@ def resume(
         device: torch device.
         watch: functions that are called during the run; see `Watch`.
         ranks: processes that train together; their number must be the same as before.
+        failures: search for failing drives; needed if the run trains with `--falsify`.
 
     Raises:
         RunError: R101, the run is damaged or was never saved; R102, its checkpoint belongs to another
@@ -171,6 +178,7 @@ def resume(
     keep_freed_memory()
     config = load_config(folder)
     _require_as_many(config.ranks, ranks.size)
+    _require_search(config, failures)
     now = clock_of(config.clock)
     started = now()
     task = task_of_run(folder)
@@ -214,7 +222,7 @@ def resume(
     writer.before(learner.next_validation)
     writer.note({"status": "running", "seconds_allowed": allowed or None})
     time_ = TimeBudget.of(now, started - before, allowed, late)
-    return _Session(writer, learner, watch, time_, schedule).finish()
+    return _Session(writer, learner, watch, time_, schedule, failures).finish()
 
 
 def _without_steps(
@@ -246,6 +254,14 @@ def _require_as_many(before: int, now: int) -> None:
         )
 
 
+def _require_search(config: ResolvedConfig, failures: FailureSearch | None) -> None:
+    """Raise UsageError (U101) if a training with `--falsify` has no search for drives, or several ranks."""
+    if config.falsify and config.ranks > 1:
+        raise usage("`--falsify` is for a training in one process", "stlc train SPEC --falsify")
+    if config.falsify and failures is None:
+        raise usage("`falsify` needs a search", "train(..., failures=stlc.assurance.drive_search.round_of)")
+
+
 def find_device(name: str) -> torch.device:
     """Return the torch device `name`; `auto` is the GPU if there is one, else the CPU.
 
@@ -270,9 +286,19 @@ class _Session:
     """Training from the learner's present state to the last step or an interruption; then the evaluation."""
 
     def __init__(
-        self, writer: RunWriter, learner: Learner, watch: Watch, time: TimeBudget, schedule: StepSchedule
+        self,
+        writer: RunWriter,
+        learner: Learner,
+        watch: Watch,
+        time: TimeBudget,
+        schedule: StepSchedule,
+        failures: FailureSearch | None = None,
     ) -> None:
-        """Prepare to make the steps of `schedule`; with a budget, their number is adapted to the pace."""
+        """Prepare to make the steps of `schedule`; with a budget, their number is adapted to the pace.
+
+        `failures`: search for failing drives, of a training with `--falsify`.
+        """
+        self.failures = failures
         self.writer = writer
         self.learner = learner
         self.watch = watch
@@ -344,6 +370,8 @@ class _Session:
         if ends and self._planned() <= learner.step:
             return False
         if learner.step >= learner.next_validation:
+            if not self._searched_drives():
+                return None
             began = self.now()
             if learner.ranks.any(not learner.explore(self.watch.stop)):
                 return None
@@ -388,6 +416,20 @@ class _Session:
         self.exhausted = not learner.ranks.any(not learner.exhausted)
         if self.barren and self.refuted is None and learner.searches:
             self.refuted = learner.ranks.any(refuted(learner.task))
+
+    def _searched_drives(self) -> bool:
+        """Make a round of falsification if one is due; return False if the user ends the training."""
+        learner, bank = self.learner, self.learner.failures
+        if bank is None or self.failures is None or not bank.due(learner.step, learner.steps):
+            return True
+        began, config = self.now(), learner.config
+        run = Run(self.writer.folder, learner.task, learner.policy)
+        states = config.batch + config.hard
+        if not bank.search(self.failures, run, learner.step, states, learner.generator, self.watch.stop):
+            return False
+        self.pace.searched_drives(self.now() - began)
+        self.writer.note({"falsification": bank.summary()})
+        return True
 
     def _wait_for_search(self) -> bool:
         """Wait for the concurrent search; return False if the user ends the training during the wait."""

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from threading import Thread
+
+import numpy as np
 import torch
 
-from stlc.controller.deployment.tape import MOST_NUMBERS, Tape
+from stlc.controller.deployment.tape import MOST_NUMBERS, Tape, TapedGenerator
 
 
 def test_given_numbers_replace_drawn_ones_and_the_rest_is_as_seeded():
@@ -58,4 +61,40 @@ def test_outside_of_the_context_nothing_is_replaced():
     generator, tape = torch.Generator().manual_seed(0), Tape(torch.full((1, 4), 0.5, dtype=torch.float64))
     tape.own([generator])
     torch.rand(4, generator=generator)
+    assert tape.used == [0]
+
+
+def test_numpy_generators_that_a_world_seeds_read_the_point_too():
+    points = torch.tensor([[0.25, 0.5, 0.999, 0.0, 0.9, 0.1, 0.5, 0.5, 0.75, 0.3]], dtype=torch.float64)
+    tape, usual = Tape(points), np.random.default_rng
+    with tape.drawing(0):
+        rng = np.random.default_rng(7)
+    assert np.random.default_rng is usual
+    assert isinstance(rng, TapedGenerator)
+    assert rng.random() == 0.25
+    assert rng.uniform(2.0, 4.0) == 3.0
+    assert rng.integers(10) == 9
+    assert rng.permutation(3).tolist() == [0, 2, 1]
+    assert rng.standard_normal() == 0.0
+    assert rng.choice(["a", "b"], p=[0.5, 0.5]) == "b"
+    assert rng.choice([3, 5, 7, 9]) == 9
+    assert rng.uniform(0, 10, 3)[0] == 3.0
+    assert tape.used == [12]
+    one, two = (TapedGenerator(usual(3).bit_generator) for _ in range(2))
+    assert one.random(4).tolist() == two.random(4).tolist()  # without a point, drawn as seeded
+    assert sorted(one.choice(5, 3, replace=False).tolist()) == sorted(set(two.choice(5, 3, False).tolist()))
+
+
+def test_other_threads_draw_as_usual():
+    tape, found = Tape(torch.full((1, 8), 0.5, dtype=torch.float64)), []
+
+    def other() -> None:
+        found.append(torch.rand(1, generator=torch.Generator().manual_seed(0)).item())
+        found.append(isinstance(np.random.default_rng(0), TapedGenerator))
+
+    with tape.drawing(0):
+        thread = Thread(target=other)
+        thread.start()
+        thread.join()
+    assert found == [torch.rand(1, generator=torch.Generator().manual_seed(0)).item(), False]
     assert tape.used == [0]

@@ -1,0 +1,277 @@
+"""Failing drives of trained policies: random search beside falsification, and `train --falsify`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import process_time
+from typing import Annotated, Any
+
+import typer
+
+from benchmarks.deployments import NOMINAL, key_of
+from benchmarks.measured import measured
+from benchmarks.options import OnlyOption, Output, Training, chosen
+from benchmarks.store import Key, Result, ResultStore
+from benchmarks.table import Columns, Table, listed, provenance, publish
+from benchmarks.timing import one_thread
+from benchmarks.training import Cell, Length, Place, filled
+from stlc.assurance.drive_search import DRIVE_SEARCH_VERSION, search_drives
+from stlc.assurance.drive_simulator import DriveSimulator
+from stlc.cli.framework.program import command
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.guard.candidates import Mode
+from stlc.controller.training.failures import FAILURES_VERSION
+from stlc.controller.training.run import Run
+from stlc.rundir import RunDir
+
+ORDER = ("traffic", "ship_safe", "manipulation", "navigation", "reach_n_avoid", "ship_track")
+"""Benchmarks in the order in which they are measured."""
+COUPLED = ("traffic",)
+"""Benchmarks whose agents influence each other: their searches keep all agents of a world."""
+GUARDS: tuple[Mode, ...] = ("none", "paper")
+BATCH = 16
+SEARCHED, FRESH = 0, 4_000_000
+"""Seeds of the searches, and of the fresh drives, on which nothing is tuned."""
+FALSIFYING = {"falsify": f"falsify{FAILURES_VERSION}"}
+AFTER = f"guided:falsify{FAILURES_VERSION}"
+"""Name of the second training in results."""
+_TRAINING, _OUTPUT = Training(clock="processor", seeds="0"), Output(Path("docs/falsification.md"))
+TEXT = """\
+Written by `python -m benchmarks failures` from `benchmarks/results/failures.json`. `random` and `falsify`:
+least robustness over all requirements, and failing drives, of the same number of simulations of the policy
+that was trained without falsification. A simulation is a drive of one agent, in traffic a world of 20 cars.
+`fresh`: share of failing drives among fresh ones, with all agents of a world, for that policy and for one
+that was trained with `--falsify` in the same time; intervals of 95 % (Wilson) take drives as independent.
+Benchmarks and entries that are missing were not measured yet.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Drives:
+    """Simulations of one policy in its world, chosen by a search or drawn.
+
+    Attributes:
+        folder: folder of the run.
+        benchmark: name of the specification.
+        guard: kind of guard.
+        random: whether the simulations are drawn rather than searched.
+        simulations: number of simulations.
+        agents: agents of each simulation.
+        steps: steps of each drive at most; None: as the system file says.
+        seed: seed of the search.
+        trained: `guided`, or `AFTER`.
+    """
+
+    folder: RunDir
+    benchmark: str
+    guard: Mode
+    random: bool
+    simulations: int
+    agents: int
+    steps: int | None
+    seed: int
+    trained: str
+
+    @property
+    def name(self) -> str:
+        """Name under which the result is stored, such as `traffic-none-falsify-100`."""
+        what = "fresh" if self.seed == FRESH else "random" if self.random else "falsify"
+        own = self.trained.replace(":", "-")
+        return "-".join([self.benchmark, own, self.guard, what, str(self.simulations)])
+
+    @property
+    def setting(self) -> Setting:
+        """Agents, steps and replanning period."""
+        test = Run.open(self.folder.path).task.system.decl.test
+        return Setting((0,), self.agents, min(self.steps or test.steps, test.steps), test.replan)
+
+    @property
+    def key(self) -> Key:
+        """Key under which the result is stored."""
+        run = Run.open(self.folder.path)
+        values = dict(key_of(run, NOMINAL, self.guard, replace(self.setting, seeds=())).values)
+        own = {"benchmark": self.benchmark, "trained": self.trained, "random": self.random, "seed": self.seed}
+        version = None if self.random else DRIVE_SEARCH_VERSION
+        sizes = {"simulations": self.simulations, "search_version": version}
+        return Key(self.name, {**values, **own, **sizes})
+
+    def measure(self) -> Result:
+        """Simulate, and return counts, the least robustness, and the processor time in seconds."""
+        simulator = DriveSimulator(Run.open(self.folder.path), self.guard, self.setting, BATCH)
+        began = process_time()
+        found = search_drives(simulator, self.simulations, seed=self.seed, random=self.random)
+        least = found.margins.min((0, 1))
+        return {
+            "drives": found.failing.size,
+            "failing": int(found.failing.sum()),
+            "least": found.least,
+            "requirements": dict(zip(simulator.requirements, least.tolist(), strict=True)),
+            "seconds": process_time() - began,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Failing drives of a benchmark under one guard.
+
+    Attributes:
+        benchmark: name of the specification.
+        guard: kind of guard.
+        simulations: number of simulations of each search.
+        agents: agents of each of them.
+        steps: steps of each drive.
+        least_random: least robustness of the drawn simulations.
+        least_falsify: least robustness of the searched ones.
+        failing_random: failing drives among the drawn simulations.
+        failing_falsify: failing drives among the searched ones.
+        searched: number of drives of each search.
+        fresh: number of fresh drives.
+        before: failing ones among them without falsification in the training.
+        after: failing ones with it; None: not trained yet.
+    """
+
+    benchmark: str
+    guard: str
+    simulations: int
+    agents: int
+    steps: int
+    least_random: float
+    least_falsify: float
+    failing_random: int
+    failing_falsify: int
+    searched: int
+    fresh: int
+    before: int
+    after: int | None
+
+
+def _share(failing: int | None, drives: int) -> str:
+    from stlc.controller.evaluation.held_out import wilson
+
+    if failing is None:
+        return ""
+    low, high = wilson(failing / drives, drives)
+    return f"{100 * failing / drives:.2f} % [{100 * low:.2f}, {100 * high:.2f}]"
+
+
+COLUMNS: Columns[Row] = {
+    "benchmark": "{benchmark}",
+    "guard": "{guard}",
+    "simulations x agents x steps": "{simulations} x {agents} x {steps}",
+    "least: random": "{least_random:.4g}",
+    "least: falsify": "{least_falsify:.4g}",
+    "failing: random": "{failing_random} of {searched}",
+    "failing: falsify": "{failing_falsify} of {searched}",
+    "fresh drives": "{fresh}",
+    "fresh: without": lambda row: _share(row.before, row.fresh),
+    "fresh: `--falsify`": lambda row: _share(row.after, row.fresh),
+}
+
+
+@command(
+    "python -m benchmarks failures",
+    "python -m benchmarks failures --only traffic --simulations 200 --fresh 2000",
+)
+def failures(
+    only: OnlyOption = None,
+    simulations: Annotated[
+        int, typer.Option("--simulations", metavar="N", min=1, help="Of each search.")
+    ] = 2000,
+    fresh: Annotated[int, typer.Option("--fresh", metavar="N", min=1, help="Fresh drives, about.")] = 20_000,
+    drive_steps: Annotated[
+        int | None, typer.Option("--drive-steps", metavar="N", min=1, help="Of each drive, at most.")
+    ] = None,
+    retrain: Annotated[
+        bool, typer.Option("--retrain/--no-retrain", help="Also train with --falsify, and drive.")
+    ] = True,
+    training: Training = _TRAINING,
+    output: Output = _OUTPUT,
+) -> None:
+    """Search for failing drives of the benchmarks' policies, at random and by falsification.
+
+    The policies are trained for 60 s of processor time, without and with `--falsify`. Trainings and drives
+    are stored when they end, and not repeated while specification, system and method are the same.
+    """
+    store, place = ResultStore("failures", training.out), training.place("failure_trainings")
+    ((seed, length), *_) = training.seeds_and_lengths((60.0,))
+    failed: list[dict[str, str]] = []
+    new = 0
+    with one_thread():
+        for benchmark in sorted(chosen(only, ORDER, "benchmark"), key=ORDER.index):
+            cells = _cells(benchmark, seed, length, retrain=retrain, held_out=training.held_out)
+            done = filled(cells, place)
+            drives = _drives(cells, place, simulations, fresh, drive_steps)
+            found = measured(drives, store, lambda each: each.measure(), doing="driving", told=_told)
+            failed += [*done.failed, *found.failed]
+            new += found.new
+
+    def section() -> list[str]:
+        return [TEXT, *table().markdown(), "", *provenance(store.all().values(), "searches")]
+
+    def table() -> Table[Any, Row]:
+        return listed("failures", rows_of([*store.all().values()]), COLUMNS)
+
+    publish("failures", output, section, {"rows": table()}, driven=new, failed=failed)
+
+
+def _cells(benchmark: str, seed: int, length: Length, *, retrain: bool, held_out: int) -> list[Cell]:
+    """The trainings of a benchmark: without falsification, then with it."""
+    before = Cell(benchmark, "guided", seed, length, held_out)
+    return [before, replace(before, options=FALSIFYING)] if retrain else [before]
+
+
+def _drives(
+    cells: Sequence[Cell], place: Place, simulations: int, fresh: int, steps: int | None
+) -> Iterator[Drives]:
+    """The simulations of a benchmark whose trainings are finished."""
+    for guard in GUARDS:
+        for cell in cells:
+            folder = place.newest_run(cell.key)
+            if folder is None or folder.status != "finished":
+                continue
+            agents = Run.open(folder.path).task.system.decl.test.agents
+            own = Drives(
+                *(folder, cell.benchmark, guard, True, -(-fresh // agents), agents, steps, FRESH),
+                trained=cell.contender,
+            )
+            if not cell.options:
+                alone = agents if cell.benchmark in COUPLED else 1
+                search = replace(own, simulations=simulations, agents=alone, seed=SEARCHED)
+                yield from (search, replace(search, random=False))
+            yield own
+
+
+def _told(result: Result) -> str:
+    return f"{result['failing']} of {result['drives']} drives fail, {result['seconds']:.0f} s"
+
+
+def rows_of(results: Sequence[Result]) -> list[Row]:
+    """Rows of the stored results, in the order of the benchmarks; incomplete ones are left out."""
+    kept = {_place_of(each): each for each in results}
+    rows = []
+    for benchmark in ORDER:
+        for guard in GUARDS:
+            first = [(benchmark, guard, "guided", what) for what in ("random", "falsify", "fresh")]
+            if not all(each in kept for each in first):
+                continue
+            random, searched, before = (kept[each] for each in first)
+            after = kept.get((benchmark, guard, AFTER, "fresh"))
+            key = searched["key"]
+            rows.append(
+                Row(
+                    *(benchmark, guard, key["simulations"], key["agents"], key["steps"]),
+                    *(random["least"], searched["least"], random["failing"], searched["failing"]),
+                    *(searched["drives"], before["drives"], before["failing"]),
+                    after=None if after is None else after["failing"],
+                )
+            )
+    return rows
+
+
+def _place_of(result: Result) -> tuple[str, str, str, str]:
+    """Benchmark, guard, training and kind of a stored result."""
+    key = result["key"]
+    what = "fresh" if key["seed"] == FRESH else "random" if key["random"] else "falsify"
+    return key["benchmark"], key["guard"], key["trained"], what

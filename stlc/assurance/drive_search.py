@@ -1,0 +1,196 @@
+"""Search for failing drives of a policy, over all requirements at once and for a fixed number of simulations.
+
+Unlike `falsify`, the search does not end at the first violation: it counts failures, and hands the states of
+failing drives to the training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stlc.assurance.drive_simulator import DriveSimulator
+from stlc.assurance.falsify import Portfolio
+from stlc.assurance.search_space import Point
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, SimulationStep, Watch
+from stlc.controller.training.failures import SearchRound
+from stlc.controller.training.run import Run
+from stlc.native import Stop
+
+DRIVE_SEARCH_VERSION = 1
+"""Version of the search; results of older versions are recomputed."""
+ROUND = 16
+"""Simulations side by side in a round of a training."""
+EARLIER = 3
+"""Decisions before the first wrong one whose states are kept too."""
+WRONG = 8
+"""Wrong decisions of a failing drive whose states are kept, the earliest first; a quarter of other drives."""
+Seen = Callable[[DeploymentRecording, NDArray[np.float64]], None]
+"""Function that receives the recorded drives of a batch, and their margins, (count, agents, requirements)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchedDrives:
+    """Simulations of a search, in the order in which they were made.
+
+    Attributes:
+        points: points of the unit cube, (count, dim).
+        margins: robustness of each agent, (count, agents, requirements).
+        values: least scaled robustness over agents and requirements, (count,).
+    """
+
+    points: NDArray[np.float64]
+    margins: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    @property
+    def failing(self) -> NDArray[np.bool_]:
+        """Whether each drive violates a requirement, (count, agents)."""
+        return np.asarray((self.margins < -TOLERANCE).any(2))
+
+    @property
+    def least(self) -> float:
+        """Least robustness of all drives and requirements."""
+        return float(self.margins.min())
+
+    def worst(self, count: int) -> NDArray[np.float64]:
+        """Points of the simulations with the least values, (k, dim) with k at most `count`."""
+        return self.points[np.argsort(self.values, kind="stable")[:count]]
+
+
+def search_drives(
+    simulator: DriveSimulator,
+    count: int,
+    *,
+    seed: int,
+    random: bool = False,
+    starts: NDArray[np.float64] | None = None,
+    seen: Seen = lambda _recording, _margins: None,
+    watch: Watch | None = None,
+) -> SearchedDrives:
+    """Search for drives that violate any requirement, in `count` simulations.
+
+    For guidance, the robustness of each requirement is divided by its median size in the first batch, so that
+    a requirement in radians and one in metres count alike.
+
+    Args:
+        simulator: simulator of the policy in its world.
+        count: number of simulations.
+        seed: seed of the search; the same seed gives the same simulations.
+        random: whether points are drawn from the declared distribution only, as a baseline.
+        starts: points that are simulated first, (k, dim).
+        seen: function that receives the recorded drives of each batch.
+        watch: function that is called at every step of the simulations.
+    """
+    space = simulator.space
+    portfolio = Portfolio(space, np.random.default_rng(seed), lambda _point: None, random=random)
+    points, margins, values = list[Point](), list[NDArray[np.float64]](), list[float]()
+    scale: NDArray[np.float64] | None = None
+    first = [] if starts is None else [each for each in starts if each.shape == (space.dim,)][:count]
+    while len(points) < count:
+        given = first[len(points) : len(points) + simulator.batch]
+        wanted = min(simulator.batch, count - len(points)) - len(given)
+        proposals = [portfolio.next() for _ in range(wanted)]
+        batch = [*given, *(each.point for each in proposals)]
+        recording = simulator.drive(np.stack(batch), watch)
+        found = simulator.margins_of_agents(recording)
+        seen(recording, found)
+        points += batch
+        margins += list(found)
+        scale = scale_of(found) if scale is None else scale
+        least = (found / scale).min((1, 2)).tolist()
+        values += least
+        for point, value in zip(given, least, strict=False):
+            portfolio.observe(point, value)
+        for proposal, value in zip(proposals, least[len(given) :], strict=True):
+            portfolio.tell(proposal, value)
+    return SearchedDrives(np.stack(points), np.stack(margins), np.array(values))
+
+
+def scale_of(margins: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Median size of the robustness of each requirement, (requirements,); 1 where it is 0 or infinite.
+
+    `margins`: (count, agents, requirements).
+    """
+    size = np.median(np.abs(margins), (0, 1))
+    return np.where(np.isfinite(size) & (size > 0.0), size, 1.0)
+
+
+# ------------------------------------------------------------------ rounds of a training
+
+
+class _StoppedError(Exception):
+    """Raised when a training ends during a round."""
+
+
+def round_of(
+    run: Run, decisions: int, seed: int, starts: NDArray[np.float64], stop: Stop
+) -> SearchRound | None:
+    """Search for failing drives of a policy in training, and collect the states where it planned wrongly.
+
+    Implements `stlc.controller.training.failures.FailureSearch`. The drives have no guard.
+
+    Args:
+        run: run with the present policy.
+        decisions: number of decisions of all drives, about.
+        seed: seed of the search.
+        starts: points that are simulated first, (p, dim).
+        stop: function that is called at every step; the search ends once it returns True.
+
+    Returns:
+        The states and the worst points; None if `stop` ended the search.
+    """
+    test = run.task.system.decl.test
+    setting = Setting((0,), test.agents, test.steps, test.replan)
+    count = max(round(decisions * test.replan / (test.agents * test.steps)), 2)
+    simulator = DriveSimulator(run, "none", setting, batch=min(ROUND, max(count // 2, 1)))
+    kept: list[NDArray[np.float64]] = []
+
+    def seen(recording: DeploymentRecording, margins: NDArray[np.float64]) -> None:
+        kept.append(wrong_states(recording, (margins < -TOLERANCE).any(2).reshape(-1), test.replan))
+
+    def watch(_step: SimulationStep) -> None:
+        if stop():
+            raise _StoppedError
+
+    try:
+        found = search_drives(
+            simulator, count, seed=seed, starts=starts[: count // 2], seen=seen, watch=watch
+        )
+    except _StoppedError:
+        return None
+    states = torch.from_numpy(np.concatenate(kept))
+    states = states[run.task.alive(states)]  # from others, no plan satisfies the specification
+    failing = found.failing
+    return SearchRound(states, found.worst(len(found.points)), failing.size, int(failing.sum()))
+
+
+def wrong_states(
+    recording: DeploymentRecording, failing: NDArray[np.bool_], replan: int
+) -> NDArray[np.float64]:
+    """States at which the policy's own plan violates the specification, and some before the first of them.
+
+    Args:
+        recording: recorded drives.
+        failing: drives that violate a requirement, (rows,); they contribute more states than others.
+        replan: replanning period in steps; states between decisions are left out.
+
+    Returns:
+        States, (k, n).
+    """
+    decided = np.arange(recording.steps) % replan == 0
+    wrong = ~(recording.policy_rho >= -TOLERANCE) & decided
+    order = wrong.cumsum(1)
+    chosen = wrong & (order <= np.where(failing, WRONG, WRONG // 4)[:, None])
+    for row in np.flatnonzero(failing & wrong.any(1)):
+        first = int(wrong[row].argmax())
+        chosen[row, max(first - EARLIER * replan, 0) : first : replan] = True
+    states = recording.states[:, :-1][chosen]
+    finite: NDArray[np.float64] = states[np.isfinite(states).all(1)]
+    return finite

@@ -1,0 +1,174 @@
+"""Failures of closed-loop drives as training states: rounds of falsification during the training.
+
+At some moments of a training, the present policy drives in the world of its system, and a search chooses the
+random numbers of the world so that drives fail. The states at which the policy then planned wrongly are kept,
+and mixed into the batches and the search rounds from then on. As in DAgger (Ross, Gordon and Bagnell 2011),
+the policy is thus trained on the states that it brings about itself, and on the worst of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stlc.native import never
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from stlc.controller.training.run import Run
+    from stlc.native import Stop
+
+FAILURES_VERSION = 1
+"""Version of the rounds and of the use of their states; results of older versions are recomputed."""
+MOMENTS = (0.25, 0.4, 0.55, 0.7, 0.82)
+"""Shares of the planned steps after which a round is due."""
+WORK = 0.06
+"""Decisions of the drives of a round, per training state of the steps since the round before."""
+LEAST_WORK, MOST_WORK = 500, 100_000
+"""Bounds of the number of decisions of a round."""
+KEPT = 8192
+"""States kept at most; the oldest are dropped."""
+POINTS = 8
+"""Points of the least robust drives that the next round simulates first."""
+MIXED = 0.125
+"""Part of the fresh states of a step that kept states replace."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchRound:
+    """Result of a round of falsification.
+
+    Attributes:
+        states: states at which the policy planned wrongly in drives, (k, n) float64.
+        points: points of the least robust simulations, (p, dim).
+        drives: number of drives.
+        failing: number of drives that violated a requirement.
+    """
+
+    states: Tensor
+    points: NDArray[np.float64]
+    drives: int
+    failing: int
+
+
+class FailureSearch(Protocol):
+    """Search for failing drives of a policy; `stlc.assurance` supplies it, which is above the training."""
+
+    def __call__(
+        self, run: Run, decisions: int, seed: int, starts: NDArray[np.float64], stop: Stop
+    ) -> SearchRound | None:
+        """Search with about `decisions` decisions of the policy; None if `stop` ended the search.
+
+        `starts`: points of earlier rounds, which are simulated first, (p, dim).
+        """
+
+
+@dataclass(slots=True)
+class FailureBank:
+    """States of failing drives, and the progress of the rounds that supply them.
+
+    Attributes:
+        states: kept states, the newest last, (k, n).
+        points: points of the least robust simulations of the last round, (p, dim).
+        rounds: number of rounds made.
+        last: step of the last round.
+        drives: number of drives of all rounds.
+        failing: number of drives that violated a requirement, of all rounds.
+        latest: share of the drives of the last round that violated a requirement.
+        repairing: number of kept states from which the present search for plans starts.
+    """
+
+    states: Tensor
+    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    rounds: int = 0
+    last: int = 0
+    drives: int = 0
+    failing: int = 0
+    latest: float = 0.0
+    repairing: int = 0
+
+    def due(self, step: int, steps: int) -> bool:
+        """Whether a round is due after `step` of `steps` steps."""
+        return self.rounds < len(MOMENTS) and step >= MOMENTS[self.rounds] * steps
+
+    def search(
+        self, search: FailureSearch, run: Run, step: int, states: int, generator: torch.Generator,
+        stop: Stop = never,
+    ) -> bool:  # fmt: skip
+        """Make a round; return False, without any effect, if `stop` ended it early.
+
+        Args:
+            search: search for failing drives.
+            run: run with the present policy.
+            step: number of completed steps.
+            states: training states of a step.
+            generator: source of the seed of the round.
+            stop: function that is called repeatedly; the round ends once it returns True.
+        """
+        before = generator.get_state()
+        seed = int(torch.randint(2**31, (), generator=generator))
+        work = int(min(max(WORK * (step - self.last) * states, LEAST_WORK), MOST_WORK))
+        found = search(run, work, seed, self.points, stop)
+        if found is None:
+            generator.set_state(before)
+            return False
+        fresh = found.states.to(self.states)
+        self.states = torch.cat((self.states, fresh))[-KEPT:]
+        self.points = found.points[:POINTS]
+        self.rounds, self.last = self.rounds + 1, step
+        self.drives, self.failing = self.drives + found.drives, self.failing + found.failing
+        self.latest = found.failing / max(found.drives, 1)
+        return True
+
+    def mixed(self, fresh: Tensor, generator: torch.Generator) -> Tensor:
+        """The states `fresh`, (batch, n), of which kept states replace the last ones."""
+        count = self.count(len(fresh))
+        if not count:
+            return fresh
+        chosen = torch.randint(len(self.states), (count,), generator=generator).to(fresh.device)
+        return torch.cat((fresh[: len(fresh) - count], self.states[chosen]))
+
+    def count(self, batch: int) -> int:
+        """Number of kept states among `batch` states of a step."""
+        return int(MIXED * batch) if len(self.states) else 0
+
+    def drawn(self, count: int, generator: torch.Generator) -> Tensor:
+        """At most `count` different kept states in random order, (k, n)."""
+        order = torch.randperm(len(self.states), generator=generator)[:count]
+        return self.states[order.to(self.states.device)]
+
+    def summary(self) -> dict[str, float | int]:
+        """Counts for the record of the run."""
+        return {
+            "rounds": self.rounds,
+            "drives": self.drives,
+            "failing": self.failing,
+            "last_share": self.latest,
+            "states": len(self.states),
+        }
+
+    # ------------------------------------------------------------- checkpoints
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors from which the rounds continue exactly."""
+        counts = (self.rounds, self.last, self.drives, self.failing, self.repairing)
+        return {
+            "states": self.states,
+            "points": torch.from_numpy(self.points.copy()),
+            "counts": torch.tensor(counts, dtype=torch.int64),
+            "latest": torch.tensor(self.latest, dtype=torch.float64),
+        }
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore the state from `tensors`, which the method of this name returned."""
+        self.states = tensors["states"].to(self.states.device)
+        self.points = tensors["points"].numpy()
+        self.rounds, self.last, self.drives, self.failing, self.repairing = tensors["counts"].tolist()
+        self.latest = float(tensors["latest"])
