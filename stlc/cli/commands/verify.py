@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stlc.assurance.bounds import clopper_pearson_lower
 from stlc.cli.framework.assured import Verified, VerifiedMode
-from stlc.cli.framework.options import FailUnderOption, RunArgument, RunsOption, parse_seconds
+from stlc.cli.framework.options import FailUnderOption, RunArgument, RunsOption, parse_clock, parse_seconds
 from stlc.cli.framework.output import PULSE, Answer, emit, table
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 
 if TYPE_CHECKING:
+    from stlc.controller.verification.around import Around
     from stlc.controller.verification.verify import ModeResult, Verification
 
 _MOST = 3
@@ -28,6 +30,12 @@ def verify(
     boxes: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Boxes of each mode to examine at most.")
     ] = None,
+    states: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Random initial states around which to prove boxes.")
+    ] = 0,
+    clock: Annotated[
+        str, typer.Option(metavar="wall|processor", help="Clock of the search for proofs.")
+    ] = "wall",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sampled states.")] = 0,
     fail_under: FailUnderOption = None,
     runs: RunsOption = Path("runs"),
@@ -36,21 +44,25 @@ def verify(
 
     Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion and
     robustness show that one proposal of the network satisfies the specification from every state in it. It is
-    refuted if the policy violates the specification from a sampled state. More time proves more. Exit code: 0
-    all proved, 1 a counterexample was found, 4 open; with --fail-under, 0 if at least that share is proved.
+    refuted if the policy violates the specification from a sampled state. More time proves more. With
+    --states, boxes are also searched around random initial states; the number of states with a proof bounds
+    the share of all states that have one, with 95 % confidence. Exit code: 0 all proved, 1 a counterexample
+    was found, 4 open; with --fail-under, 0 if at least that share is proved.
     """
     import torch
 
+    from stlc.controller.training.budget import clock_of
     from stlc.controller.training.run import Run
     from stlc.controller.verification.verify import Verifier
 
     torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
     seconds = parse_seconds(budget)
     opened = Run.open(run, root=runs)
-    verifier = Verifier(opened.task, opened.policy, seed=seed)
+    verifier = Verifier(opened.task, opened.policy, seed=seed, clock=clock_of(parse_clock(clock)))
     with PULSE.doing("proving"):
         found = verifier.run(seconds, boxes=boxes)
-    record = _record(opened.dir.shown, found)
+        near = {each.mode.name: each for each in verifier.around(states, seed=seed)} if states else {}
+    record = _record(opened.dir.shown, found, near)
     return Answer(record, lambda: emit("\n".join(_lines(record))), _exit_code(found, fail_under))
 
 
@@ -62,21 +74,28 @@ def _exit_code(found: Verification, fail_under: float | None) -> int:
     return 4 if found.open > 0.0 else 0
 
 
-def _record(run: str, found: Verification) -> Verified:
+def _record(run: str, found: Verification, near: Mapping[str, Around]) -> Verified:
+    drawn, proved, violated = (
+        sum(getattr(each, name) for each in near.values()) for name in ("states", "proved", "violated")
+    )
     return {
         "run": run,
         "seconds": found.seconds,
         "proved": found.proved,
         "refuted": found.refuted,
         "open": found.open,
-        "modes": [_mode(each) for each in found.modes],
+        "states": drawn,
+        "states_proved": proved,
+        "states_violated": violated,
+        "states_share": clopper_pearson_lower(proved, drawn) if drawn else 0.0,
+        "modes": [_mode(each, found.probability(each), near.get(each.mode.name)) for each in found.modes],
     }
 
 
-def _mode(each: ModeResult) -> VerifiedMode:
+def _mode(each: ModeResult, probability: float, near: Around | None) -> VerifiedMode:
     return {
         "name": each.mode.name,
-        "probability": each.mode.weight,
+        "probability": probability,
         "proved": each.proved,
         "refuted": each.refuted,
         "open": each.open,
@@ -84,6 +103,9 @@ def _mode(each: ModeResult) -> VerifiedMode:
         "examined_boxes": each.examined,
         "witness": None if each.witness is None else dict(each.witness.state),
         "robustness": None if each.witness is None else each.witness.robustness,
+        "states": 0 if near is None else near.states,
+        "states_proved": 0 if near is None else near.proved,
+        "states_violated": 0 if near is None else near.violated,
     }
 
 
@@ -98,6 +120,13 @@ def _lines(found: Verified) -> Iterator[str]:
     yield f"{visible(found['run'])}    {float(found['seconds']):.0f} s"
     yield ""
     yield table(rows, header=("initial states", "probability", "proved", "refuted", "open"))
+    if found["states"]:
+        yield ""
+        yield (
+            f"{found['states_proved']} of {found['states']} random initial states are in a proved box, "
+            f"{found['states_violated']} are violated; so at least {_percent(found['states_share'])} of all "
+            "initial states have such a box (95 % confidence)"
+        )
     known = [mode for mode in found["modes"] if mode["witness"] is not None]
     for mode in sorted(known, key=lambda mode: float(mode["robustness"] or 0.0))[:_MOST]:
         state = ", ".join(f"{name}={float(value):.6g}" for name, value in (mode["witness"] or {}).items())
@@ -107,4 +136,5 @@ def _lines(found: Verified) -> Iterator[str]:
 
 
 def _percent(share: float | str) -> str:
-    return f"{100.0 * float(share):.1f} %"
+    value = 100.0 * float(share)
+    return f"{value:.1f} %" if value >= 0.05 or value == 0.0 else f"{value:.1g} %"
