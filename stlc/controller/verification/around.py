@@ -17,7 +17,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.verification.boxes import Box, Mode
 from stlc.controller.verification.forms import Floats
 from stlc.controller.verification.judged import PROVED
-from stlc.controller.verification.plans import Plans
+from stlc.controller.verification.subject import Subject
 
 FIRST = 8
 """Boxes along each coordinate that the search around a state begins with."""
@@ -54,7 +54,7 @@ class Around:
 class StateProver:
     """Search for boxes with a proof around random initial states of a policy."""
 
-    def __init__(self, plans: Plans, *, seed: int = 0) -> None:
+    def __init__(self, plans: Subject, *, seed: int = 0) -> None:
         self._plans = plans
         self._rng = np.random.default_rng(seed)
 
@@ -90,7 +90,7 @@ class StateProver:
 
 
 def narrowed(
-    plans: Plans,
+    plans: Subject,
     mode: Mode,
     boxes: Sequence[Box],
     states: Floats,
@@ -100,7 +100,7 @@ def narrowed(
     """Halve boxes around states until they are proved; return the proved ones.
 
     Args:
-        plans: the plans of a policy.
+        plans: what is verified.
         mode: mode of the boxes.
         boxes: the boxes.
         states: coordinates of a state in each box, (boxes, coordinates).

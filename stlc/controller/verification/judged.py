@@ -48,10 +48,18 @@ class BoxVerdicts:
 
 
 class Judge:
-    """Robustness of formulas over affine forms of signals."""
+    """Robustness of formulas over affine forms of signals.
 
-    def __init__(self, formulas: Sequence[ir.Formula], *, end: Boundary = "strict") -> None:
-        self._end = end
+    Args:
+        formulas: the formulas.
+        end: treatment of instants beyond the last sample.
+        apart: whether the symbols of different samples have nothing in common.
+    """
+
+    def __init__(
+        self, formulas: Sequence[ir.Formula], *, end: Boundary = "strict", apart: bool = False
+    ) -> None:
+        self._end, self._apart = end, apart
         self._numbers: dict[ir.Num, str] = {}
         self._formulas = [self._named(formula) for formula in formulas]
         self._program = ArrayProgram({name: num for num, name in self._numbers.items()})
@@ -106,8 +114,13 @@ class Judge:
             place = at if shifted is None else at + shifted.steps
             if shifted is not None and shifted.clamped:
                 place = min(max(place, 0), len(forms) - 1)
-            known = 0 <= place < len(forms)
-            env[name] = forms[place] if known else Forms.between(like - np.inf, like + np.inf)
+            if not 0 <= place < len(forms):
+                env[name] = Forms.between(like - np.inf, like + np.inf)
+            elif self._apart and place != at:
+                bound = forms[place].range
+                env[name] = Forms.between(bound.low, bound.high)
+            else:
+                env[name] = forms[place]
         return env or {"": Forms.point(np.zeros_like(like))}
 
     def _add_effects(self, effects: Floats, forms: Sequence[Forms], bound: Intervals) -> None:

@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -27,16 +27,9 @@ from stlc.controller.verification.around import Around, StateProver, narrowed
 from stlc.controller.verification.boxes import Box, Mode, whole
 from stlc.controller.verification.forms import Bools, Floats
 from stlc.controller.verification.judged import PROVED, BoxVerdicts
-from stlc.controller.verification.plans import Indices, Plans
-
-if TYPE_CHECKING:
-    from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Task
+from stlc.controller.verification.subject import Indices, Subject
 
 Clock: TypeAlias = Callable[[], float]
-
-BATCH = 512
-"""Boxes that are bounded at once."""
 
 DIVES = 16
 """States around which boxes are searched at once."""
@@ -163,18 +156,15 @@ class _Samples:
 
 
 class Verifier:
-    """Branch and bound for one policy.
+    """Branch and bound for one policy or closed loop.
 
     Attributes:
-        plans: plans of the policy.
+        plans: what is verified.
         modes: ways to draw an initial state.
-
-    Raises:
-        UsageError: U101, a policy, system or distribution of initial states that is not supported.
     """
 
-    def __init__(self, task: Task, policy: Policy, *, seed: int = 0, clock: Clock = time.monotonic) -> None:
-        self.plans, self._clock = Plans(task, policy), clock
+    def __init__(self, plans: Subject, *, seed: int = 0, clock: Clock = time.monotonic) -> None:
+        self.plans, self._clock = plans, clock
         self.modes = self.plans.modes
         self._names = self.plans.names
         self._rng = np.random.default_rng(seed)
@@ -210,7 +200,7 @@ class Verifier:
 
     def _advance(self, result: ModeResult, front: _Front) -> None:
         """Examine one batch of boxes of a mode, and search around states in some while little is proved."""
-        self._examine(result, front, front.take(BATCH))
+        self._examine(result, front, front.take(self.plans.batch))
         if result.proved < LITTLE and len(front.queue) >= DIVES:
             self._dive(result, front, front.take(DIVES))
 
