@@ -115,7 +115,8 @@ def _closed_loop(
 ) -> ClosedLoop:
     """Load the closed loop of a system and a network."""
     from stlc.controller.problem.load import load_task
-    from stlc.controller.verification.loop import ClosedLoop, read_onnx
+    from stlc.controller.verification.loop import ClosedLoop
+    from stlc.controller.verification.onnx_layers import read_onnx
 
     task = load_task(spec, system)
     dt = float(task.system.decl.dt)

@@ -169,11 +169,12 @@ class Verifier:
         self._names = self.plans.names
         self._rng = np.random.default_rng(seed)
 
-    def run(self, seconds: float, *, boxes: int | None = None) -> Verification:
+    def run(self, seconds: float, *, boxes: int | None = None, until_refuted: bool = False) -> Verification:
         """Return the result after at most about `seconds` of the clock.
 
         The mode with the largest box is next, so that all modes are divided into boxes of about one size.
-        `boxes` is the number of boxes of each mode that are examined at most.
+        `boxes` is the number of boxes of each mode that are examined at most. With `until_refuted`, the
+        search ends with the first counterexample.
         """
         begun = self._clock()
         most = math.inf if boxes is None else boxes
@@ -181,7 +182,7 @@ class Verifier:
         fronts = [_Front(deque([whole(mode)]), np.ones(len(mode.coordinates))) for mode in self.modes]
         while self._clock() - begun < seconds:
             ready = [i for i, each in enumerate(results) if fronts[i].queue and each.examined < most]
-            if not ready:
+            if not ready or (until_refuted and any(each.witness for each in results)):
                 break
             largest = max(ready, key=lambda i: fronts[i].queue[0].volume)
             self._advance(results[largest], fronts[largest])

@@ -13,8 +13,9 @@ from stlc.cli.framework.app import main
 from stlc.controller.problem.load import load_task
 from stlc.controller.verification.boxes import Box
 from stlc.controller.verification.forms import Forms
-from stlc.controller.verification.loop import ClosedLoop, read_onnx
+from stlc.controller.verification.loop import ClosedLoop
 from stlc.controller.verification.network import Layer, NetworkBounds
+from stlc.controller.verification.onnx_layers import read_onnx
 from stlc.controller.verification.verify import Verifier
 from stlc.diagnostics import UsageError
 
