@@ -58,7 +58,7 @@ HOMES = {
     "rich": ("stlc.cli", "stlc.view"),
     "typer": ("stlc.cli", "benchmarks"),
     "click": (),
-    "yaml": ("stlc.dynamics.schema.yaml_nodes",),
+    "yaml": ("stlc.dynamics.schema.yaml_nodes", "benchmarks.tables.ainncs"),
     "pydantic": (),
     "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),

@@ -1,8 +1,9 @@
 """Solutions of differential equations over affine forms, with a bound on the error of every step.
 
 A step has a first enclosure of the solution from interval arithmetic (Picard iteration; Moore, Kearfott and
-Cloud 2009, chapter 10). In it the solution is, at a time s of the step, `x + s F`, with the range F of the
-derivative. The derivative over this form is linear in s up to a remainder. Its integral over the step is
+Cloud 2009, chapter 10). In it the solution is, at a time s of the step, `x + s F`, where F contains the mean
+of the derivative up to that time: first the range of the derivative over the enclosure, then the derivative
+over the form itself. The last derivative is linear in s up to a remainder. Its integral over the step is
 exact for the linear part, and the remainder times the length of the step contains the rest.
 """
 
@@ -17,6 +18,9 @@ from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.controller.verification.forms import FORMS, SLACK, Bools, Floats, Forms, spread
 from stlc.dynamics.declaration.decl import SystemDecl
+
+_ROUNDS = 2
+"""How often the derivative is evaluated over the solution."""
 
 _TRIES = 8
 """How often a first enclosure is enlarged."""
@@ -52,18 +56,20 @@ class Flow:
         rate = self._rate(enclosure, INTERVALS)
         time = Forms(np.full(batch, 0.5 * length), np.zeros((0, batch)), np.full(batch, 0.5 * length))
         time = time.with_symbol(symbols)
-        tube = dict(env)
+        slopes = {name: Forms.between(*_ends(rate[name], batch)) for name in self._moved}
+        for _ in range(_ROUNDS):
+            tube = dict(env)
+            for name in self._moved:
+                moved = FORMS.add(env[name], FORMS.mul(slopes[name], time))
+                tube[name] = Forms(moved.centre, moved.generators, moved.rest, *_ends(enclosure[name], batch))
+            found = self._rate(tube, FORMS)
+            slopes = {name: _lumped(spread(found[name], batch), symbols) for name in self._moved}
+        later = {}
         for name in self._moved:
-            slope = _whole(rate[name], batch)
-            moved = FORMS.add(env[name], FORMS.mul(Forms.between(slope.low, slope.high), time))
-            tube[name] = Forms(moved.centre, moved.generators, moved.rest, *_ends(enclosure[name], batch))
-        found = {}
-        for name, form in self._rate(tube, FORMS).items():
-            mean = _without(spread(form, batch), symbols).times(length)
-            later = FORMS.add(env[name], mean).widened(0.0, SLACK)
-            rest = np.where(contained, later.rest, np.inf)
-            found[name] = Forms(later.centre, later.generators, rest)
-        return found
+            mean = _lumped(spread(found[name], batch), symbols, linear=True).times(length)
+            moved = FORMS.add(env[name], mean).widened(0.0, SLACK)
+            later[name] = Forms(moved.centre, moved.generators, np.where(contained, moved.rest, np.inf))
+        return later
 
     def _enclosed(self, start: Mapping[str, Intervals]) -> tuple[dict[str, Intervals], Bools]:
         """Intervals that contain the solution during a step, and whether they are known to."""
@@ -111,10 +117,14 @@ def _ends(x: Intervals, batch: int) -> tuple[Floats, Floats]:
     return whole.low, whole.high
 
 
-def _without(form: Forms, symbol: int) -> Forms:
-    """The mean of a form over the symbol of time, which is linear in it."""
+def _lumped(form: Forms, symbol: int, *, linear: bool = False) -> Forms:
+    """The form without the symbol of time, whose effect is added to the remainder.
+
+    If `linear`, it is the mean over the whole step, in which the effect of the symbol is 0.
+    """
     if len(form.generators) <= symbol:
-        return form
+        return Forms(form.centre, form.generators, form.rest)
     generators = form.generators.copy()
     generators[symbol] = 0.0
-    return Forms(form.centre, generators, form.rest)
+    rest = form.rest if linear else form.rest + np.abs(form.generators[symbol])
+    return Forms(form.centre, generators, rest)
