@@ -34,7 +34,7 @@ from stlc.controller.verification.network import Layer
 from stlc.controller.verification.onnx_layers import read_onnx
 from stlc.controller.verification.verify import Verifier
 from stlc.diagnostics import usage
-from stlc.files import SPECS
+from stlc.files import SYSTEMS
 from stlc.provenance import sha256
 
 _OUTPUT = Output(Path("docs/assurance.md"))
@@ -53,7 +53,7 @@ class Case:
 
     Attributes:
         name: name of the instance.
-        spec: name of the specification in `specs/ainncs`.
+        spec: name of the specification in `examples/ainncs`.
         network: file of the network below the folder of the models.
         steps: control period in time steps.
         other: names of the benchmark and the instance in `results.csv`.
@@ -205,7 +205,7 @@ def _verified(case: Case, models: Path, seconds: float, store: ResultStore) -> R
         raise usage(
             f"there is no network `{path}`", "git clone https://github.com/JuliaReach/ARCH2023_AINNCS_RE"
         )
-    task = load_task(SPECS / "ainncs" / f"{case.spec}.stl")
+    task = load_task(SYSTEMS / "ainncs" / f"{case.spec}.stl")
     values = {**inputs_of(task), "network": sha256(path.read_bytes()), "seconds": seconds}
 
     def compute() -> Result:

@@ -20,7 +20,7 @@ from stlc.controller.verification.verify import Verifier
 from stlc.diagnostics import UsageError
 
 ROOT = Path(__file__).parents[3]
-SPEC = str(ROOT / "specs" / "ainncs" / "single_pendulum.stl")
+SPEC = str(ROOT / "examples" / "ainncs" / "single_pendulum.stl")
 
 
 def random_layers(kind: str, inputs: int = 2, outputs: int = 1) -> list[Layer]:
