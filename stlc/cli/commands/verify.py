@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.assurance.bounds import clopper_pearson_lower
 from stlc.cli.framework.assured import Verified, VerifiedMode
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
@@ -73,7 +72,7 @@ def verify(
     fail_under: FailUnderOption = None,
     runs: RunsOption = Path("runs"),
 ) -> Answer[Verified]:
-    """Prove plans of a trained policy, or a closed loop with a network, on boxes of states.
+    """Prove plans or closed loops on boxes of states.
 
     Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion and
     robustness show that one proposal of the network satisfies the specification from every state in it. It is
@@ -135,6 +134,8 @@ def _exit_code(found: Verification, fail_under: float | None) -> int:
 
 
 def _record(run: str, found: Verification, near: Mapping[str, Around]) -> Verified:
+    from stlc.assurance.bounds import clopper_pearson_lower
+
     drawn, proved, violated = (
         sum(getattr(each, name) for each in near.values()) for name in ("states", "proved", "violated")
     )
