@@ -123,7 +123,7 @@ def verify(
             for each in every
         )
         table = listed("verify", rows(every), COLUMNS).markdown()
-        return [TEXT, *table, "", f"- {spent}", *provenance(every, "policies")]
+        return [TEXT, *table, "", f"- {spent}", *provenance(every, "runs")]
 
     publish("verify", output, section, {"rows": listed("verify", rows(results), COLUMNS)})
 
