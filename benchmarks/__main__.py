@@ -20,7 +20,7 @@ PROGRAM = Program(
     package="benchmarks.tables",
     order=(
         *("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step", "robustness"),
-        *("gym", "falsify", "certificates", "uncertain"),
+        *("gym", "falsify", "certificates", "uncertain", "verify", "ainncs"),
     ),
 )
 

@@ -58,7 +58,7 @@ HOMES = {
     "rich": ("stlc.cli", "stlc.view"),
     "typer": ("stlc.cli", "benchmarks"),
     "click": (),
-    "yaml": ("stlc.dynamics.schema.yaml_nodes",),
+    "yaml": ("stlc.dynamics.schema.yaml_nodes", "benchmarks.tables.ainncs"),
     "pydantic": (),
     "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),
@@ -82,7 +82,7 @@ HOMES = {
         "stlc.cli",
         "benchmarks",
     ),
-    "onnx": ("stlc.export",),
+    "onnx": ("stlc.export", "stlc.controller.verification.onnx_layers"),
     "onnxruntime": ("stlc.runtime", "stlc.plants.controller"),
     "fmpy": ("stlc.plants.kinds.fmu",),
     "pyarrow": ("stlc.trace.formats.parquet", "stlc.trace.formats.cells"),

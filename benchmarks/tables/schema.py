@@ -19,7 +19,18 @@ from benchmarks.formulas import Timing
 from benchmarks.plannings import PlanRow
 from benchmarks.repairs import Mended
 from benchmarks.steps import Speed, StepTiming
-from benchmarks.tables import ablation, certificates, failures, falsify, family, latency, paper, uncertain
+from benchmarks.tables import (
+    ablation,
+    ainncs,
+    certificates,
+    failures,
+    falsify,
+    family,
+    latency,
+    paper,
+    uncertain,
+    verify,
+)
 from stlc.cli.framework.documents import DocumentRecord, Num, schema_of
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
@@ -65,6 +76,8 @@ ROWS: dict[str, dict[str, type]] = {
     "uncertain": {"rows": uncertain.Overhead},
     "gym": {"rows": EpisodeSpeed},
     "certificates": {"rows": certificates.Row},
+    "verify": {"rows": verify.Row},
+    "ainncs": {"rows": ainncs.Row},
 }
 """Name of a table -> key in its result -> record of a row."""
 

@@ -2,56 +2,127 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stlc.cli.framework.assured import Verified, VerifiedMode
-from stlc.cli.framework.options import FailUnderOption, RunArgument, RunsOption, parse_seconds
+from stlc.cli.framework.completion import run_names
+from stlc.cli.framework.options import (
+    FailUnderOption,
+    RunsOption,
+    SystemOption,
+    parse_clock,
+    parse_seconds,
+)
 from stlc.cli.framework.output import PULSE, Answer, emit, table
 from stlc.cli.framework.program import command
+from stlc.diagnostics import usage
 from stlc.escape import visible
 
 if TYPE_CHECKING:
+    from stlc.controller.verification.around import Around
+    from stlc.controller.verification.loop import ClosedLoop
+    from stlc.controller.verification.subject import Subject
     from stlc.controller.verification.verify import ModeResult, Verification
 
 _MOST = 3
 """Counterexamples that the text shows."""
 
 
-@command("stlc verify latest", "stlc verify traffic --budget 10min --fail-under 0.5")
+@command(
+    "stlc verify latest",
+    "stlc verify traffic --budget 10min --fail-under 0.5",
+    "stlc verify latest --states 1000",
+    "stlc verify loop.stl --controller network.onnx --period 0.1s",
+)
 def verify(
-    run: RunArgument = "latest",
+    run: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN|SPEC", help="A run, or with --controller a specification.", autocompletion=run_names
+        ),
+    ] = "latest",
+    controller: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A network in ONNX that controls the system of SPEC."),
+    ] = None,
+    period: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Control period of the network; the time step if not given."),
+    ] = None,
+    continuous: Annotated[
+        bool,
+        typer.Option("--continuous", help="Bound solutions of the differential equations, not the model's."),
+    ] = False,
+    system: SystemOption = None,
     budget: Annotated[str, typer.Option(metavar="TIME", help="Time of the search for proofs.")] = "60s",
     boxes: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Boxes of each mode to examine at most.")
     ] = None,
+    states: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Random initial states around which to prove boxes.")
+    ] = 0,
+    clock: Annotated[
+        str, typer.Option(metavar="wall|processor", help="Clock of the search for proofs.")
+    ] = "wall",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sampled states.")] = 0,
     fail_under: FailUnderOption = None,
     runs: RunsOption = Path("runs"),
 ) -> Answer[Verified]:
-    """Prove plans of a trained policy on boxes of states.
+    """Prove plans or closed loops on boxes of states.
 
     Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion and
     robustness show that one proposal of the network satisfies the specification from every state in it. It is
-    refuted if the policy violates the specification from a sampled state. More time proves more. Exit code: 0
-    all proved, 1 a counterexample was found, 4 open; with --fail-under, 0 if at least that share is proved.
+    refuted if the policy violates the specification from a sampled state. More time proves more. With
+    --states, boxes are also searched around random initial states; the number of states with a proof bounds
+    the share of all states that have one, with 95 % confidence. Exit code: 0 all proved, 1 a counterexample
+    was found, 4 open; with --fail-under, 0 if at least that share is proved.
+
+    With --controller, a network acts on the system of SPEC once per period, and the whole horizon is proved,
+    at the samples of the model or, with --continuous, of the exact solutions.
     """
     import torch
 
+    from stlc.controller.training.budget import clock_of
     from stlc.controller.training.run import Run
+    from stlc.controller.verification.plans import Plans
     from stlc.controller.verification.verify import Verifier
 
     torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
     seconds = parse_seconds(budget)
-    opened = Run.open(run, root=runs)
-    verifier = Verifier(opened.task, opened.policy, seed=seed)
+    subject: Subject
+    if controller is None:
+        if period is not None or system is not None or continuous:
+            raise usage("--period, --system and --continuous are for a network: --controller FILE")
+        opened = Run.open(run, root=runs)
+        name, subject = opened.dir.shown, Plans(opened.task, opened.policy)
+    else:
+        name, subject = run, _closed_loop(run, system, controller, period, continuous)
+    verifier = Verifier(subject, seed=seed, clock=clock_of(parse_clock(clock)))
     with PULSE.doing("proving"):
         found = verifier.run(seconds, boxes=boxes)
-    record = _record(opened.dir.shown, found)
+        near = {each.mode.name: each for each in verifier.around(states, seed=seed)} if states else {}
+    record = _record(name, found, near)
     return Answer(record, lambda: emit("\n".join(_lines(record))), _exit_code(found, fail_under))
+
+
+def _closed_loop(
+    spec: str, system: str | None, controller: Path, period: str | None, continuous: bool
+) -> ClosedLoop:
+    """Load the closed loop of a system and a network."""
+    from stlc.controller.problem.load import load_task
+    from stlc.controller.verification.loop import ClosedLoop
+    from stlc.controller.verification.onnx_layers import read_onnx
+
+    task = load_task(spec, system)
+    dt = float(task.system.decl.dt)
+    steps = 1.0 if period is None else parse_seconds(period) / dt
+    if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
+        raise usage(f"the control period `{period}` is not a multiple of the time step {dt:g} s")
+    return ClosedLoop(task, read_onnx(controller), round(steps), continuous=continuous)
 
 
 def _exit_code(found: Verification, fail_under: float | None) -> int:
@@ -62,21 +133,30 @@ def _exit_code(found: Verification, fail_under: float | None) -> int:
     return 4 if found.open > 0.0 else 0
 
 
-def _record(run: str, found: Verification) -> Verified:
+def _record(run: str, found: Verification, near: Mapping[str, Around]) -> Verified:
+    from stlc.assurance.bounds import clopper_pearson_lower
+
+    drawn, proved, violated = (
+        sum(getattr(each, name) for each in near.values()) for name in ("states", "proved", "violated")
+    )
     return {
         "run": run,
         "seconds": found.seconds,
         "proved": found.proved,
         "refuted": found.refuted,
         "open": found.open,
-        "modes": [_mode(each) for each in found.modes],
+        "states": drawn,
+        "states_proved": proved,
+        "states_violated": violated,
+        "states_share": clopper_pearson_lower(proved, drawn) if drawn else 0.0,
+        "modes": [_mode(each, found.probability(each), near.get(each.mode.name)) for each in found.modes],
     }
 
 
-def _mode(each: ModeResult) -> VerifiedMode:
+def _mode(each: ModeResult, probability: float, near: Around | None) -> VerifiedMode:
     return {
         "name": each.mode.name,
-        "probability": each.mode.weight,
+        "probability": probability,
         "proved": each.proved,
         "refuted": each.refuted,
         "open": each.open,
@@ -84,6 +164,9 @@ def _mode(each: ModeResult) -> VerifiedMode:
         "examined_boxes": each.examined,
         "witness": None if each.witness is None else dict(each.witness.state),
         "robustness": None if each.witness is None else each.witness.robustness,
+        "states": 0 if near is None else near.states,
+        "states_proved": 0 if near is None else near.proved,
+        "states_violated": 0 if near is None else near.violated,
     }
 
 
@@ -91,20 +174,29 @@ def _lines(found: Verified) -> Iterator[str]:
     """Lines of text that show the result of `stlc verify`."""
     shares = [(mode["proved"], mode["refuted"], mode["open"]) for mode in found["modes"]]
     rows = [
-        (visible(mode["name"]), _percent(mode["probability"]), *map(_percent, each))
+        (visible(mode["name"] or "initial set"), _percent(mode["probability"]), *map(_percent, each))
         for mode, each in zip(found["modes"], shares, strict=True)
     ]
     rows.append(("all", *map(_percent, (1.0, found["proved"], found["refuted"], found["open"]))))
     yield f"{visible(found['run'])}    {float(found['seconds']):.0f} s"
     yield ""
     yield table(rows, header=("initial states", "probability", "proved", "refuted", "open"))
+    if found["states"]:
+        yield ""
+        yield (
+            f"{found['states_proved']} of {found['states']} random initial states are in a proved box, "
+            f"{found['states_violated']} are violated; so at least {_percent(found['states_share'])} of all "
+            "initial states have such a box (95 % confidence)"
+        )
     known = [mode for mode in found["modes"] if mode["witness"] is not None]
     for mode in sorted(known, key=lambda mode: float(mode["robustness"] or 0.0))[:_MOST]:
         state = ", ".join(f"{name}={float(value):.6g}" for name, value in (mode["witness"] or {}).items())
         least = float(mode["robustness"] or 0.0)
         yield ""
-        yield f"{visible(mode['name'])}: violated from {visible(state)}, robustness {least:+.3g}"
+        name = visible(mode["name"] or "initial set")
+        yield f"{name}: violated from {visible(state)}, robustness {least:+.3g}"
 
 
 def _percent(share: float | str) -> str:
-    return f"{100.0 * float(share):.1f} %"
+    value = 100.0 * float(share)
+    return f"{value:.1f} %" if value >= 0.05 or value == 0.0 else f"{value:.1g} %"

@@ -291,6 +291,9 @@ class VerifiedMode(TypedDict):
     examined_boxes: int
     witness: dict[str, Num] | None
     robustness: Num | None
+    states: int
+    states_proved: int
+    states_violated: int
 
 
 class Verified(TypedDict):
@@ -301,6 +304,10 @@ class Verified(TypedDict):
     proved: Num
     refuted: Num
     open: Num
+    states: int
+    states_proved: int
+    states_violated: int
+    states_share: Num
     modes: list[VerifiedMode]
 
 

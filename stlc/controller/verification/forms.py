@@ -11,7 +11,7 @@ Values are computed in float64 without outward rounding. `SLACK` covers the roun
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast, final
@@ -25,6 +25,9 @@ from stlc.compile.backends.array.namespace import FloatConstants, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 
 Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+_TURN = 2.0 * np.pi
 
 SLACK = 1e-10
 """Widening of every range, relative to its magnitude plus 1; it covers rounding errors."""
@@ -41,12 +44,14 @@ class Forms:
         rest: radius of the remainder, (batch,).
         floor: lower bounds that are known in addition to the form, (batch,); None if none are known. The
             result of `relu`, for example, is at least 0, although its form may extend below 0.
+        ceiling: upper bounds that are known in addition to the form, (batch,); None if none are known.
     """
 
     centre: Floats
     generators: Floats
     rest: Floats
     floor: Floats | None = None
+    ceiling: Floats | None = None
 
     __array_ufunc__ = None
 
@@ -82,24 +87,61 @@ class Forms:
         low, high = self.centre - reach, self.centre + reach
         if self.floor is not None:
             low = np.maximum(low, self.floor)
+        if self.ceiling is not None:
+            high = np.minimum(high, self.ceiling)
         finite = np.isfinite(low) & np.isfinite(high)
         if finite.all():
             return Intervals(low, high)
         return Intervals(np.where(finite, low, -np.inf), np.where(finite, high, np.inf))
 
     def times(self, factor: Any) -> Forms:
-        """Product with exact numbers, one float or one per element."""
-        return Forms(self.centre * factor, self.generators * factor, self.rest * np.abs(factor))
+        """Product with exact numbers, one float or one per element; known bounds are kept for a float."""
+        floor, ceiling = self.floor, self.ceiling
+        if not isinstance(factor, float):
+            floor = ceiling = None
+        elif factor < 0.0:
+            floor, ceiling = ceiling, floor
+        return Forms(
+            self.centre * factor,
+            self.generators * factor,
+            self.rest * np.abs(factor),
+            None if floor is None else _below(floor * factor),
+            None if ceiling is None else _above(ceiling * factor),
+        )
 
     def widened(self, middle: Any, radius: Any) -> Forms:
         """Sum with numbers from `middle - radius` to `middle + radius`, which belong to this form alone."""
         return Forms(self.centre + middle, self.generators, self.rest + radius)
+
+    def at(self, rows: NDArray[np.int64]) -> Forms:
+        """The forms of some elements, without known bounds."""
+        return Forms(self.centre[rows], self.generators[:, rows], self.rest[rows])
+
+    def with_symbol(self, index: int) -> Forms:
+        """The same forms, whose remainder is the generator of symbol number `index`."""
+        generators = np.zeros((index + 1, *self.shape))
+        generators[: len(self.generators)] = self.generators
+        known = np.isfinite(self.rest)
+        generators[index] = np.where(known, self.rest, 0.0)
+        rest = np.where(known, 0.0, self.rest)
+        return Forms(self.centre, generators, rest, self.floor, self.ceiling)
 
     def __neg__(self) -> Forms:
         return self.times(-1.0)
 
 
 Operand: TypeAlias = Forms | float
+
+
+def _below(values: Floats) -> Floats:
+    """Numbers a little less than `values`, by more than their rounding errors."""
+    found: Floats = values - SLACK * (1.0 + np.abs(values))
+    return found
+
+
+def _above(values: Floats) -> Floats:
+    """Numbers a little greater than `values`, by more than their rounding errors."""
+    return -_below(-values)
 
 
 def _combined(a: Floats, b: Floats) -> Floats:
@@ -123,14 +165,18 @@ class FormOps(FloatConstants):
     name = "forms"
 
     def add(self, a: Operand, b: Operand) -> Forms:
-        """`a + b`."""
+        """`a + b`; known bounds are kept if both operands have them."""
         if not isinstance(a, Forms):
             a, b = b, a
         assert isinstance(a, Forms)
         if not isinstance(b, Forms):
-            floor = None if a.floor is None else a.floor + b - SLACK * (1.0 + np.abs(a.floor))
-            return Forms(a.centre + b, a.generators, a.rest, floor)
-        return Forms(a.centre + b.centre, _combined(a.generators, b.generators), a.rest + b.rest)
+            floor = None if a.floor is None else _below(a.floor + b)
+            ceiling = None if a.ceiling is None else _above(a.ceiling + b)
+            return Forms(a.centre + b, a.generators, a.rest, floor, ceiling)
+        floor = None if a.floor is None or b.floor is None else _below(a.floor + b.floor)
+        ceiling = None if a.ceiling is None or b.ceiling is None else _above(a.ceiling + b.ceiling)
+        generators = _combined(a.generators, b.generators)
+        return Forms(a.centre + b.centre, generators, a.rest + b.rest, floor, ceiling)
 
     def sub(self, a: Operand, b: Operand) -> Forms:
         """`a - b`."""
@@ -144,19 +190,54 @@ class FormOps(FloatConstants):
         if not isinstance(b, Forms):
             return a.times(b)
         linear = self.add(a.times(b.centre), b.times(a.centre))
-        rest = np.abs(b.centre) * a.rest + np.abs(a.centre) * b.rest + a.radius * b.radius
-        return Forms(a.centre * b.centre, linear.generators, rest)
+        with np.errstate(invalid="ignore"):  # 0 times infinity
+            rest = np.abs(b.centre) * a.rest + np.abs(a.centre) * b.rest + a.radius * b.radius
+        found = Forms(a.centre * b.centre, linear.generators, rest)
+        return _bounded(found, INTERVALS.mul(a.range, b.range))
 
     def square(self, x: Forms) -> Forms:
-        """`x * x`."""
+        """`x * x`, which is known to be between the squares of the ends of the range."""
         half = 0.5 * x.radius**2
-        return x.times(2.0 * x.centre).widened(half - x.centre**2, half)
+        found = x.times(2.0 * x.centre).widened(half - x.centre**2, half)
+        plain = INTERVALS.square(x.range)
+        return Forms(found.centre, found.generators, found.rest, plain.low, plain.high)
 
     def div(self, a: Operand, b: Operand) -> Forms:
-        """`a / b`: linear if `b` is a number."""
-        if isinstance(a, Forms) and not isinstance(b, Forms):
+        """`a / b`: linear in both; unknown where `b` may be 0."""
+        if not isinstance(b, Forms):
+            assert isinstance(a, Forms)
             return a.times(1.0 / b)
-        return self._by_range("div", a, b)
+        return self.mul(a, self._reciprocal(b))
+
+    def _reciprocal(self, x: Forms) -> Forms:
+        """`1 / x`: between the chord over the range and the tangent parallel to it."""
+        bound = x.range
+        low, high = bound.low, bound.high
+        plain = INTERVALS.div(1.0, bound)
+        with np.errstate(all="ignore"):
+            slope = -1.0 / (low * high)
+            middle = np.sign(low) * np.sqrt(low * high)
+            return _between_lines(x, slope, plain, [1.0 / low, 1.0 / middle], [low, middle])
+
+    def pow(self, a: Operand, b: Operand) -> Forms:
+        """`a ^ b`: products for the whole exponents 1 to 4."""
+        if not isinstance(a, Forms) or not isinstance(b, float) or b not in (1.0, 2.0, 3.0, 4.0):
+            return self._by_range("pow", a, b)
+        if b == 1.0:
+            return a
+        square = self.square(a)
+        return square if b == 2.0 else self.mul(square, a) if b == 3.0 else self.square(square)
+
+    def mod(self, a: Operand, b: Operand) -> Forms:
+        """Floored modulo: linear where it does not jump."""
+        plain = self._by_range("mod", a, b)
+        if not isinstance(a, Forms) or not isinstance(b, float) or b <= 0.0:
+            return plain
+        bound = a.range
+        turns = np.floor(bound.low / b)
+        smooth = turns == np.floor(bound.high / b)
+        found = a.widened(np.where(smooth, -turns * b, 0.0), 0.0)
+        return picked(smooth, found, plain)
 
     def axpy(self, a: Operand, b: Forms, factor: float) -> Forms:
         """`a + factor * b`."""
@@ -173,7 +254,8 @@ class FormOps(FloatConstants):
         slope = high / np.maximum(high - low, 1e-300)
         half = -0.5 * slope * low
         found = x.times(slope).widened(half, half)
-        return Forms(found.centre, found.generators, found.rest, np.maximum(bound.low, 0.0))
+        floor, ceiling = np.maximum(bound.low, 0.0), np.maximum(bound.high, 0.0)
+        return Forms(found.centre, found.generators, found.rest, floor, ceiling)
 
     def maximum(self, a: Operand, b: Operand) -> Forms:
         """Elementwise maximum."""
@@ -189,18 +271,11 @@ class FormOps(FloatConstants):
         first, last = np.clip(bound.low, low, high), np.clip(bound.high, low, high)
         x = x if low is None else self.maximum(x, low)
         x = x if high is None else self.minimum(x, high)
-        plain = Forms.between(first, last)
-        keep = x.radius <= 2.0 * plain.rest
-        return Forms(
-            np.where(keep, x.centre, plain.centre),
-            x.generators * keep,
-            np.where(keep, x.rest, plain.rest),
-            first - SLACK * (1.0 + np.abs(first)),
-        )
+        return _bounded(x, Intervals(_below(first), _above(last)))
 
     def abs(self, x: Forms) -> Forms:
         """`|x|`."""
-        return self.sub(self.relu(x).times(2.0), x)
+        return _bounded(self.sub(self.relu(x).times(2.0), x), INTERVALS.abs(x.range))
 
     def sqrt(self, x: Forms) -> Forms:
         """Square root: the chord over the range, and half its greatest distance from the curve.
@@ -217,27 +292,93 @@ class FormOps(FloatConstants):
         half = 0.5 * (0.25 / slope - start)
         return x.times(slope).widened(start + half, half + slope * slack)
 
+    def norm(self, *components: Operand) -> Forms:
+        """Euclidean norm: at least its tangent at the centre, which is at most `h` below it.
+
+        With g the direction of the centre, `norm(v) >= g v`, because g has length 1. The part of v across g
+        is P at most, so the norm is `sqrt((g v)^2 + P^2)` at most; `h` is its distance from `g v` where that
+        is least.
+        """
+        parts = [each for each in components if isinstance(each, Forms)]
+        if len(parts) < len(components):
+            like = parts[0].centre
+            parts = [
+                each if isinstance(each, Forms) else Forms.point(np.full(like.shape, each))
+                for each in components
+            ]
+        size = np.sqrt(np.sum([part.centre**2 for part in parts], axis=0))
+        along = [part.centre / np.maximum(size, 1e-300) for part in parts]
+        linear = _total([part.times(share) for part, share in zip(parts, along, strict=True)])
+        linear = Forms(linear.centre, linear.generators, linear.rest)
+        aside = [self.sub(part, linear.times(share)) for part, share in zip(parts, along, strict=True)]
+        across = np.sqrt(np.sum([part.radius**2 for part in aside], axis=0))
+        least = linear.range.low
+        half = 0.5 * (np.sqrt(least**2 + across**2) - least)
+        plain = INTERVALS.norm(*(part.range for part in parts))
+        return _bounded(linear.widened(half, half + SLACK * (1.0 + np.abs(half))), plain)
+
     def sin(self, x: Forms) -> Forms:
-        """Sine: the tangent at the centre, from which it is off by at most half the squared radius."""
-        return self._wave("sin", x, np.sin(x.centre), np.cos(x.centre))
+        """Sine: parallel to the chord over ranges of at most half a turn."""
+        bound = x.range
+        middle, width = 0.5 * (bound.low + bound.high), bound.high - bound.low
+        plain = INTERVALS.sin(bound)
+        with np.errstate(all="ignore"):
+            chord = (np.sin(bound.high) - np.sin(bound.low)) / np.maximum(width, 1e-300)
+            slope = np.where(width < 1e-6, np.cos(middle), np.clip(chord, -1.0, 1.0))
+            at = [bound.low, bound.high]
+            for turn in (np.arccos(slope), -np.arccos(slope)):  # where the tangent is parallel to the chord
+                near = turn + _TURN * np.rint((middle - turn) / _TURN)
+                at.append(np.clip(near, bound.low, bound.high))
+            found = _between_lines(x, slope, plain, [np.sin(each) for each in at], at)
+        return picked(width <= 0.5 * _TURN, found, Forms.between(plain.low, plain.high))
 
     def cos(self, x: Forms) -> Forms:
-        """Cosine: the tangent at the centre, from which it is off by at most half the squared radius."""
-        return self._wave("cos", x, np.cos(x.centre), -np.sin(x.centre))
+        """Cosine."""
+        return self.sin(self.add(x, 0.25 * _TURN))
 
-    def _wave(self, name: str, x: Forms, value: Floats, slope: Floats) -> Forms:
-        """Tangent of a function whose second derivative is within [-1, 1]; its range if `x` is wide."""
-        radius = x.radius
-        found = x.times(slope).widened(value - slope * x.centre, 0.5 * radius**2 + SLACK)
-        keep = radius <= 1.0
-        if keep.all():
-            return found
-        plain = self._by_range(name, x)
-        return Forms(
-            np.where(keep, found.centre, plain.centre),
-            found.generators * keep,
-            np.where(keep, found.rest, plain.rest),
-        )
+    def tan(self, x: Forms) -> Forms:
+        """Tangent; unknown where a pole may lie in the range."""
+        return _bounded(self.div(self.sin(x), self.cos(x)), INTERVALS.tan(x.range))
+
+    def exp(self, x: Forms) -> Forms:
+        """`e ^ x`: between the chord over the range and the tangent parallel to it."""
+        bound = x.range
+        plain = INTERVALS.exp(bound)
+        with np.errstate(all="ignore"):
+            width = bound.high - bound.low
+            chord = np.exp(bound.low) * np.expm1(width) / np.maximum(width, 1e-300)
+            slope = np.where(width < 1e-6, np.exp(bound.low), chord)
+            at = [bound.low, bound.high, np.clip(np.log(slope), bound.low, bound.high)]
+            return _between_lines(x, slope, plain, [np.exp(each) for each in at], at)
+
+    def tanh(self, x: Forms) -> Forms:
+        """Hyperbolic tangent."""
+        return _bounded(tanh(x), INTERVALS.tanh(x.range))
+
+    def sigmoid(self, x: Forms) -> Forms:
+        """`1 / (1 + exp(-x))`."""
+        found = self.add(tanh(x.times(0.5)).times(0.5), 0.5)
+        return _bounded(found, INTERVALS.sigmoid(x.range))
+
+    def atan(self, x: Forms) -> Forms:
+        """Arc tangent."""
+        return _bounded(arctan(x), INTERVALS.atan(x.range))
+
+    def floor(self, x: Forms) -> Forms:
+        """Next whole number below."""
+        return self._rounded("floor", x, -0.5)
+
+    def ceil(self, x: Forms) -> Forms:
+        """Next whole number above."""
+        return self._rounded("ceil", x, 0.5)
+
+    def round(self, x: Forms) -> Forms:
+        """Nearest whole number."""
+        return self._rounded("round", x, 0.0)
+
+    def _rounded(self, name: str, x: Forms, middle: float) -> Forms:
+        """A whole number within 1/2 of `x + middle`."""
+        return _bounded(x.widened(middle, 0.5), getattr(INTERVALS, name)(x.range))
 
     def gt(self, a: Operand, b: Operand) -> Belief:
         """`a > b`."""
@@ -290,14 +431,82 @@ class FormOps(FloatConstants):
         return lambda *args: self._by_range(name, *args)
 
 
-def tanh(x: Forms) -> Forms:
-    """Hyperbolic tangent: a line with the least slope over the range, and the deviation from it.
+def picked(mask: Any, yes: Forms, no: Forms) -> Forms:
+    """The elements of `yes` where `mask` is True, else those of `no`, with the known bounds of both."""
+    generators = _combined(np.where(mask, yes.generators, 0.0), np.where(mask, 0.0, no.generators))
+    one, other = yes.range, no.range
+    return Forms(
+        np.where(mask, yes.centre, no.centre),
+        generators,
+        np.where(mask, yes.rest, no.rest),
+        np.where(mask, one.low, other.low),
+        np.where(mask, one.high, other.high),
+    )
 
-    Source: Singh et al. 2018.
+
+def _bounded(x: Forms, plain: Intervals) -> Forms:
+    """The form `x` with known bounds; without symbols where its radius is twice that of the bounds."""
+    other = Forms.between(plain.low, plain.high)
+    with np.errstate(invalid="ignore"):
+        keep = x.radius <= 2.0 * other.rest
+    generators = x.generators if keep.all() else np.where(keep, x.generators, 0.0)
+    return Forms(
+        np.where(keep, x.centre, other.centre),
+        generators,
+        np.where(keep, x.rest, other.rest),
+        plain.low,
+        plain.high,
+    )
+
+
+def _between_lines(
+    x: Forms, slope: Floats, plain: Intervals, values: Sequence[Floats], at: Sequence[Floats]
+) -> Forms:
+    """A function of `x` between two lines of a slope; `plain` where they are not finite.
+
+    Args:
+        x: the argument.
+        slope: slope of both lines, (batch,).
+        plain: bounds on the function.
+        values: values of the function where its distance from a line of that slope may be extreme.
+        at: arguments of these values.
+    """
+    off = [value - slope * place for value, place in zip(values, at, strict=True)]
+    low, high = np.min(off, axis=0), np.max(off, axis=0)
+    good = np.isfinite(slope) & np.isfinite(low) & np.isfinite(high) & np.isfinite(plain.low + plain.high)
+    slope, low, high = (np.where(good, each, 0.0) for each in (slope, low, high))
+    error = SLACK * (1.0 + np.abs(low) + np.abs(high) + np.abs(slope) * (1.0 + np.abs(x.centre)))
+    found = x.times(slope).widened(0.5 * (low + high), 0.5 * (high - low) + error)
+    return _bounded(picked(good, found, Forms.between(plain.low, plain.high)), plain)
+
+
+def _total(forms: Sequence[Forms]) -> Forms:
+    out = forms[0]
+    for each in forms[1:]:
+        out = cast("Forms", FORMS.add(out, each))
+    return out
+
+
+def tanh(x: Forms) -> Forms:
+    """Hyperbolic tangent (Singh et al. 2018)."""
+    bound = x.range
+    return _rising(x, np.tanh(bound.low), np.tanh(bound.high), lambda value, _: 1.0 - value**2)
+
+
+def arctan(x: Forms) -> Forms:
+    """Arc tangent."""
+    bound = x.range
+    return _rising(x, np.arctan(bound.low), np.arctan(bound.high), lambda _, at: 1.0 / (1.0 + at**2))
+
+
+def _rising(x: Forms, first: Floats, last: Floats, slope_at: Callable[[Floats, Floats], Floats]) -> Forms:
+    """A rising function whose slope is least at an end of any range.
+
+    It rises faster than a line of that slope, so it lies between the parallel lines through its ends.
+    `slope_at` gives the slope, from the value of the function and from the argument.
     """
     bound = x.range
-    first, last = np.tanh(bound.low), np.tanh(bound.high)
-    slope = np.minimum(1.0 - first**2, 1.0 - last**2)
+    slope = np.minimum(slope_at(first, bound.low), slope_at(last, bound.high))
     low, high = first - slope * bound.low, last - slope * bound.high
     return x.times(slope).widened(0.5 * (low + high), 0.5 * (high - low) + SLACK)
 
@@ -306,6 +515,27 @@ def ranges(forms: Sequence[Forms]) -> Intervals:
     """Ranges of a sequence of forms (batch,) over time: (time, batch)."""
     found = [form.range for form in forms]
     return Intervals(np.stack([each.low for each in found]), np.stack([each.high for each in found]))
+
+
+def together(parts: Sequence[Forms]) -> Forms:
+    """Forms (batch,) of several batches as one, without known bounds."""
+    generators = np.zeros((max(len(part.generators) for part in parts), sum(len(p.centre) for p in parts)))
+    at = 0
+    for part in parts:
+        generators[: len(part.generators), at : at + len(part.centre)] = part.generators
+        at += len(part.centre)
+    centre, rest = (np.concatenate(each) for each in zip(*((p.centre, p.rest) for p in parts), strict=True))
+    return Forms(centre, generators, rest)
+
+
+def spread(form: Forms, batch: int) -> Forms:
+    """The form with one element per box; forms of a constant have a single one."""
+    if form.shape == (batch,):
+        return form
+    rows = len(form.generators)
+    generators = np.broadcast_to(form.generators.reshape(rows, -1), (rows, batch))
+    ends = (None if end is None else np.broadcast_to(end, batch) for end in (form.floor, form.ceiling))
+    return Forms(np.broadcast_to(form.centre, batch), generators, np.broadcast_to(form.rest, batch), *ends)
 
 
 FORMS: Ops = cast("Ops", FormOps())

@@ -1,14 +1,13 @@
-"""Bounds on the plans of a network over boxes of initial states.
+"""Bounds on the outputs of a feed-forward network over boxes of inputs, and on the plans of a policy.
 
-All neurons of a layer are affine forms in the same symbols. Each neuron has a symbol of its own for the
-deviation of its ReLU from a line (Singh et al. 2018). The network computes in float32: the error of a sum of
-n products, in any order, is at most n 2^-24 / (1 - n 2^-24) times the sum of their magnitudes (Higham 2002,
-section 3.1).
+All neurons of a layer are affine forms in the same symbols. A neuron has a symbol of its own for what a line
+cannot follow of its activation (Singh et al. 2018). Where a network computes in float32, a sum of n products,
+in any order, is within n 2^-24 / (1 - n 2^-24) of the sum of the magnitudes (Higham 2002, section 3.1).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,115 +16,202 @@ from torch import nn
 
 from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import Task
-from stlc.controller.verification.forms import SLACK, Floats, Forms, tanh
+from stlc.controller.verification.forms import FORMS, SLACK, Floats, Forms, arctan, picked, tanh
+from stlc.dynamics.model.controls import EPS, raw_width
+
+UNIT = 2.0**-24
+"""Relative rounding error of one operation in float32."""
 
 _LARGE = 1e-4
 """Remainder from which a neuron gets a symbol; smaller ones, of rounding errors, are added up."""
 
-_UNIT = 2.0**-24
-"""Relative rounding error of one operation in float32."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Layer:
-    weight: Floats
-    bias: Floats
+_KEPT = 12
+"""Symbols of neurons that the outputs of a policy keep; the others become one symbol for each output."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Neurons:
-    """Affine forms of a layer: centre and remainder (batch, width), generators (symbols, batch, width)."""
+class Layer:
+    """Layer of a network: `activation(weight x + bias)`.
 
-    centre: Floats
-    generators: Floats
-    rest: Floats
+    Attributes:
+        weight: (outputs, inputs).
+        bias: (outputs,).
+        activation: a name in `ACTIVATIONS`.
+    """
 
-    def radius(self) -> Floats:
-        found: Floats = np.abs(self.generators).sum(0) + self.rest
-        return found
+    weight: Floats
+    bias: Floats
+    activation: str = "linear"
 
-    def with_own_symbols(self) -> _Neurons:
-        """The same forms, in which each large remainder has become a symbol that later layers share."""
-        large = np.flatnonzero(self.rest.max(0) > _LARGE)
-        own = np.zeros((len(large), *self.rest.shape))
-        own[np.arange(len(large)), :, large] = self.rest[:, large].T
-        rest = self.rest.copy()
-        rest[:, large] = 0.0
-        return _Neurons(self.centre, np.concatenate((self.generators, own)), rest)
+
+ACTIVATIONS: Mapping[str, Callable[[Forms], Forms]] = {
+    "linear": lambda x: x,
+    "relu": lambda x: FORMS.maximum(x, 0.0),
+    "tanh": lambda x: FORMS.tanh(x),
+    "sigmoid": lambda x: FORMS.sigmoid(x),
+}
+"""Activation -> its bounds."""
+
+
+class NetworkBounds:
+    """Bounds on the outputs of a feed-forward network.
+
+    Args:
+        layers: the layers, in order.
+        unit: relative rounding error of one operation of the network that is described: `UNIT` for float32.
+    """
+
+    def __init__(self, layers: Sequence[Layer], unit: float = UNIT) -> None:
+        self._layers, self._unit = tuple(layers), unit
+
+    def outputs(self, inputs: Forms, rows: slice = slice(None)) -> Forms:
+        """Forms (batch, outputs) for forms (batch, inputs); `rows` selects outputs of the last layer."""
+        neurons = inputs
+        for layer in self._layers[:-1]:
+            neurons = own_symbols(self._layer(neurons, layer))
+        last = self._layers[-1]
+        return self._layer(neurons, Layer(last.weight[rows], last.bias[rows], last.activation))
+
+    def _layer(self, x: Forms, layer: Layer) -> Forms:
+        weight, size = layer.weight.T, np.abs(layer.weight.T)
+        symbols, batch, width = x.generators.shape
+        generators = (x.generators.reshape(-1, width) @ weight).reshape(symbols, batch, -1)
+        terms = width + 2.0
+        most = (np.abs(x.centre) + x.radius) @ size + np.abs(layer.bias)
+        error = x.rest @ size + most * (terms * self._unit / (1.0 - terms * self._unit)) + SLACK
+        found = Forms(x.centre @ weight + layer.bias, generators, error)
+        if layer.activation == "linear":
+            return found
+        active = ACTIVATIONS[layer.activation](found)
+        if layer.activation == "relu":  # exact
+            return active
+        return active.widened(0.0, 8.0 * self._unit)
+
+
+def joined(forms: Sequence[Forms]) -> Forms:
+    """Forms (batch,) of several quantities as one array of forms, (batch, quantities)."""
+    batch, symbols = len(forms[0].centre), max(len(each.generators) for each in forms)
+    generators = np.zeros((symbols, batch, len(forms)))
+    for i, each in enumerate(forms):
+        generators[: len(each.generators), :, i] = each.generators
+    return Forms(
+        np.stack([each.centre for each in forms], 1), generators, np.stack([each.rest for each in forms], 1)
+    )
+
+
+def columns(x: Forms) -> list[Forms]:
+    """Forms (batch, quantities) as a list of forms (batch,)."""
+    return [
+        Forms(x.centre[:, i], np.ascontiguousarray(x.generators[:, :, i]), x.rest[:, i])
+        for i in range(x.centre.shape[1])
+    ]
+
+
+def own_symbols(x: Forms, large: float = _LARGE) -> Forms:
+    """The same forms (batch, width), in which each large remainder has become a symbol."""
+    chosen = np.flatnonzero(x.rest.max(0) > large)
+    own = np.zeros((len(chosen), *x.rest.shape))
+    own[np.arange(len(chosen)), :, chosen] = x.rest[:, chosen].T
+    rest = x.rest.copy()
+    rest[:, chosen] = 0.0
+    return Forms(x.centre, np.concatenate((x.generators, own)), rest)
+
+
+def reduced(x: Forms, first: int, most: int) -> Forms:
+    """Forms (batch, width) with the first symbols, and the `most` largest ones of the others at most.
+
+    What is left out is added to the remainders.
+    """
+    if len(x.generators) <= first + most:
+        return x
+    size = np.abs(x.generators[first:]).sum((1, 2))
+    order = np.argsort(-size)
+    kept = np.concatenate((np.arange(first), first + np.sort(order[:most])))
+    rest = x.rest + np.abs(x.generators[first + order[most:]]).sum(0)
+    return Forms(x.centre, x.generators[kept], rest)
 
 
 class PlanBounds:
-    """Bounds on single plans of a network, with weights in float64.
+    """Bounds on single plans of a policy's network, with weights in float64.
 
     Raises:
-        ValueError: the network uses a mirror symmetry, or squashes its outputs other than by tanh.
+        ValueError: an angle among the controls, with a range other than one turn around 0.
     """
 
     def __init__(self, network: PlanNetwork, task: Task) -> None:
-        controls = task.system.decl.controls
-        if network.mirror is not None or {control.squash for control in controls} != {"tanh"}:
-            raise ValueError("only networks without mirror, with controls squashed by tanh")
+        self._controls = task.system.decl.controls
+        for control in self._controls:
+            if control.squash == "angle" and abs(control.low + control.high) > 1e-9:
+                raise ValueError(f"the angle `{control.name}` has a range that is not around 0")
         modules = [module for module in network.body if isinstance(module, nn.Linear)]
-        self._layers = [_Layer(_array(each.weight), _array(each.bias)) for each in modules]
+        kinds = ["relu"] * (len(modules) - 1) + ["linear"]
+        self._network = NetworkBounds(
+            [
+                Layer(_array(each.weight), _array(each.bias), kind)
+                for each, kind in zip(modules, kinds, strict=True)
+            ]
+        )
         self._centre, self._spread = _array(network.centre), _array(network.spread)
         self._low, self._high = _array(task.system.control_low), _array(task.system.control_high)
-        self._steps = task.horizon
+        self._steps, self._width = task.horizon, raw_width(self._controls)
 
     def plan(self, observed: Sequence[Forms], index: int) -> list[list[Forms]]:
         """Forms of proposal number `index`: one list per step with one form (batch,) per control."""
-        neurons = self._inputs(observed)
-        for layer in self._layers[:-1]:
-            neurons = _relu(_linear(neurons, layer)).with_own_symbols()
-        last, width = self._layers[-1], self._steps * len(self._low)
+        first = max(len(each.generators) for each in observed)
+        width = self._steps * self._width
         rows = slice(index * width, (index + 1) * width)
-        raw = _linear(neurons, _Layer(last.weight[rows], last.bias[rows])).with_own_symbols()
-        outputs = [
-            tanh(Forms(raw.centre[:, i], raw.generators[:, :, i], raw.rest[:, i])) for i in range(width)
-        ]
-        half, middle = 0.5 * (self._high - self._low), 0.5 * (self._high + self._low)
-        error = 16.0 * _UNIT * (np.abs(middle) + half)  # tanh within 4 units of the last place, and the map
-        controls = len(half)
+        raw = self._network.outputs(self._inputs(observed), rows)
+        outputs = columns(own_symbols(reduced(raw, first, _KEPT)))
         return [
-            [
-                outputs[step * controls + i].times(half[i]).widened(middle[i], error[i])
-                for i in range(controls)
-            ]
+            self._squashed(outputs[step * self._width : (step + 1) * self._width])
             for step in range(self._steps)
         ]
 
-    def _inputs(self, observed: Sequence[Forms]) -> _Neurons:
-        batch, symbols = len(observed[0].centre), max(len(each.generators) for each in observed)
-        generators = np.zeros((symbols, batch, len(observed)))
-        for i, each in enumerate(observed):
-            generators[: len(each.generators), :, i] = each.generators
-        centre = np.stack([each.centre for each in observed], 1)
-        rest = np.stack([each.rest for each in observed], 1)
-        most = np.abs(centre) + np.abs(generators).sum(0) + rest
-        error = 4.0 * _UNIT * (most + np.abs(self._centre)) + SLACK
-        found = _Neurons(
-            (centre - self._centre) / self._spread, generators / self._spread, (rest + error) / self._spread
+    def _squashed(self, raw: Sequence[Forms]) -> list[Forms]:
+        """Controls of one step in physical units."""
+        found, given = [], iter(raw)
+        half, middle = 0.5 * (self._high - self._low), 0.5 * (self._high + self._low)
+        error = (
+            16.0 * UNIT * (np.abs(middle) + half)
+        )  # functions within 4 units of the last place, and the map
+        for i, control in enumerate(self._controls):
+            first = next(given)
+            match control.squash:
+                case "tanh":
+                    share = tanh(first)
+                case "clip":
+                    share = FORMS.clamp(first, -1.0, 1.0)
+                case _:
+                    share = _direction(FORMS.add(first, EPS), next(given)).times(1.0 / np.pi)
+            found.append(share.times(half[i]).widened(middle[i], error[i]))
+        return found
+
+    def _inputs(self, observed: Sequence[Forms]) -> Forms:
+        x = joined(observed)
+        error = 4.0 * UNIT * (np.abs(x.centre) + x.radius + np.abs(self._centre)) + SLACK
+        found = Forms(
+            (x.centre - self._centre) / self._spread,
+            x.generators / self._spread,
+            (x.rest + error) / self._spread,
         )
-        return found.with_own_symbols()
+        return own_symbols(found)
+
+
+def _direction(x: Forms, y: Forms) -> Forms:
+    """Direction of the point (x, y), from -pi to pi; all directions where the point may be near the cut.
+
+    Around the direction of the centre it is the arc tangent of the part across by the part along.
+    """
+    plain = FORMS.atan2(y, x)
+    size = np.maximum(np.hypot(x.centre, y.centre), 1e-300)
+    cosine, sine = x.centre / size, y.centre / size
+    along = FORMS.add(x.times(cosine), y.times(sine))
+    across = FORMS.sub(y.times(cosine), x.times(sine))
+    turned: Forms = FORMS.add(arctan(FORMS.div(across, along)), Forms.point(np.arctan2(sine, cosine)))
+    bound = turned.range
+    good = (along.range.low > 0.0) & (bound.low > -np.pi) & (bound.high < np.pi)
+    return picked(good, turned, plain)
 
 
 def _array(tensor: torch.Tensor) -> Floats:
     return tensor.detach().cpu().to(torch.float64).numpy()
-
-
-def _linear(x: _Neurons, layer: _Layer) -> _Neurons:
-    """`W x + b`."""
-    weight, size = layer.weight.T, np.abs(layer.weight.T)
-    symbols, batch, width = x.generators.shape
-    generators = (x.generators.reshape(-1, width) @ weight).reshape(symbols, batch, -1)
-    terms = width + 2.0
-    most = (np.abs(x.centre) + x.radius()) @ size + np.abs(layer.bias)
-    error = x.rest @ size + most * (terms * _UNIT / (1.0 - terms * _UNIT)) + SLACK
-    return _Neurons(x.centre @ weight + layer.bias, generators, error)
-
-
-def _relu(x: _Neurons) -> _Neurons:
-    radius = x.radius()
-    low, high = np.minimum(x.centre - radius, 0.0), np.maximum(x.centre + radius, 0.0)
-    slope = high / np.maximum(high - low, 1e-300)
-    half = -0.5 * slope * low
-    return _Neurons(x.centre * slope + half, x.generators * slope, x.rest * slope + half)

@@ -15,64 +15,33 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TypeAlias
 
 import numpy as np
 import torch
 
-from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.interval import Intervals
-from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.policies.policy import BestOfKPolicy
-from stlc.controller.verification.boxes import Mode, Unsupported, modes_of
-from stlc.controller.verification.forms import FORMS, Floats, Forms, ranges
-from stlc.controller.verification.network import PlanBounds
-from stlc.diagnostics import usage
-from stlc.dynamics.model.schedule import blocks
-from stlc.dynamics.model.step import build_step
+from stlc.controller.verification.around import Around, StateProver, narrowed
+from stlc.controller.verification.boxes import Box, Mode, whole
+from stlc.controller.verification.forms import Bools, Floats
+from stlc.controller.verification.judged import PROVED, BoxVerdicts
+from stlc.controller.verification.subject import Indices, Subject
 
-if TYPE_CHECKING:
-    from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Task
+Clock: TypeAlias = Callable[[], float]
 
-BATCH = 64
-"""Boxes that are bounded at once."""
+DIVES = 16
+"""States around which boxes are searched at once."""
 
-POINTS = 4
-"""States that are sampled in each box: its centre and three at random."""
+LITTLE = 0.01
+"""Proved share of a mode up to which boxes around single states are searched."""
 
+POINTS = 8
+"""States that are sampled in each box: its centre and others at random."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Box:
-    """Box of coordinates of a mode.
-
-    Attributes:
-        centre: (coordinates,).
-        half: half of its width in each coordinate, (coordinates,).
-        refuted: whether the policy violates the specification from a known state in it.
-    """
-
-    centre: Floats
-    half: Floats
-    refuted: bool = False
-
-    @property
-    def volume(self) -> float:
-        """Share of the mode's probability."""
-        return float(np.prod(2.0 * self.half))
-
-    def split(self, axis: int) -> tuple[Box, Box]:
-        """Return the two halves along a coordinate."""
-        half = self.half.copy()
-        half[axis] *= 0.5
-        step = np.zeros_like(half)
-        step[axis] = half[axis]
-        return Box(self.centre - step, half, self.refuted), Box(self.centre + step, half, self.refuted)
+_EDGE = 1e-6
+"""Volume from which a proved box on the border of `where` is divided, to find its part inside."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +61,10 @@ class Witness:
 class ModeResult:
     """Result for one mode; shares are probabilities within the mode and add up to 1.
 
+    With conditions of `where`, probabilities are conditional on them. `proved` counts only boxes in which
+    every state meets the conditions, and divides by an upper bound on the share of drawn states that does
+    (`Plans.acceptance`), so that it is a lower bound. `refuted` counts boxes with a counterexample whole.
+
     Attributes:
         mode: the mode.
         proved: share of proved boxes.
@@ -100,6 +73,7 @@ class ModeResult:
         boxes: the proved boxes.
         examined: number of boxes that were bounded or refuted.
         witness: the counterexample with the least robustness; None if none was found.
+        accepted: share of drawn states that meet `where`, at most; 1 without conditions.
     """
 
     mode: Mode
@@ -109,6 +83,7 @@ class ModeResult:
     boxes: list[Box] = field(default_factory=list)
     examined: int = 0
     witness: Witness | None = None
+    accepted: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,204 +93,212 @@ class Verification:
     modes: tuple[ModeResult, ...]
     seconds: float
 
+    def probability(self, each: ModeResult) -> float:
+        """Probability of a mode, given the conditions of `where`; exact without conditions."""
+        total = sum(other.mode.weight * other.accepted for other in self.modes)
+        return each.mode.weight * each.accepted / total
+
     @property
     def proved(self) -> float:
-        """Probability of an initial state in a proved box."""
-        return sum(each.mode.weight * each.proved for each in self.modes)
+        """Probability of an initial state in a proved box, at least."""
+        return sum(self.probability(each) * each.proved for each in self.modes)
 
     @property
     def refuted(self) -> float:
         """Probability of an initial state in a box with a known counterexample."""
-        return sum(each.mode.weight * each.refuted for each in self.modes)
+        return sum(self.probability(each) * each.refuted for each in self.modes)
 
     @property
     def open(self) -> float:
         """Probability of all other initial states."""
-        return sum(each.mode.weight * each.open for each in self.modes)
+        return sum(self.probability(each) * each.open for each in self.modes)
+
+
+@dataclass(slots=True)
+class _Front:
+    """Boxes of a mode that are left to examine.
+
+    Attributes:
+        queue: the boxes, the oldest and so the largest first.
+        effects: mean effect of each coordinate on the bounds, (coordinates,), of boxes of width 1.
+    """
+
+    queue: deque[Box]
+    effects: Floats
+
+    def take(self, count: int) -> list[Box]:
+        """Take the oldest boxes, `count` at most."""
+        return [self.queue.popleft() for _ in range(min(count, len(self.queue)))]
+
+    def split(self, box: Box, axis: int | None = None) -> None:
+        """Add the two halves of a box, along the coordinate `axis`, or that with the greatest mean effect."""
+        self.queue.extend(box.split(int(np.argmax(self.effects * box.half)) if axis is None else axis))
+
+    def learn(self, box: Box, effects: Floats) -> None:
+        """Take the effects in one box into the mean."""
+        share = effects / (effects.sum() * box.half)
+        self.effects += 0.02 * (share / share.mean() - self.effects)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Samples:
+    """What sampled states say about boxes.
+
+    Attributes:
+        refuted: whether a state in the box violates the specification, (boxes,).
+        index: number of the proposal that is most robust in its worst state, (boxes,).
+        hopeful: whether this proposal satisfies the specification from all sampled states, (boxes,).
+    """
+
+    refuted: Bools
+    index: Indices
+    hopeful: Bools
 
 
 class Verifier:
-    """Branch and bound for one policy.
+    """Branch and bound for one policy or closed loop.
 
-    Raises:
-        UsageError: U101, a policy, system or distribution of initial states that is not supported.
+    Attributes:
+        plans: what is verified.
+        modes: ways to draw an initial state.
     """
 
-    def __init__(self, task: Task, policy: Policy, *, seed: int = 0) -> None:
-        if not isinstance(policy, BestOfKPolicy):
-            raise usage("only policies that select a proposal of a network can be verified: guided, gradient")
-        decl = task.system.decl
-        if task.compiled.timers or task.compiled.parameters or decl.feedback is not None:
-            raise usage("the states that a specification or inner feedback adds cannot be verified yet")
-        try:
-            self._plans = PlanBounds(policy.network, task)
-            self.modes = modes_of(decl.init)
-        except (ValueError, Unsupported) as error:
-            raise usage(f"this run cannot be verified: {error}") from None
-        self._task, self._policy = task, policy
-        step = build_step(decl, soft=False)
-        numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
-        self._blocks = [ArrayProgram(block) for block in blocks(numbers)]
-        self._moved = tuple(step.next)
-        self._observe = ArrayProgram({str(i): num for i, num in enumerate(task.system.observed)})
-        self._controls = [control.name for control in decl.controls]
+    def __init__(self, plans: Subject, *, seed: int = 0, clock: Clock = time.monotonic) -> None:
+        self.plans, self._clock = plans, clock
+        self.modes = self.plans.modes
+        self._names = self.plans.names
         self._rng = np.random.default_rng(seed)
 
-    def run(self, seconds: float, *, boxes: int | None = None) -> Verification:
-        """Return the result after at most about `seconds` of wall time.
+    def run(self, seconds: float, *, boxes: int | None = None, until_refuted: bool = False) -> Verification:
+        """Return the result after at most about `seconds` of the clock.
 
         The mode with the largest box is next, so that all modes are divided into boxes of about one size.
-        `boxes` is the maximum number of boxes that are examined per mode.
+        `boxes` is the number of boxes of each mode that are examined at most. With `until_refuted`, the
+        search ends with the first counterexample.
         """
-        begun = time.monotonic()
+        begun = self._clock()
         most = math.inf if boxes is None else boxes
         results = [ModeResult(mode) for mode in self.modes]
-        queues = [deque([_whole(mode)]) for mode in self.modes]
-        while time.monotonic() - begun < seconds:
-            ready = [i for i, each in enumerate(results) if queues[i] and each.examined < most]
-            if not ready:
+        fronts = [_Front(deque([whole(mode)]), np.ones(len(mode.coordinates))) for mode in self.modes]
+        while self._clock() - begun < seconds:
+            ready = [i for i, each in enumerate(results) if fronts[i].queue and each.examined < most]
+            if not ready or (until_refuted and any(each.witness for each in results)):
                 break
-            largest = max(ready, key=lambda i: queues[i][0].volume)
-            self._advance(results[largest], queues[largest])
-        for result, queue in zip(results, queues, strict=True):
-            result.refuted = sum(box.volume for box in queue if box.refuted)
-            result.open = sum(box.volume for box in queue if not box.refuted)
-        return Verification(tuple(results), time.monotonic() - begun)
+            largest = max(ready, key=lambda i: fronts[i].queue[0].volume)
+            self._advance(results[largest], fronts[largest])
+        for result, front in zip(results, fronts, strict=True):
+            self._close(result, front)
+        return Verification(tuple(results), self._clock() - begun)
 
-    def _advance(self, result: ModeResult, queue: deque[Box]) -> None:
-        """Examine one batch of boxes of a mode, the oldest and so the largest first."""
-        boxes = [queue.popleft() for _ in range(min(BATCH, len(queue)))]
-        result.examined += len(boxes)
-        bad, index = self._sampled(result, boxes)
-        good = [i for i in range(len(boxes)) if not bad[i]]
-        for wrong in (box for box, refuted in zip(boxes, bad, strict=True) if refuted):
-            queue.extend(replace(wrong, refuted=True).split(int(np.argmax(wrong.half))))
-        for number in sorted({int(index[i]) for i in good}):
-            rows = [i for i in good if index[i] == number]
-            low, weight = self.bound(result.mode, [boxes[i] for i in rows], number)
-            for i, least, effect in zip(rows, low, weight, strict=True):
-                box = boxes[i]
-                if least >= 0.0:
-                    result.proved += box.volume
-                    result.boxes.append(box)
-                else:
-                    queue.extend(Box(box.centre, box.half).split(int(np.argmax(effect))))
+    def _close(self, result: ModeResult, front: _Front) -> None:
+        """Compute the shares of a mode at the end."""
+        result.accepted = self.plans.acceptance(result.mode)
+        sure = sum(box.volume for box in result.boxes if box.inside)
+        bad = sum(box.volume for box in front.queue if box.refuted)
+        result.proved = min(1.0, sure / result.accepted)
+        result.refuted = min(bad / result.accepted, 1.0 - result.proved)
+        result.open = max(0.0, 1.0 - result.proved - result.refuted)
+
+    def _advance(self, result: ModeResult, front: _Front) -> None:
+        """Examine one batch of boxes of a mode, and search around states in some while little is proved."""
+        self._examine(result, front, front.take(self.plans.batch))
+        if result.proved < LITTLE and len(front.queue) >= DIVES:
+            self._dive(result, front, front.take(DIVES))
+
+    def _dive(self, result: ModeResult, front: _Front, taken: Sequence[Box]) -> None:
+        """Search boxes that can be proved around a random state in each of some boxes."""
+        half = np.stack([box.half for box in taken])
+        at = np.stack([box.centre for box in taken]) + self._rng.uniform(-1.0, 1.0, half.shape) * half
+        x0 = self.states(result.mode, at)
+        good = self.plans.admits(result.mode, at) & (self.plans.choices(x0).max(1) >= 0.0)
+        front.queue.extend(box for box, fine in zip(taken, good, strict=True) if not fine)
+        chosen = np.flatnonzero(good).tolist()
+        if len(chosen):
+            boxes = [replace(taken[i], refuted=False) for i in chosen]
+            proved = narrowed(self.plans, result.mode, boxes, at[chosen], spare=front.queue.append)
+            result.boxes += proved
+            result.proved += sum(box.volume for box in proved)
+            result.examined += len(boxes)
+
+    def _examine(self, result: ModeResult, front: _Front, taken: Sequence[Box]) -> None:
+        boxes = self._admitted(result.mode, taken, front)
+        result.examined += len(taken)
+        if not boxes:
+            return
+        samples = self._sampled(result, boxes)
+        for i, box in enumerate(boxes):
+            if samples.refuted[i] or not samples.hopeful[i]:
+                front.split(replace(box, refuted=bool(samples.refuted[i])))
+        good = np.flatnonzero(samples.hopeful & ~samples.refuted).tolist()
+        if not good:
+            return
+        found = self.plans.bound(result.mode, [boxes[i] for i in good], samples.index[good])
+        for row, i in enumerate(good):
+            box, least, effects = boxes[i], float(found.low[row]), found.effects[row]
+            if least < -PROVED:
+                front.learn(box, effects)
+                box = replace(box, refuted=False)
+                front.split(box, int(np.argmax(effects)))
+            elif box.inside or box.volume <= _EDGE:
+                result.boxes.append(box)
+                result.proved += box.volume * box.inside
+            else:  # its part inside of `where` is found by dividing it
+                front.split(replace(box, refuted=False))
+
+    def _admitted(self, mode: Mode, boxes: Sequence[Box], front: _Front) -> list[Box]:
+        """The boxes that may contain a state that meets `where`."""
+        asked = [box for box in boxes if not box.inside]
+        if not asked:
+            return list(boxes)
+        found = [box for box in boxes if box.inside]
+        try:
+            truth = mode.truths(asked, self._names)
+        except ValueError:
+            for box in asked:
+                front.split(box, int(np.argmax(box.half)))
+            return found
+        return found + [
+            replace(box, inside=bool(truth.sure[i])) for i, box in enumerate(asked) if truth.possible[i]
+        ]
+
+    def around(self, states: int, *, seed: int = 0) -> list[Around]:
+        """Search boxes with a proof around random initial states; one result per mode that was drawn."""
+        return StateProver(self.plans, seed=seed).run(states)
 
     # ---------------------------------------------------------------------------- samples
 
     def states(self, mode: Mode, at: Floats) -> torch.Tensor:
         """Initial states at coordinates (B, coordinates) from 0 to 1: (B, n) float64."""
-        table = {name: at[:, i] for i, name in enumerate(mode.coordinates)} | {"": np.zeros(len(at))}
-        columns = mode.states(table, self._task.system.names, NUMPY)
-        return torch.from_numpy(np.stack([np.broadcast_to(each, len(at)) for each in columns], 1).copy())
+        return self.plans.states(mode, at)
 
     def robustness(self, x0: torch.Tensor) -> Floats:
         """Robustness of the plans that the policy selects from states (B, n), (B,)."""
-        found: Floats = self._policy.plan_judged(x0)[1].rho.numpy()
-        return found
+        return self.plans.robustness(x0)
 
-    def _sampled(self, result: ModeResult, boxes: Sequence[Box]) -> tuple[Any, Any]:
-        """Sample states in boxes.
+    def bound(self, mode: Mode, boxes: Sequence[Box], index: int) -> BoxVerdicts:
+        """Bounds on the robustness of proposal number `index` over boxes of a mode."""
+        return self.plans.bound(mode, boxes, index)
 
-        Returns:
-            Whether a state in the box violates the specification, and the number of the proposal that is the
-            most robust from its centre; (boxes,) each.
-        """
+    def _sampled(self, result: ModeResult, boxes: Sequence[Box]) -> _Samples:
+        """Sample states in boxes; those that do not meet `where` do not count."""
         centre, half = np.stack([b.centre for b in boxes]), np.stack([b.half for b in boxes])
         moves = self._rng.uniform(-1.0, 1.0, (POINTS, *centre.shape))
         moves[0] = 0.0
         at = np.clip(centre + moves * half, 0.0, 1.0).reshape(-1, centre.shape[1])
         x0 = self.states(result.mode, at)
-        rho = self.robustness(x0)
-        worst = int(np.argmin(rho))
-        if rho[worst] < -TOLERANCE and (result.witness is None or rho[worst] < result.witness.robustness):
-            state = dict(zip(self._task.system.names, x0[worst].tolist(), strict=True))
-            result.witness = Witness(state, float(rho[worst]))
-        bad = (rho.reshape(POINTS, -1) < -TOLERANCE).any(0)
-        middle = x0[: len(boxes)]
-        with torch.no_grad():
-            plans = self._policy.candidates(middle).to(torch.float64)
-        count = plans.shape[1]
-        judged = self._task.judge(middle.repeat_interleave(count, 0), plans.flatten(0, 1), states=False)
-        return bad, judged.rho.view(-1, count).argmax(1).numpy()
+        met = self.plans.admits(result.mode, at)
+        rho = np.where(met[:, None], self.plans.choices(x0), np.inf)
+        failing = np.flatnonzero(rho.max(1) < -PROVED)
+        least = rho.reshape(POINTS, len(boxes), -1).min(0)
+        refuted = np.zeros(len(at), dtype=bool)
+        if len(failing):
+            chosen = self.robustness(x0[torch.from_numpy(failing)])
+            refuted[failing] = chosen < -TOLERANCE
+            self._witness(result, x0[failing[int(np.argmin(chosen))]], float(chosen.min()))
+        index = least.argmax(1)
+        hopeful: Bools = least[np.arange(len(boxes)), index] >= -PROVED
+        return _Samples(np.any(refuted.reshape(POINTS, -1), axis=0), index, hopeful)
 
-    # ----------------------------------------------------------------------------- bounds
-
-    def bound(self, mode: Mode, boxes: Sequence[Box], index: int) -> tuple[Floats, Floats]:
-        """Bounds for one proposal over boxes.
-
-        Args:
-            mode: mode of the boxes.
-            boxes: the boxes.
-            index: number of the proposal.
-
-        Returns:
-            Lower bounds on the robustness of the proposal, (boxes,); and the effect of each coordinate on the
-            predicted states, (boxes, coordinates).
-        """
-        table = {"": Forms.point(np.zeros(len(boxes)))}
-        for i, name in enumerate(mode.coordinates):
-            generators = np.zeros((i + 1, len(boxes)))
-            generators[i] = [box.half[i] for box in boxes]
-            centre = np.array([box.centre[i] for box in boxes])
-            table[name] = Forms(centre, generators, np.zeros(len(boxes)))
-        names = self._task.system.names
-        try:
-            drawn = mode.states(table, names, FORMS)
-        except ValueError:
-            return np.full(len(boxes), -np.inf), np.stack([box.half for box in boxes])
-        with FORMS.quiet():
-            history = self._predicted(dict(zip(names, drawn, strict=True)), len(boxes), index)
-            return self._judged(history), self._effects(history, len(mode.coordinates))
-
-    def _predicted(self, start: dict[str, Forms], batch: int, index: int) -> dict[str, list[Forms]]:
-        """Forms of the states under one proposal: name -> one form (batch,) per sample of the plan."""
-        env = {name: _full(form, batch) for name, form in start.items()}
-        seen = self._observe(env, FORMS)
-        plan = self._plans.plan([_full(seen[str(i)], batch) for i in range(len(seen))], index)
-        history = {name: [form] for name, form in env.items()}
-        for step in plan:
-            moving = {**env, **dict(zip(self._controls, step, strict=True))}
-            for block in self._blocks:
-                moving.update(block(moving, FORMS))
-            env = {**env, **{name: _full(moving[f"{name}'"], batch) for name in self._moved}}
-            for name, form in env.items():
-                history[name].append(form)
-        return history
-
-    def _judged(self, history: dict[str, list[Forms]]) -> Floats:
-        """Lower bounds on the robustness of predicted states, (batch,)."""
-        end = self._task.graph.end
-        env: dict[str, Intervals] = {name: ranges(forms) for name, forms in history.items()}
-        formulas = [rule.formula for rule in self._task.compiled.requirements]
-        found = evaluate(formulas, env, ops=INTERVALS, end=end)
-        least: Floats = np.min([each.low[0] for each in found], axis=0)
-        return least
-
-    def _effects(self, history: dict[str, list[Forms]], count: int) -> Floats:
-        """Sum of the effects of each coordinate on the states that move, as shares of their ranges."""
-        batch = len(next(iter(history.values()))[0].centre)
-        total = np.full((count, batch), 1e-12)
-        columns = {column.name: column for column in self._task.system.signature.columns}
-        for name in self._moved:
-            forms, column = history[name], columns[name]
-            width = (column.high or 1.0) - (column.low or 0.0)
-            for form in forms:
-                share = np.abs(form.generators[:count]) / max(width, 1e-9)
-                total[: len(share)] += share
-        return total.T
-
-
-def _full(form: Forms, batch: int) -> Forms:
-    """The form with one element per box."""
-    if form.shape == (batch,):
-        return form
-    generators = np.broadcast_to(
-        form.generators.reshape(len(form.generators), -1), (len(form.generators), batch)
-    )
-    return Forms(np.broadcast_to(form.centre, batch), generators, np.broadcast_to(form.rest, batch))
-
-
-def _whole(mode: Mode) -> Box:
-    count = len(mode.coordinates)
-    return Box(np.full(count, 0.5), np.full(count, 0.5))
+    def _witness(self, result: ModeResult, state: torch.Tensor, rho: float) -> None:
+        if rho < -TOLERANCE and (result.witness is None or rho < result.witness.robustness):
+            result.witness = Witness(dict(zip(self._names, state.tolist(), strict=True)), rho)

@@ -6,7 +6,7 @@ on half of the state space and covers all of it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -16,8 +16,9 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import Hard
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from stlc.compile.backends.array.namespace import Ops
     from stlc.dynamics.declaration.motion import Assign
     from stlc.dynamics.schema.names import ControlDecl
 
@@ -59,6 +60,14 @@ class Mirror:
             if each.squash == "angle":
                 moved[..., index] = torch.remainder(moved[..., index] - each.low, 2.0 * torch.pi) + each.low
         return moved
+
+    def image_of_states(self, states: Mapping[str, Any], ops: Ops) -> dict[str, Any]:
+        """Return the states that the mirror changes, over any array library: name -> array."""
+        return self._states(states, ops, HARD) if self._states.columns else {}
+
+    def image_of_controls(self, controls: Mapping[str, Any], ops: Ops) -> dict[str, Any]:
+        """Return the controls that the mirror changes, over any array library, without wrapping angles."""
+        return self._inputs(controls, ops, HARD) if self._inputs.columns else {}
 
     def fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Map states (B, n) to their representatives (B, n).

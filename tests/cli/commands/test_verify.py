@@ -49,8 +49,21 @@ def test_a_least_share_decides_the_exit_code(run: str, least: str, code: int) ->
     assert main(["verify", run, "--boxes", "3", "--fail-under", least]) == code
 
 
-def test_what_cannot_be_verified_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = trained(tmp_path, "ship_safe")
+def test_boxes_around_random_states(run: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", run, "--boxes", "1", "--states", "20", "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert result["states"] == sum(mode["states"] for mode in result["modes"]) == 20
+    assert result["states_proved"] + result["states_violated"] <= 20
+    assert result["states_share"] <= result["states_proved"] / 20
+    main(["verify", run, "--boxes", "1", "--states", "20", "--clock", "processor"])
+    assert " of 20 random initial states are in a proved box" in capsys.readouterr().out
+
+
+def test_what_cannot_be_verified_is_refused(
+    run: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shooting = trained(tmp_path, "traffic", "ppo")
     capsys.readouterr()
-    assert main(["verify", run]) == 2
+    assert main(["verify", shooting]) == 2
     assert "can be verified" in capsys.readouterr().err
+    assert main(["verify", run, "--clock", "moon"]) == 2

@@ -1,0 +1,191 @@
+"""Proofs on boxes of initial states for trained policies: proved, refuted and open shares of each mode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from benchmarks.options import Output, ResultsOption, RunsArgument
+from benchmarks.store import Key, Result, ResultStore, inputs_of
+from benchmarks.table import Columns, listed, provenance, publish
+from benchmarks.timing import one_thread
+from stlc.assurance.bounds import clopper_pearson_lower
+from stlc.cli.framework.options import parse_seconds
+from stlc.cli.framework.output import say
+from stlc.cli.framework.program import command
+from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.training.budget import clock_of
+from stlc.controller.training.run import Run
+from stlc.controller.verification.plans import Plans
+from stlc.controller.verification.subject import Subject
+from stlc.controller.verification.verify import Verification, Verifier
+from stlc.provenance import sha256
+from stlc.rundir import RunDir
+
+_OUTPUT = Output(Path("docs/assurance.md"))
+TEXT = """\
+Written by `python -m benchmarks verify` from `benchmarks/results/verify.json`. `proved`, `refuted` and
+`open`: shares of the initial states by branch and bound. `states`: random initial states that are in a box
+with a proof, of all that were drawn; the others are violated or open. `with a proof`: share of all initial
+states of the mode with such a box, at least, with 95 % confidence. `violations`: random points of proved
+boxes from which the policy violates the specification, of all that were drawn. Times are processor times of
+one thread.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Result for one mode of the initial states of a policy.
+
+    Attributes:
+        spec: name of the specification.
+        mode: name of the mode.
+        probability: its probability.
+        proved: share of proved boxes.
+        refuted: share of boxes with a counterexample.
+        open: share of other boxes.
+        states: number of random initial states.
+        with_proof: number of these in a box with a proof.
+        violated: number of these from which the policy violates the specification.
+        violations: number of violations among random points of proved boxes.
+        points: number of these points.
+    """
+
+    spec: str
+    mode: str
+    probability: float
+    proved: float
+    refuted: float
+    open: float
+    states: int
+    with_proof: int
+    violated: int
+    violations: int
+    points: int
+
+    @property
+    def least(self) -> float:
+        """Lower bound on the share of initial states in a box with a proof."""
+        return clopper_pearson_lower(self.with_proof, self.states) if self.states else 0.0
+
+
+COLUMNS: Columns[Row] = {
+    "policy": "{spec}",
+    "initial states": "{mode}",
+    "probability": "{probability:.1%}",
+    "proved": lambda row: _share(row.proved),
+    "refuted": lambda row: _share(row.refuted),
+    "open": "{open:.1%}",
+    "states": "{with_proof} / {states}",
+    "with a proof": "{least:.1%}",
+    "violations": "{violations} / {points:,}",
+}
+
+
+@command(
+    "python -m benchmarks verify runs/traffic/latest",
+    "python -m benchmarks verify runs/*/latest --budget 10min --states 1000 --page docs/assurance.md",
+)
+def verify(
+    runs: RunsArgument = None,
+    budget: Annotated[
+        str, typer.Option("--budget", metavar="TIME", help="Processor time of branch and bound for each run.")
+    ] = "10min",
+    states: Annotated[
+        int, typer.Option("--states", metavar="N", min=1, help="Random initial states of each run.")
+    ] = 1000,
+    points: Annotated[
+        int, typer.Option("--points", metavar="N", min=1, help="Random points in each proved box.")
+    ] = 1000,
+    out: ResultsOption = Path("benchmarks/results"),
+    output: Output = _OUTPUT,
+) -> None:
+    """Prove plans of trained policies on boxes of initial states, and write the table.
+
+    Results are stored, and not computed again while specification, system and policy are the same.
+    """
+    store = ResultStore("verify", out)
+    folders = [RunDir.open(name) for name in runs or ["latest"]]
+    results = [_verified(folder, parse_seconds(budget), states, points, store) for folder in folders]
+
+    def rows(every: Sequence[Result]) -> list[Row]:
+        return [Row(**mode) for each in every for mode in each["modes"]]
+
+    def section() -> list[str]:
+        every = [*store.all().values()]
+        spent = ", ".join(
+            f"{each['key']['spec']} {each['seconds']:.0f} s, for the states {each['seconds_of_states']:.0f} s"
+            for each in every
+        )
+        table = listed("verify", rows(every), COLUMNS).markdown()
+        return [TEXT, *table, "", f"- {spent}", *provenance(every, "runs")]
+
+    publish("verify", output, section, {"rows": listed("verify", rows(results), COLUMNS)})
+
+
+def _verified(folder: RunDir, seconds: float, states: int, points: int, store: ResultStore) -> Result:
+    """Result for a run, from the store or computed."""
+    run = Run.open(folder.path)
+    values: dict[str, Any] = {
+        "spec": run.task.compiled.name,
+        **inputs_of(run.task),
+        "policy_sha256": sha256((folder.path / "ckpt" / "last.json").read_text(encoding="utf-8")),
+        "seconds": seconds,
+        "states": states,
+        "points": points,
+    }
+
+    def compute() -> Result:
+        one_thread()
+        say(f"verifying {folder.shown}")
+        clock = clock_of("processor")
+        subject = Plans(run.task, run.policy)
+        verifier = Verifier(subject, clock=clock)
+        found = verifier.run(seconds)
+        begun = clock()
+        around = {each.mode.name: each for each in verifier.around(states)}
+        spent = clock() - begun
+        modes = []
+        for each in found.modes:
+            near = around.get(each.mode.name)
+            boxes = [*each.boxes, *(near.boxes if near else [])]
+            modes.append(
+                {
+                    "spec": values["spec"],
+                    "mode": each.mode.name,
+                    "probability": found.probability(each),
+                    "proved": each.proved,
+                    "refuted": each.refuted,
+                    "open": each.open,
+                    "states": near.states if near else 0,
+                    "with_proof": near.proved if near else 0,
+                    "violated": near.violated if near else 0,
+                    "violations": _violations(subject, found, each.mode.name, boxes, points),
+                    "points": len(boxes) * points,
+                }
+            )
+        return {"run": folder.name, "seconds": found.seconds, "seconds_of_states": spent, "modes": modes}
+
+    return store.get(Key(values["spec"], values), compute)
+
+
+def _violations(subject: Subject, found: Verification, name: str, boxes: Sequence[Any], points: int) -> int:
+    """Number of violations among random points of proved boxes of a mode."""
+    rng = np.random.default_rng(11)
+    (mode,) = (each.mode for each in found.modes if each.mode.name == name)
+    count = 0
+    for box in boxes:
+        at = box.centre + rng.uniform(-1.0, 1.0, (points, len(box.half))) * box.half
+        at = at[subject.admits(mode, at)]
+        if len(at):
+            count += int((subject.robustness(subject.states(mode, at)) < -TOLERANCE).sum())
+    return count
+
+
+def _share(value: float) -> str:
+    return f"{value:.1%}" if value >= 5e-4 or value == 0.0 else f"{100.0 * value:.0e} %"

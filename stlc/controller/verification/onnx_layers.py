@@ -1,0 +1,113 @@
+"""Feed-forward networks in ONNX, read as layers: a chain of linear maps and activations.
+
+Linear maps that follow each other are multiplied into one. Nothing in a file is executed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stlc.controller.verification.forms import Floats
+from stlc.controller.verification.network import Layer
+from stlc.diagnostics import Diagnostic, MissingError, usage
+
+
+def read_onnx(path: Path) -> list[Layer]:
+    """Read a feed-forward network: one input, one output, and a chain of layers.
+
+    Raises:
+        UsageError: U101, the file cannot be read, or has an operation that is not supported.
+        MissingError: R301, the package onnx is missing.
+    """
+    try:
+        import onnx
+        from onnx import numpy_helper
+    except ImportError:
+        message = "a network in ONNX needs the package onnx"
+        raise MissingError(Diagnostic("R301", message, help=("pip install 'stlc[onnx]'",))) from None
+    try:
+        graph = onnx.load(str(path), load_external_data=False).graph
+        constants = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
+    except Exception as error:
+        raise usage(f"`{path}` is not a network in ONNX: {str(error)[:200]}") from None
+    chain = _Chain()
+    inputs = [each for each in graph.input if each.name not in constants]
+    if len(inputs) != 1 or len(graph.output) != 1:
+        raise usage(f"`{path}` does not have one input and one output")
+    here = inputs[0].name
+    shape = [each.dim_value for each in inputs[0].type.tensor_type.shape.dim]
+    chain.size = max([each for each in shape if each > 0], default=0)
+    for node in graph.node:
+        if node.op_type == "Constant":
+            constants[node.output[0]] = numpy_helper.to_array(node.attribute[0].t)
+            continue
+        if here not in node.input:
+            raise usage(f"`{path}` is not a chain of layers: `{node.op_type}` reads another value")
+        try:
+            options = {each.name: onnx.helper.get_attribute_value(each) for each in node.attribute}
+            values = [np.asarray(constants[name], dtype=np.float64) for name in node.input if name != here]
+            chain.add(node.op_type, values, options, first=node.input[0] == here)
+        except (KeyError, ValueError, IndexError) as error:
+            raise usage(
+                f"`{path}` has an operation that is not supported: {node.op_type} ({error})"
+            ) from None
+        here = node.output[0]
+    if here != graph.output[0].name:
+        raise usage(f"`{path}` is not a chain of layers: its output is not that of the last one")
+    return chain.finished()
+
+
+class _Chain:
+    """Layers that are read so far, and a linear map after them."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._layers: list[Layer] = []
+        self._map: tuple[Floats, Floats] | None = None
+
+    def add(self, kind: str, values: Sequence[Floats], options: Mapping[str, Any], *, first: bool) -> None:
+        """Add an operation; `values` are its constant operands, `first` says that the chain comes first."""
+        if kind in ("Identity", "Flatten", "Reshape", "Squeeze", "Unsqueeze", "Dropout", "Cast"):
+            return
+        if kind in ("Relu", "Tanh", "Sigmoid"):
+            self._layers.append(Layer(*self._linear(self.size), kind.lower()))
+            self._map = None
+        elif kind == "Gemm" and first:
+            weight = values[0] if options.get("transB", 0) else values[0].T
+            bias = values[1].reshape(-1) if len(values) > 1 else np.zeros(len(weight))
+            self._compose(weight * options.get("alpha", 1.0), bias * options.get("beta", 1.0))
+        elif kind == "MatMul":
+            weight = values[0].T if first else values[0]
+            self._compose(weight, np.zeros(len(weight)))
+        elif kind in ("Add", "Sub", "Mul", "Div") and (first or kind in ("Add", "Mul")):
+            self._each(kind, values[0].reshape(-1))
+        else:
+            raise ValueError("no layer of a feed-forward network")
+
+    def _each(self, kind: str, value: Floats) -> None:
+        """Add an operation on each component with a constant."""
+        size = self._linear(max(self.size, value.size))[0].shape[0]
+        value = np.broadcast_to(value, size)
+        if kind in ("Add", "Sub"):
+            self._compose(np.eye(size), value if kind == "Add" else -value)
+        else:
+            self._compose(np.diag(value if kind == "Mul" else 1.0 / value), np.zeros(size))
+
+    def _linear(self, size: int) -> tuple[Floats, Floats]:
+        """The linear map after the layers; the identity if there is none."""
+        if self._map is not None:
+            return self._map
+        size = self._layers[-1].weight.shape[0] if self._layers else size
+        return np.eye(size), np.zeros(size)
+
+    def _compose(self, weight: Floats, bias: Floats) -> None:
+        before, shift = self._linear(weight.shape[1])
+        self._map = weight @ before, weight @ shift + bias
+
+    def finished(self) -> list[Layer]:
+        """All layers, the last one linear."""
+        return [*self._layers, Layer(*self._linear(self.size))]

@@ -1,0 +1,163 @@
+"""Closed loops with a network: bounds, exact solutions, networks in ONNX, and what is refused."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stlc.cli.framework.app import main
+from stlc.controller.problem.load import load_task
+from stlc.controller.verification.boxes import Box
+from stlc.controller.verification.forms import Forms
+from stlc.controller.verification.loop import ClosedLoop
+from stlc.controller.verification.network import Layer, NetworkBounds
+from stlc.controller.verification.onnx_layers import read_onnx
+from stlc.controller.verification.verify import Verifier
+from stlc.diagnostics import UsageError
+
+ROOT = Path(__file__).parents[3]
+SPEC = str(ROOT / "examples" / "ainncs" / "single_pendulum.stl")
+
+
+def random_layers(kind: str, inputs: int = 2, outputs: int = 1) -> list[Layer]:
+    """Layers of a small random network, whose last layer is linear."""
+    rng = np.random.default_rng(7)
+    hidden = Layer(rng.normal(size=(8, inputs)), rng.normal(size=8), kind)
+    return [hidden, Layer(0.2 * rng.normal(size=(outputs, 8)), rng.normal(size=outputs))]
+
+
+@cache
+def loop(kind: str, period: int = 2, *, continuous: bool = False, substeps: int = 1) -> ClosedLoop:
+    task = load_task(SPEC, overrides={"time.substeps": str(substeps)})
+    return ClosedLoop(task, random_layers(kind), period, continuous=continuous)
+
+
+@pytest.mark.parametrize("kind", ["relu", "tanh", "sigmoid"])
+@pytest.mark.parametrize("continuous", [False, True])
+def test_bounds_contain_the_simulated_robustness(kind: str, continuous: bool) -> None:
+    found = loop(kind, continuous=continuous)
+    exact = loop(kind, substeps=40) if continuous else found
+    rng, mode = np.random.default_rng(1), found.modes[0]
+    centre = rng.uniform(0.05, 0.95, (30, 2))
+    half = 10.0 ** rng.uniform(-3, -1.3, (30, 2))
+    bounds = found.bound(mode, [Box(*each) for each in zip(centre, half, strict=True)], 0)
+    assert np.isfinite(bounds.low).sum() > 20
+    for _ in range(5):
+        at = np.clip(centre + rng.choice([-1.0, 1.0, 0.3], centre.shape) * half, 0, 1)
+        rho = exact.robustness(exact.states(mode, at))
+        assert (bounds.low <= rho + 1e-7).all()
+        assert (bounds.high >= rho - 1e-7).all()
+
+
+def test_the_network_acts_once_per_period() -> None:
+    states = loop("tanh", 2).simulated(loop("tanh", 2).states(loop("tanh").modes[0], np.array([[0.5, 0.5]])))
+    other = loop("tanh", 1).simulated(states[:, 0])
+    np.testing.assert_allclose(states[:, 1], other[:, 1])
+    assert float((states[:, 2] - other[:, 2]).abs().max()) > 1e-6
+
+
+@pytest.mark.parametrize("kind", ["relu", "tanh", "sigmoid"])
+def test_outputs_of_a_network_stay_within_their_forms(kind: str) -> None:
+    layers, rng = random_layers(kind, 3, 2), np.random.default_rng(3)
+    centre, generators = rng.normal(size=(5, 3)), 0.3 * rng.normal(size=(4, 5, 3))
+    found = NetworkBounds(layers).outputs(Forms(centre, generators, np.zeros((5, 3))))
+    bound = found.range
+    for _ in range(50):
+        x = centre + np.tensordot(rng.uniform(-1, 1, 4), generators, 1)
+        first = x @ layers[0].weight.T + layers[0].bias
+        hidden = {
+            "relu": np.maximum(first, 0),
+            "tanh": np.tanh(first),
+            "sigmoid": 1 / (1 + np.exp(-first)),
+        }[kind]
+        exact = hidden @ layers[1].weight.T + layers[1].bias
+        assert ((bound.low <= exact) & (exact <= bound.high)).all()
+
+
+def test_sampled_states_of_proved_boxes_satisfy_the_specification() -> None:
+    subject = ClosedLoop(load_task(SPEC), [Layer(np.array([[-2.0, -1.0]]), np.zeros(1))])
+    result = Verifier(subject, seed=2).run(1e6, boxes=200).modes[0]
+    assert result.proved > 0.3
+    rng = np.random.default_rng(6)
+    for box in result.boxes[:10]:
+        at = box.centre + rng.uniform(-1, 1, (100, 2)) * box.half
+        assert (subject.robustness(subject.states(result.mode, at)) >= -1e-6).all()
+
+
+# ---------------------------------------------------------------------------------- networks
+
+
+def written(path: Path, layers: list[Layer], scale: float = 1.0) -> Path:
+    """Write a network with Gemm, MatMul, Add and an activation; its inputs are multiplied by `scale`."""
+    onnx = pytest.importorskip("onnx")
+    helper, arrays = onnx.helper, onnx.numpy_helper
+
+    def constant(value: Any, name: str) -> Any:
+        return arrays.from_array(np.asarray(value, dtype=np.float32), name)
+
+    first, last = layers
+    nodes = [
+        helper.make_node("Mul", ["x", "scale"], ["s"]),
+        helper.make_node("Gemm", ["s", "W", "b"], ["h"], transB=1),
+        helper.make_node(first.activation.capitalize(), ["h"], ["a"]),
+        helper.make_node("MatMul", ["a", "V"], ["m"]),
+        helper.make_node("Add", ["m", "c"], ["u"]),
+    ]
+    values = [
+        constant([scale], "scale"),
+        constant(first.weight, "W"),
+        constant(first.bias, "b"),
+        constant(last.weight.T, "V"),
+        constant(last.bias, "c"),
+    ]
+    real = onnx.TensorProto.FLOAT
+    ports = (
+        [helper.make_tensor_value_info("x", real, [1, first.weight.shape[1]])],
+        [helper.make_tensor_value_info("u", real, [1, len(last.bias)])],
+    )
+    graph = helper.make_graph(nodes, "network", *ports, values)
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), str(path))
+    return path
+
+
+def test_layers_of_a_file_in_onnx(tmp_path: Path) -> None:
+    layers = random_layers("tanh")
+    first, last = read_onnx(written(tmp_path / "net.onnx", layers, 2.0))
+    np.testing.assert_allclose(first.weight, 2.0 * layers[0].weight, rtol=1e-6)
+    np.testing.assert_allclose(first.bias, layers[0].bias, rtol=1e-6)
+    np.testing.assert_allclose(last.weight, layers[1].weight, rtol=1e-6)
+    assert (first.activation, last.activation) == ("tanh", "linear")
+
+
+def test_a_closed_loop_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(written(tmp_path / "net.onnx", random_layers("tanh")))
+    arguments = ["verify", SPEC, "--controller", path, "--boxes", "64"]
+    assert main([*arguments, "--period", "0.1s", "--continuous"]) in (0, 1, 4)
+    assert "initial set" in capsys.readouterr().out
+    assert main([*arguments, "--period", "0.07s"]) == 2
+    assert "not a multiple of the time step" in capsys.readouterr().err
+    assert main(["verify", "latest", "--period", "0.1s"]) == 2
+
+
+def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    (tmp_path / "net.onnx").write_bytes(b"\x08\x07no network")
+    with pytest.raises(UsageError, match=r"not a network|one input"):
+        read_onnx(tmp_path / "net.onnx")
+    with pytest.raises(UsageError, match="not a network"):
+        read_onnx(tmp_path / "absent.onnx")
+
+
+def test_a_network_of_other_sizes_is_refused() -> None:
+    with pytest.raises(UsageError, match="takes 3 numbers"):
+        ClosedLoop(load_task(SPEC), random_layers("relu", inputs=3))
+
+
+def test_solutions_of_a_system_with_jumps_are_refused() -> None:
+    task = load_task(ROOT / "specs" / "traffic.stl")
+    with pytest.raises(UsageError, match="cannot be bounded"):
+        ClosedLoop(task, random_layers("relu", inputs=7), continuous=True)
