@@ -129,12 +129,13 @@ class Proposal:
 
 
 class Portfolio:
-    """The strategies of a search, in turn: constant vertices first, then points for the others to start from.
+    """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
 
-    After that every other turn goes to the strategy that has found the least robust point. If the robustness
-    takes few values, as that of conditions on gears does, nothing can be learnt from it: then points are
-    drawn at random. In a space most of whose coordinates have no effect, `SensitiveClimbing` is the only
-    strategy, and points are uniform while the robustness hardly ever changes.
+    Every third point is random, every third one goes to the strategy that has found the least robust point,
+    and the rest to all in turn. If the robustness takes few values, as that of conditions on gears does,
+    nothing can be learnt from it: then points are drawn at random.
+    In a space most of whose coordinates have no effect, `SensitiveClimbing` is the only strategy, and points are
+    uniform while the robustness hardly ever changes.
     """
 
     def __init__(
