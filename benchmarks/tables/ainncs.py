@@ -29,8 +29,8 @@ from stlc.cli.framework.program import command
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.load import load_task
 from stlc.controller.training.budget import clock_of
-from stlc.controller.verification.loop import ClosedLoop
-from stlc.controller.verification.network import Layer
+from stlc.controller.verification.loop import NetworkLoop
+from stlc.controller.verification.network import NetworkLayer
 from stlc.controller.verification.onnx_layers import read_onnx
 from stlc.controller.verification.verify import Verifier
 from stlc.diagnostics import usage
@@ -211,7 +211,7 @@ def _verified(case: Case, models: Path, seconds: float, store: ResultStore) -> R
     def compute() -> Result:
         one_thread()
         say(f"verifying {case.name}")
-        subject = ClosedLoop(task, layers_of(path), case.steps, continuous=True)
+        subject = NetworkLoop(task, layers_of(path), case.steps, continuous=True)
         found = Verifier(subject, clock=clock_of("processor")).run(seconds, until_refuted=True)
         (result,) = found.modes
         rng, violations, points = np.random.default_rng(11), 0, 0
@@ -247,7 +247,7 @@ def _others(path: Path) -> Mapping[tuple[str, str], str]:
 # --------------------------------------------------------------------------------- networks
 
 
-def layers_of(path: Path) -> list[Layer]:
+def layers_of(path: Path) -> list[NetworkLayer]:
     """Read a network in one of the formats of the models.
 
     Raises:
@@ -266,7 +266,7 @@ def layers_of(path: Path) -> list[Layer]:
             raise usage(f"`{path}` is not a network in a known format")
 
 
-def _matlab(path: Path) -> list[Layer]:
+def _matlab(path: Path) -> list[NetworkLayer]:
     """Read a file of MATLAB with the weights W, the biases b and the names of the activations."""
     from scipy.io import loadmat
 
@@ -275,16 +275,16 @@ def _matlab(path: Path) -> list[Layer]:
     weights = [np.asarray(each, dtype=float) for each in found["W"].ravel()]
     biases = [np.asarray(each, dtype=float).ravel() for each in found["b"].ravel()]
     return [
-        Layer(weight.reshape(weight.shape[:2]), bias, name)
+        NetworkLayer(weight.reshape(weight.shape[:2]), bias, name)
         for weight, bias, name in zip(weights, biases, names[: len(weights)], strict=True)
     ]
 
 
-def _yaml(path: Path) -> list[Layer]:
+def _yaml(path: Path) -> list[NetworkLayer]:
     """Read a file with weights, offsets and activations by the number of the layer."""
     found: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
     return [
-        Layer(
+        NetworkLayer(
             np.array(found["weights"][number], dtype=float),
             np.array(found["offsets"][number], dtype=float),
             str(found["activations"][number]).lower(),
@@ -293,7 +293,7 @@ def _yaml(path: Path) -> list[Layer]:
     ]
 
 
-def _nnet(path: Path) -> list[Layer]:
+def _nnet(path: Path) -> list[NetworkLayer]:
     """Read a file in the format NNet (Julian 2016): ReLU layers and a linear one, without its scaling."""
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("//")]
     rows = [[float(each) for each in re.findall(r"[^,\s]+", line)] for line in lines]
@@ -302,6 +302,6 @@ def _nnet(path: Path) -> list[Layer]:
     for number in range(count):
         width = sizes[number + 1]
         weight, bias = np.array(rows[at : at + width]), np.array(rows[at + width : at + 2 * width]).ravel()
-        layers.append(Layer(weight, bias, "relu" if number < count - 1 else "linear"))
+        layers.append(NetworkLayer(weight, bias, "relu" if number < count - 1 else "linear"))
         at += 2 * width
     return layers

@@ -18,7 +18,7 @@ from benchmarks.options import OnlyOption, Output, ResultsOption
 from benchmarks.store import RESULTS, Key, Result, ResultStore, inputs_of
 from benchmarks.table import Columns, Table, listed, provenance, publish
 from benchmarks.timing import one_thread
-from stlc.assurance.falsify import FALSIFIER_VERSION, Search
+from stlc.assurance.falsify import FALSIFIER_VERSION, ViolationSearch
 from stlc.assurance.model_simulator import ModelSimulator
 from stlc.cli.framework.options import parse_seeds
 from stlc.cli.framework.output import say
@@ -233,7 +233,7 @@ def _side_by_side(case: Case, simulator: ModelSimulator, seeds: Sequence[int]) -
     """Carry out the searches of all seeds, one simulation of each at a time."""
     say(f"falsifying {case.name}")
     requirement = simulator.requirements.index(case.requirement)
-    searches = [Search(simulator, requirement, seed) for seed in seeds]
+    searches = [ViolationSearch(simulator, requirement, seed) for seed in seeds]
     going = searches
     while going:
         points = [search.ask(1) for search in going]
@@ -244,7 +244,7 @@ def _side_by_side(case: Case, simulator: ModelSimulator, seeds: Sequence[int]) -
     return [_record(search, seed) for search, seed in zip(searches, seeds, strict=True)]
 
 
-def _record(search: Search, seed: int) -> Mapping[str, Any]:
+def _record(search: ViolationSearch, seed: int) -> Mapping[str, Any]:
     result, best = search.result(shrinks=False), search.found
     violations = [each.simulation for each in (*result.spurious, *([] if best is None else [best]))]
     return {

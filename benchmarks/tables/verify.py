@@ -21,8 +21,8 @@ from stlc.cli.framework.program import command
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.training.budget import clock_of
 from stlc.controller.training.run import Run
-from stlc.controller.verification.plans import Plans
-from stlc.controller.verification.subject import Subject
+from stlc.controller.verification.plans import ProposedPlans
+from stlc.controller.verification.subject import VerificationSubject
 from stlc.controller.verification.verify import Verification, Verifier
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
@@ -144,7 +144,7 @@ def _verified(folder: RunDir, seconds: float, states: int, points: int, store: R
         one_thread()
         say(f"verifying {folder.shown}")
         clock = clock_of("processor")
-        subject = Plans(run.task, run.policy)
+        subject = ProposedPlans(run.task, run.policy)
         verifier = Verifier(subject, clock=clock)
         found = verifier.run(seconds)
         begun = clock()
@@ -174,7 +174,9 @@ def _verified(folder: RunDir, seconds: float, states: int, points: int, store: R
     return store.get(Key(values["spec"], values), compute)
 
 
-def _violations(subject: Subject, found: Verification, name: str, boxes: Sequence[Any], points: int) -> int:
+def _violations(
+    subject: VerificationSubject, found: Verification, name: str, boxes: Sequence[Any], points: int
+) -> int:
     """Number of violations among random points of proved boxes of a mode."""
     rng = np.random.default_rng(11)
     (mode,) = (each.mode for each in found.modes if each.mode.name == name)

@@ -133,9 +133,9 @@ class Portfolio:
 
     Every third point is random, every third one goes to the strategy that has found the least robust point,
     and the rest to all in turn. If the robustness takes few values, as that of conditions on gears does,
-    nothing can be learnt from it: then points are drawn at random.
-    In a space most of whose coordinates have no effect, `SensitiveClimbing` is the only strategy, and points are
-    uniform while the robustness hardly ever changes.
+    nothing can be learnt from it: then points are drawn at random. In a space most of whose coordinates have
+    no effect, `SensitiveClimbing` is the only strategy, and points are uniform while the robustness hardly
+    ever changes.
     """
 
     def __init__(
@@ -235,7 +235,7 @@ class Portfolio:
                 other.observe(proposal.point, value)
 
 
-class Search:
+class ViolationSearch:
     """A search for a violation of one requirement, as a dialogue: points are asked for, outcomes are told.
 
     The first simulations measure the sizes of the predicates. They are judged again with the scales that
@@ -380,7 +380,7 @@ def falsify(
         shrinks: whether a counterexample is shrunk.
     """
     began = perf_counter()
-    search = Search(simulator, requirement, seed, random=random)
+    search = ViolationSearch(simulator, requirement, seed, random=random)
     while search.found is None and search.tried < budget.simulations and not search.exhausted:
         if budget.seconds is not None and perf_counter() - began > budget.seconds:
             break
@@ -425,24 +425,32 @@ def falsify_each(
     shared = simulator if workers is None else SharedSimulator(simulator, workers, order.batch)
     if workers is None or len(requirements) == 1:
         for each in requirements:
-            yield _search(shared, (each, order))
+            yield _search(shared, _Ordered(each, order))
         return
-    ended = workers.run(_search, [(each, order) for each in requirements])
+    ended = workers.run(_search, [_Ordered(each, order) for each in requirements])
     for each in requirements:
         found = next(ended)
         if isinstance(found, LostCall):
             ended = iter(list(ended))  # the workers must be free
-            found = _search(shared, (each, order))
+            found = _search(shared, _Ordered(each, order))
         yield found
 
 
-def _search(simulator: Simulator, what: tuple[int, SearchOrder]) -> Falsification:
-    requirement, order = what
+@dataclass(frozen=True, slots=True)
+class _Ordered:
+    """A search as it is sent to a worker: index of the requirement, and the settings."""
+
+    requirement: int
+    order: SearchOrder
+
+
+def _search(simulator: Simulator, ordered: _Ordered) -> Falsification:
+    order = ordered.order
     if order.batch is not None and not isinstance(simulator, SharedSimulator):
         simulator = SharedSimulator(simulator, None, order.batch)
     return falsify(
         simulator,
-        requirement,
+        ordered.requirement,
         budget=order.budget,
         seed=order.seed,
         random=order.random,

@@ -167,7 +167,7 @@ class SharedSimulator:
         parts = [points[first : first + self._part] for first in range(0, len(points), self._part)]
         if self.workers is None or len(points) == 1:
             return Simulations.joined([self.local.simulate(part, focus) for part in parts])
-        found = list(self.workers.run(_simulated, [(part, focus) for part in parts]))
+        found = list(self.workers.run(_simulated, [_Part(part, focus) for part in parts]))
         known = [each for each in found if not isinstance(each, LostCall)]
         sizes = np.concatenate([each.sizes for each in known]) if known else np.zeros((0, 0))
         whole = []
@@ -195,5 +195,13 @@ def _missing(count: int, sizes: NDArray[np.float64]) -> Simulations:
     return Simulations(nothing, nothing, np.zeros(count, dtype=np.bool_), np.tile(typical, (count, 1)))
 
 
-def _simulated(simulator: Simulator, order: tuple[NDArray[np.float64], Focus]) -> Simulations:
-    return simulator.simulate(*order)
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Points, (count, dim), as they are sent to a worker, and the focus of their judgement."""
+
+    points: NDArray[np.float64]
+    focus: Focus
+
+
+def _simulated(simulator: Simulator, part: _Part) -> Simulations:
+    return simulator.simulate(part.points, part.focus)

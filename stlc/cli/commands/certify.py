@@ -69,7 +69,7 @@ DRIVING = Driving()
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class DrawnSubject:
     """Options on what is simulated instead of a policy."""
 
     plant: Annotated[
@@ -87,7 +87,7 @@ class Drawing:
     ] = 1
 
 
-DRAWING = Drawing()
+DRAWING = DrawnSubject()
 
 
 @command(
@@ -124,7 +124,7 @@ def certify(
         ),
     ] = None,
     how: Driving = DRIVING,
-    what: Drawing = DRAWING,
+    what: DrawnSubject = DRAWING,
     seeds: Annotated[
         str | None,
         typer.Option(
@@ -201,7 +201,7 @@ class _Chosen:
 
     name: str | None
     how: Driving
-    what: Drawing
+    what: DrawnSubject
     require: tuple[str, ...]
     overrides: Mapping[str, str]
     runs: Path
@@ -266,7 +266,7 @@ class _Chosen:
         return ModelDraws(simulator, find_spec(self.name), self.require, self.overrides)
 
 
-def require_drawn(name: str | None, how: Driving, what: Drawing) -> None:
+def require_drawn(name: str | None, how: Driving, what: DrawnSubject) -> None:
     """Raise UsageError (U101) if an option does not suit the certificate of a plant or system."""
     option = "--plant" if what.plant is not None else "--system"
     if what.plant is not None and what.system is not None:
@@ -359,7 +359,7 @@ def _finding_text(each: CertifiedFinding) -> str:
 # ------------------------------------------------------------------------- verification
 
 
-def _verified(path: Path, name: str | None, what: Drawing, runs: Path) -> Answer[CertifyResult]:
+def _verified(path: Path, name: str | None, what: DrawnSubject, runs: Path) -> Answer[CertifyResult]:
     """Compare the certificate in a file with what it names, or with what is given instead."""
     from stlc.jsontext import plain
 
@@ -381,7 +381,7 @@ def _verified(path: Path, name: str | None, what: Drawing, runs: Path) -> Answer
 
 
 def _compared(
-    document: Mapping[str, Any], name: str | None, what: Drawing, runs: Path
+    document: Mapping[str, Any], name: str | None, what: DrawnSubject, runs: Path
 ) -> tuple[str, CertificateVerification]:
     """Return what a certificate is compared with, as it is shown, and the comparison."""
     if "kind" in document:

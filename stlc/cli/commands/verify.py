@@ -24,8 +24,8 @@ from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.controller.verification.around import Around
-    from stlc.controller.verification.loop import ClosedLoop
-    from stlc.controller.verification.subject import Subject
+    from stlc.controller.verification.loop import NetworkLoop
+    from stlc.controller.verification.subject import VerificationSubject
     from stlc.controller.verification.verify import ModeResult, Verification
 
 _MOST = 3
@@ -88,17 +88,17 @@ def verify(
 
     from stlc.controller.training.budget import clock_of
     from stlc.controller.training.run import Run
-    from stlc.controller.verification.plans import Plans
+    from stlc.controller.verification.plans import ProposedPlans
     from stlc.controller.verification.verify import Verifier
 
     torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
     seconds = parse_seconds(budget)
-    subject: Subject
+    subject: VerificationSubject
     if controller is None:
         if period is not None or system is not None or continuous:
             raise usage("--period, --system and --continuous are for a network: --controller FILE")
         opened = Run.open(run, root=runs)
-        name, subject = opened.dir.shown, Plans(opened.task, opened.policy)
+        name, subject = opened.dir.shown, ProposedPlans(opened.task, opened.policy)
     else:
         name, subject = run, _closed_loop(run, system, controller, period, continuous)
     verifier = Verifier(subject, seed=seed, clock=clock_of(parse_clock(clock)))
@@ -111,10 +111,10 @@ def verify(
 
 def _closed_loop(
     spec: str, system: str | None, controller: Path, period: str | None, continuous: bool
-) -> ClosedLoop:
+) -> NetworkLoop:
     """Load the closed loop of a system and a network."""
     from stlc.controller.problem.load import load_task
-    from stlc.controller.verification.loop import ClosedLoop
+    from stlc.controller.verification.loop import NetworkLoop
     from stlc.controller.verification.onnx_layers import read_onnx
 
     task = load_task(spec, system)
@@ -122,7 +122,7 @@ def _closed_loop(
     steps = 1.0 if period is None else parse_seconds(period) / dt
     if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
         raise usage(f"the control period `{period}` is not a multiple of the time step {dt:g} s")
-    return ClosedLoop(task, read_onnx(controller), round(steps), continuous=continuous)
+    return NetworkLoop(task, read_onnx(controller), round(steps), continuous=continuous)
 
 
 def _exit_code(found: Verification, fail_under: float | None) -> int:

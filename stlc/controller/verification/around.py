@@ -17,7 +17,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.verification.boxes import Box, Mode
 from stlc.controller.verification.forms import Floats
 from stlc.controller.verification.judged import PROVED
-from stlc.controller.verification.subject import Subject
+from stlc.controller.verification.subject import VerificationSubject
 
 FIRST = 8
 """Boxes along each coordinate that the search around a state begins with."""
@@ -54,7 +54,7 @@ class Around:
 class StateProver:
     """Search for boxes with a proof around random initial states of a policy."""
 
-    def __init__(self, plans: Subject, *, seed: int = 0) -> None:
+    def __init__(self, plans: VerificationSubject, *, seed: int = 0) -> None:
         self._plans = plans
         self._rng = np.random.default_rng(seed)
 
@@ -90,7 +90,7 @@ class StateProver:
 
 
 def narrowed(
-    plans: Subject,
+    plans: VerificationSubject,
     mode: Mode,
     boxes: Sequence[Box],
     states: Floats,

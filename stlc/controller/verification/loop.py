@@ -16,8 +16,15 @@ import torch
 
 from stlc.controller.verification.flow import Flow
 from stlc.controller.verification.forms import FORMS, Floats, Forms
-from stlc.controller.verification.network import Layer, NetworkBounds, columns, joined, own_symbols, reduced
-from stlc.controller.verification.subject import History, Indices, Subject
+from stlc.controller.verification.network import (
+    NetworkBounds,
+    NetworkLayer,
+    columns,
+    joined,
+    own_symbols,
+    reduced,
+)
+from stlc.controller.verification.subject import History, Indices, VerificationSubject
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
@@ -38,7 +45,7 @@ _ACTIVE: Mapping[str, Callable[[Any], Any]] = {
 
 
 @final
-class ClosedLoop(Subject):
+class NetworkLoop(VerificationSubject):
     """A system whose controls are the outputs of a network; there is one choice in each state.
 
     Args:
@@ -55,7 +62,7 @@ class ClosedLoop(Subject):
     renumbers = True
 
     def __init__(
-        self, task: Task, layers: Sequence[Layer], period: int = 1, *, continuous: bool = False
+        self, task: Task, layers: Sequence[NetworkLayer], period: int = 1, *, continuous: bool = False
     ) -> None:
         super().__init__(task)
         try:

@@ -30,7 +30,7 @@ _KEPT = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Layer:
+class NetworkLayer:
     """Layer of a network: `activation(weight x + bias)`.
 
     Attributes:
@@ -61,7 +61,7 @@ class NetworkBounds:
         unit: relative rounding error of one operation of the network that is described: `UNIT` for float32.
     """
 
-    def __init__(self, layers: Sequence[Layer], unit: float = UNIT) -> None:
+    def __init__(self, layers: Sequence[NetworkLayer], unit: float = UNIT) -> None:
         self._layers, self._unit = tuple(layers), unit
 
     def outputs(self, inputs: Forms, rows: slice = slice(None)) -> Forms:
@@ -70,9 +70,9 @@ class NetworkBounds:
         for layer in self._layers[:-1]:
             neurons = own_symbols(self._layer(neurons, layer))
         last = self._layers[-1]
-        return self._layer(neurons, Layer(last.weight[rows], last.bias[rows], last.activation))
+        return self._layer(neurons, NetworkLayer(last.weight[rows], last.bias[rows], last.activation))
 
-    def _layer(self, x: Forms, layer: Layer) -> Forms:
+    def _layer(self, x: Forms, layer: NetworkLayer) -> Forms:
         weight, size = layer.weight.T, np.abs(layer.weight.T)
         symbols, batch, width = x.generators.shape
         generators = (x.generators.reshape(-1, width) @ weight).reshape(symbols, batch, -1)
@@ -147,7 +147,7 @@ class PlanBounds:
         kinds = ["relu"] * (len(modules) - 1) + ["linear"]
         self._network = NetworkBounds(
             [
-                Layer(_array(each.weight), _array(each.bias), kind)
+                NetworkLayer(_array(each.weight), _array(each.bias), kind)
                 for each, kind in zip(modules, kinds, strict=True)
             ]
         )

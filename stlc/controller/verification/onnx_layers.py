@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from stlc.controller.verification.forms import Floats
-from stlc.controller.verification.network import Layer
+from stlc.controller.verification.network import NetworkLayer
 from stlc.diagnostics import Diagnostic, MissingError, usage
 
 
-def read_onnx(path: Path) -> list[Layer]:
+def read_onnx(path: Path) -> list[NetworkLayer]:
     """Read a feed-forward network: one input, one output, and a chain of layers.
 
     Raises:
@@ -66,7 +66,7 @@ class _Chain:
 
     def __init__(self) -> None:
         self.size = 0
-        self._layers: list[Layer] = []
+        self._layers: list[NetworkLayer] = []
         self._map: tuple[Floats, Floats] | None = None
 
     def add(self, kind: str, values: Sequence[Floats], options: Mapping[str, Any], *, first: bool) -> None:
@@ -74,7 +74,7 @@ class _Chain:
         if kind in ("Identity", "Flatten", "Reshape", "Squeeze", "Unsqueeze", "Dropout", "Cast"):
             return
         if kind in ("Relu", "Tanh", "Sigmoid"):
-            self._layers.append(Layer(*self._linear(self.size), kind.lower()))
+            self._layers.append(NetworkLayer(*self._linear(self.size), kind.lower()))
             self._map = None
         elif kind == "Gemm" and first:
             weight = values[0] if options.get("transB", 0) else values[0].T
@@ -108,6 +108,6 @@ class _Chain:
         before, shift = self._linear(weight.shape[1])
         self._map = weight @ before, weight @ shift + bias
 
-    def finished(self) -> list[Layer]:
+    def finished(self) -> list[NetworkLayer]:
         """All layers, the last one linear."""
-        return [*self._layers, Layer(*self._linear(self.size))]
+        return [*self._layers, NetworkLayer(*self._linear(self.size))]

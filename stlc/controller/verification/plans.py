@@ -11,7 +11,7 @@ import torch
 from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.verification.forms import FORMS, Bools, Floats, Forms, picked, spread, together
 from stlc.controller.verification.network import UNIT, PlanBounds
-from stlc.controller.verification.subject import History, Indices, Subject
+from stlc.controller.verification.subject import History, Indices, VerificationSubject
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _TOUCH = 1e-9
 """Overlap with the other side of a mirror symmetry up to which a box is taken to lie on one side."""
 
 
-class Plans(Subject):
+class ProposedPlans(VerificationSubject):
     """Plans that the network of a policy proposes; the choices are the proposals.
 
     Raises:

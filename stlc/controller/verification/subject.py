@@ -35,7 +35,7 @@ _LARGE = 1e-3
 """Remainder of a state, as a share of its range, from which it becomes a symbol of later steps."""
 
 
-class Subject(ABC):
+class VerificationSubject(ABC):
     """A controller of a system, whose behaviour is bounded over boxes of initial states.
 
     It has one or more choices in each state; the controller satisfies the specification wherever one of them

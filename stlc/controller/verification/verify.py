@@ -27,7 +27,7 @@ from stlc.controller.verification.around import Around, StateProver, narrowed
 from stlc.controller.verification.boxes import Box, Mode, whole
 from stlc.controller.verification.forms import Bools, Floats
 from stlc.controller.verification.judged import PROVED, BoxVerdicts
-from stlc.controller.verification.subject import Indices, Subject
+from stlc.controller.verification.subject import Indices, VerificationSubject
 
 Clock: TypeAlias = Callable[[], float]
 
@@ -63,7 +63,8 @@ class ModeResult:
 
     With conditions of `where`, probabilities are conditional on them. `proved` counts only boxes in which
     every state meets the conditions, and divides by an upper bound on the share of drawn states that does
-    (`Plans.acceptance`), so that it is a lower bound. `refuted` counts boxes with a counterexample whole.
+    (`ProposedPlans.acceptance`), so that it is a lower bound. `refuted` counts boxes with a counterexample
+    whole.
 
     Attributes:
         mode: the mode.
@@ -163,7 +164,7 @@ class Verifier:
         modes: ways to draw an initial state.
     """
 
-    def __init__(self, plans: Subject, *, seed: int = 0, clock: Clock = time.monotonic) -> None:
+    def __init__(self, plans: VerificationSubject, *, seed: int = 0, clock: Clock = time.monotonic) -> None:
         self.plans, self._clock = plans, clock
         self.modes = self.plans.modes
         self._names = self.plans.names

@@ -13,8 +13,8 @@ from stlc.cli.framework.app import main
 from stlc.controller.problem.load import load_task
 from stlc.controller.verification.boxes import Box
 from stlc.controller.verification.forms import Forms
-from stlc.controller.verification.loop import ClosedLoop
-from stlc.controller.verification.network import Layer, NetworkBounds
+from stlc.controller.verification.loop import NetworkLoop
+from stlc.controller.verification.network import NetworkBounds, NetworkLayer
 from stlc.controller.verification.onnx_layers import read_onnx
 from stlc.controller.verification.verify import Verifier
 from stlc.diagnostics import UsageError
@@ -23,17 +23,17 @@ ROOT = Path(__file__).parents[3]
 SPEC = str(ROOT / "examples" / "ainncs" / "single_pendulum.stl")
 
 
-def random_layers(kind: str, inputs: int = 2, outputs: int = 1) -> list[Layer]:
+def random_layers(kind: str, inputs: int = 2, outputs: int = 1) -> list[NetworkLayer]:
     """Layers of a small random network, whose last layer is linear."""
     rng = np.random.default_rng(7)
-    hidden = Layer(rng.normal(size=(8, inputs)), rng.normal(size=8), kind)
-    return [hidden, Layer(0.2 * rng.normal(size=(outputs, 8)), rng.normal(size=outputs))]
+    hidden = NetworkLayer(rng.normal(size=(8, inputs)), rng.normal(size=8), kind)
+    return [hidden, NetworkLayer(0.2 * rng.normal(size=(outputs, 8)), rng.normal(size=outputs))]
 
 
 @cache
-def loop(kind: str, period: int = 2, *, continuous: bool = False, substeps: int = 1) -> ClosedLoop:
+def loop(kind: str, period: int = 2, *, continuous: bool = False, substeps: int = 1) -> NetworkLoop:
     task = load_task(SPEC, overrides={"time.substeps": str(substeps)})
-    return ClosedLoop(task, random_layers(kind), period, continuous=continuous)
+    return NetworkLoop(task, random_layers(kind), period, continuous=continuous)
 
 
 @pytest.mark.parametrize("kind", ["relu", "tanh", "sigmoid"])
@@ -79,7 +79,7 @@ def test_outputs_of_a_network_stay_within_their_forms(kind: str) -> None:
 
 
 def test_sampled_states_of_proved_boxes_satisfy_the_specification() -> None:
-    subject = ClosedLoop(load_task(SPEC), [Layer(np.array([[-2.0, -1.0]]), np.zeros(1))])
+    subject = NetworkLoop(load_task(SPEC), [NetworkLayer(np.array([[-2.0, -1.0]]), np.zeros(1))])
     result = Verifier(subject, seed=2).run(1e6, boxes=200).modes[0]
     assert result.proved > 0.3
     rng = np.random.default_rng(6)
@@ -91,7 +91,7 @@ def test_sampled_states_of_proved_boxes_satisfy_the_specification() -> None:
 # ---------------------------------------------------------------------------------- networks
 
 
-def written(path: Path, layers: list[Layer], scale: float = 1.0) -> Path:
+def written(path: Path, layers: list[NetworkLayer], scale: float = 1.0) -> Path:
     """Write a network with Gemm, MatMul, Add and an activation; its inputs are multiplied by `scale`."""
     onnx = pytest.importorskip("onnx")
     helper, arrays = onnx.helper, onnx.numpy_helper
@@ -154,10 +154,10 @@ def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:
 
 def test_a_network_of_other_sizes_is_refused() -> None:
     with pytest.raises(UsageError, match="takes 3 numbers"):
-        ClosedLoop(load_task(SPEC), random_layers("relu", inputs=3))
+        NetworkLoop(load_task(SPEC), random_layers("relu", inputs=3))
 
 
 def test_solutions_of_a_system_with_jumps_are_refused() -> None:
     task = load_task(ROOT / "specs" / "traffic.stl")
     with pytest.raises(UsageError, match="cannot be bounded"):
-        ClosedLoop(task, random_layers("relu", inputs=7), continuous=True)
+        NetworkLoop(task, random_layers("relu", inputs=7), continuous=True)

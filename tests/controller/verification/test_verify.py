@@ -17,7 +17,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.verification.boxes import Box, Unsupported, modes_of
 from stlc.controller.verification.forms import Forms
 from stlc.controller.verification.network import PlanBounds
-from stlc.controller.verification.plans import Plans
+from stlc.controller.verification.plans import ProposedPlans
 from stlc.controller.verification.verify import Verification, Verifier
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.init import GridDecl, InitDecl, Situation
@@ -51,7 +51,7 @@ def policy() -> BestOfKPolicy:
 
 @cache
 def verifier() -> Verifier:
-    return Verifier(Plans(policy().task, policy()), seed=1)
+    return Verifier(ProposedPlans(policy().task, policy()), seed=1)
 
 
 @cache
@@ -126,7 +126,9 @@ def test_a_witness_violates_the_specification() -> None:
 
 
 def test_the_same_seed_gives_the_same_result() -> None:
-    one, other = (Verifier(Plans(policy().task, policy()), seed=4).run(1e6, boxes=2) for _ in range(2))
+    one, other = (
+        Verifier(ProposedPlans(policy().task, policy()), seed=4).run(1e6, boxes=2) for _ in range(2)
+    )
     assert [each.proved for each in one.modes] == [each.proved for each in other.modes]
     assert [each.examined for each in one.modes] == [each.examined for each in other.modes]
 
@@ -198,7 +200,7 @@ def other_verifier(spec: str, system: str) -> Verifier:
         torch.manual_seed(3)
         network = PlanNetwork(task, hidden=(16, 12), plans=2).eval()
         network.normalise(task.sample(300, seed=1))
-    return Verifier(Plans(task, BestOfKPolicy(task, network)), seed=1)
+    return Verifier(ProposedPlans(task, BestOfKPolicy(task, network)), seed=1)
 
 
 @pytest.mark.parametrize(("spec", "system", "width"), OTHERS)
@@ -280,7 +282,7 @@ def test_boxes_of_a_mode_do_not_overlap() -> None:
 def test_a_policy_that_is_no_network_of_plans_is_refused() -> None:
     task = task_of("traffic", "car")
     with pytest.raises(UsageError, match="can be verified"):
-        Plans(task, ModelRollout(lambda x: x[:, :1], task))
+        ProposedPlans(task, ModelRollout(lambda x: x[:, :1], task))
 
 
 def assign(name: str, value: ir.Num) -> Assign:
