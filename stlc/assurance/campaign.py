@@ -72,9 +72,10 @@ class Campaign:
 
     Attributes:
         subject: what is observed.
-        claim: what is asked of it.
-        width: width of the interval at which the campaign stops; None: it stops once the claim is decided.
-        most: largest number of units.
+        claim: the share to certify, and the confidence.
+        width: the campaign stops once the confidence interval of the share is no wider than this; None: it
+            stops once the claim is decided.
+        most: largest number of independent observations (drives, worlds or simulations).
         seeds: seeds fixed in advance, which are all observed; None: seeds from `SEED` on, as many as needed.
     """
 

@@ -43,7 +43,9 @@ def sample_of(
     rules: Rules | None = None,
     require: Sequence[str] = (),
 ) -> Sample:
-    """Judge a recorded deployment drive by drive; units are the worlds, or drives if agents are independent.
+    """Judge a recorded deployment drive by drive.
+
+    Independent observations are the worlds, or single drives if the agents of a world are independent.
 
     Args:
         task: specification of the plans, and system.

@@ -147,14 +147,16 @@ class Portfolio:
         random: bool = False,
         graded: bool = True,
     ) -> None:
-        """Take turns between all strategies, or sample uniformly if `random`.
+        """Take turns between all strategies, or draw random points if `random`.
 
         Args:
             space: the search space.
             generator: source of all random numbers.
             gradient: function that returns the gradient of the robustness at a point, or None.
-            random: whether points are drawn from the declared distribution only.
-            graded: whether the robustness varies with the signals, rather than taking a few values.
+            random: whether all points are uniform in the unit cube, so that the simulated values have the
+                declared distribution.
+            graded: whether the robustness varies with the signals. If it takes only a few values, points are
+                drawn at random.
         """
         self._uniform = UniformSampling(space, generator)
         self._discrete = DiscreteSampling(space, generator)

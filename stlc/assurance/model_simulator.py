@@ -87,9 +87,9 @@ class ModelSimulator:
         return SearchSpace(self.points.dim, tuple(blocks))
 
     def _time_coordinates(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Coordinates of the free switching times `names` of an input.
+        """Index of the search coordinate that sets each of the free switching times `names`.
 
-        A time is computed from several coordinates; the last of them belongs to this time alone.
+        Several coordinates may affect a time. The last of them, which is returned, affects no other time.
         """
         return self.points.last_coordinates_of(names)
 

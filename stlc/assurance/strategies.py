@@ -213,10 +213,11 @@ class HillClimbing(Strategy):
         return changed
 
     def _picked(self, point: Point) -> Iterator[list[int]]:
-        """Groups of coordinates to change together, one and a half on average.
+        """One or two groups of coordinates; those of a group are changed together.
 
-        Half of the time the group is a piece: neighbours with one value. Otherwise it is a run of successive
-        values, or a single one.
+        A group starts from a random coordinate. If this is a value of an input, the group is half of the time
+        the stretch around it over which the input has the same value, and otherwise a run of successive
+        values of the input, or the coordinate alone. Any other coordinate is changed alone.
         """
         generator = self.generator
         for _ in range(1 + (generator.random() < 0.5)):

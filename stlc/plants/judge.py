@@ -54,16 +54,18 @@ class JudgedRequirement:
 
 @dataclass(frozen=True, slots=True)
 class JudgedRun:
-    """One judged simulation.
+    """Simulation of a plant with its verdicts.
+
+    A simulation fails if the plant crashes, hangs or gives invalid outputs.
 
     Attributes:
         seed: seed of the simulation.
-        point: value of each variable.
-        samples: number of samples; 0 for a finding.
-        status: verdict over all requirements; None for a finding.
+        point: name of each variable of the plant file -> its value.
+        samples: number of samples; 0 if the simulation failed.
+        status: verdict over all requirements; None if the simulation failed.
         requirements: results of the requirements.
-        finding: why there is no trace, or None.
-        trace: the trace; None for a finding, and if it was judged while the plant ran.
+        finding: the failure; None if there was none.
+        trace: the trace; None if the simulation failed, or was judged while the plant ran.
     """
 
     seed: int

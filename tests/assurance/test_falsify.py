@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -199,7 +200,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     text = capsys.readouterr().out
     assert "up: violated, robustness -" in text
     assert "deep: no violation in 20 simulations" in text
-    assert "failed, error at t = 0.9 s: RuntimeError: below the ground" in text
+    assert re.search(r"failed, error at t = \S+ s: RuntimeError: below the ground", text)
     replay = ["--plant", "fall.yaml", "--replay", "counterexamples/up.json"]
     assert main(["falsify", "fall.stl", *replay]) == 1
     assert "bit for bit" in capsys.readouterr().out
@@ -215,8 +216,10 @@ def test_a_failure_is_a_file_that_replays(capsys):
     result = document["result"]
     assert result["requirements"][0]["verdict"] == "open"
     (finding,) = result["findings"]
-    assert (finding["reason"], finding["time"]) == ("error", pytest.approx(0.9))
-    assert finding["simulations"] == len(result["failures"])
+    assert finding["reason"] == "error"
+    assert 0.8 <= finding["time"] <= 1.0
+    assert finding["simulations"] >= 1
+    assert result["failures"] == ["error: RuntimeError: below the ground"]
     assert "Traceback" in finding["stderr"]
     replay = shlex.split(finding["replay"])[1:]
     assert main([*replay, "--json"]) == 1

@@ -19,7 +19,7 @@ def robustness(point: np.ndarray) -> float:
 
 def searched(seed: int, *, random: bool, count: int = 300) -> tuple[float, Portfolio]:
     space = SearchSpace(DIM, sparse=True)
-    portfolio = Portfolio(space, np.random.default_rng(seed), random=random)
+    portfolio = Portfolio(space, np.random.default_rng(seed), lambda _: None, random=random)
     least = np.inf
     for _ in range(count):
         proposal = portfolio.next()

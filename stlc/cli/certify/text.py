@@ -34,10 +34,10 @@ def checked_share(option: str, share: float) -> float:
 
 
 def require_claim(share: float | None, fail_under: float | None) -> None:
-    """Check the value of `--certify`, if given.
+    """Check the options `--certify` and `--fail-under`.
 
     Raises:
-        UsageError: U101, it is no share, or `--fail-under` also wants the exit code.
+        UsageError: U101, `share` is not between 0 and 1, or both options are given: each sets the exit code.
     """
     if share is not None and checked_share("--certify", share) and fail_under is not None:
         raise usage("`--certify` does not go with `--fail-under`", "each of them says what the exit code is")

@@ -228,10 +228,13 @@ def _bounded(log: Tensor, lowest: Tensor, highest: Tensor) -> Tensor:
 
 
 class Predictor:
-    """Random predictions by the elites (the networks with the least validation error) of an ensemble.
+    """Sampler of the change of a state in one step, as an ensemble predicts it.
+
+    A sample is drawn from the Gaussian that one of the elites predicts, the networks with the least
+    validation error.
 
     Attributes:
-        elites: number of networks.
+        elites: number of elites.
     """
 
     def __init__(self, ensemble: Ensemble) -> None:

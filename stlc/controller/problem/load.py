@@ -22,7 +22,7 @@ HINT = "--system FILE"
 def require_controls(task: Task, who: str = "a policy") -> None:
     """Raise UsageError (U101) if the system of a task has no control.
 
-    `who` would have chosen its values: `a policy`, `a guard`.
+    `who` names, in the message, what would choose the controls: `a policy` or `a guard`.
     """
     if task.system.decl.controls:
         return

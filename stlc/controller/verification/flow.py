@@ -41,14 +41,16 @@ class Flow:
         self._length = float(decl.dt) / decl.substeps
 
     def step(self, env: Mapping[str, Forms], symbols: int) -> dict[str, Forms]:
-        """States that move, one substep later.
+        """States with a differential equation, as affine forms, at the end of one substep.
 
         Args:
-            env: states and controls, which are constant during the step, (batch,) each.
-            symbols: number of symbols; the next one is used for the time within the step.
+            env: states at the start of the substep, and controls, (batch,) each. Controls, and states without
+                an equation, are constant during the substep.
+            symbols: number of symbols of the forms in `env`. One more stands for the time within the substep.
 
         Returns:
-            Their forms; without bounds for the elements whose solution may leave every enclosure tried.
+            State -> forms, (batch,). The remainder of an element is infinite if no enclosure of its solution
+            was found.
         """
         batch, length = len(next(iter(env.values())).centre), self._length
         start = {name: form.range for name, form in env.items()}

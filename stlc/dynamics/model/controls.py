@@ -19,10 +19,11 @@ def raw_width(controls: tuple[ControlDecl, ...]) -> int:
 
 
 def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
-    """Controls in physical units: (…, raw_width) -> (…, m).
+    """Controls in physical units from network outputs: (…, raw_width) -> (…, m).
 
-    `tanh` (smooth) and `clip` (piecewise linear) map [-1, 1] onto the range; `angle` maps a planar vector to
-    its direction, without discontinuity at the ends of the range.
+    `tanh` (smooth) or `clip` (cut off at the ends) brings an output into [-1, 1], which is then scaled to the
+    range of the control. `angle` gives the direction of a planar vector, two outputs, without discontinuity
+    at the ends of the range.
     """
     middle, half = _affine(controls, raw.dtype, raw.device)
     kinds = {control.squash for control in controls}

@@ -1,7 +1,8 @@
 """Scenarios: named changes of a system for deployment.
 
-Every system has the standard scenarios `mismatch`, `disturb` and `noise`; a percentage may follow, as in
-`mismatch-20`.
+Every system has three standard scenarios, whose size in percent may follow the name, as in `mismatch-20`:
+`mismatch` of the numbers in the dynamics and of the actuator gains, `disturb` of the controls, and `noise` on
+the measured states.
 """
 
 from __future__ import annotations

@@ -124,8 +124,8 @@ class ParseFailure:
     def line_with(self, *edits: tuple[int, int, str]) -> str:
         """Return the line that contains the first of `edits`, with all edits applied.
 
-        A comment at the end of the line is removed, except where an edit reaches into it. An edit is (offset
-        of the first character, offset after the last one, replacement).
+        A comment at the end of the line is removed, except where an edit reaches into it. An edit (start,
+        end, text) replaces the characters from offset `start` up to, but without, offset `end` of the source.
         """
         source = self.piece.source
         number = source.position(edits[0][0])[0]

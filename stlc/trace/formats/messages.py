@@ -235,7 +235,7 @@ class Room:
         `how` is the compression method: `bz2`, `lz4` or `zstd`; `none` or "" for data that is not compressed.
 
         Raises:
-            TraceError: E603, the data exceeds the remaining limit.
+            TraceError: E603, `size` is more than may still be decompressed from this file.
             MissingError: R301, the compression method needs a package.
             DamageError: the decompressed data has another size.
         """
