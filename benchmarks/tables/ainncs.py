@@ -2,17 +2,19 @@
 
 The networks are not part of this repository. They are in the repeatability packages of JuliaReach
 (github.com/JuliaReach/ARCH2023_AINNCS_RE, folder `models`), in the formats of MATLAB, NNet, YAML and ONNX.
-The programs there write a file `results.csv` with the columns benchmark, instance, result, time; such a file
-is shown beside the results.
+Beside the results are those that other tools have published, from `benchmarks/results/ainncs_published.json`,
+or instead those of a file `results.csv` that such a program writes: benchmark, instance, result, time.
 """
 
 from __future__ import annotations
 
 import csv
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,7 +23,7 @@ import yaml
 
 from benchmarks.options import OnlyOption, Output, ResultsOption
 from benchmarks.store import Key, Result, ResultStore, inputs_of
-from benchmarks.table import Columns, listed, provenance, publish
+from benchmarks.table import WIDTH, Columns, listed, provenance, publish
 from benchmarks.timing import one_thread
 from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
@@ -43,8 +45,11 @@ Written by `python -m benchmarks ainncs FOLDER` from `benchmarks/results/ainncs.
 ARCH-COMP category AINNCS, for the exact solutions of the differential equations (`--continuous`) at the
 samples. `proved` and `refuted`: shares of the initial set. The result is `verified` if all of it is proved,
 `falsified` if a counterexample was found, which ends the search. `violations`: random points of proved boxes
-whose simulation violates the specification. Time is processor time of one thread.
+whose simulation violates the specification. Time is processor time of one thread. `published`: results and
+times of other tools, read from the sources below; each is from the machine of its authors, whose processor is
+not named there. No entry: nothing was found for the same instance.
 """
+PUBLISHED = "ainncs_published.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +125,7 @@ class Row:
         boxes: number of examined boxes.
         violations: number of violations among random points of proved boxes.
         points: number of these points.
-        published: result and time of another tool; "" if it is not given.
+        published: results and times of other tools; "" if there are none.
     """
 
     name: str
@@ -165,7 +170,9 @@ def ainncs(
     published: Annotated[
         Path | None,
         typer.Option(
-            "--published", metavar="FILE", help="Results of another tool: benchmark,instance,result,time."
+            "--published",
+            metavar="FILE",
+            help="Shown instead of the published results: benchmark,instance,result,time.",
         ),
     ] = None,
     only: OnlyOption = None,
@@ -179,12 +186,12 @@ def ainncs(
     store = ResultStore("ainncs", out)
     wanted = None if only is None else set(only.split(","))
     chosen = [case for case in CASES if wanted is None or case.spec in wanted]
-    others = {} if published is None else _others(published)
+    tools = published_in(out) if published is None else []
+    known = _texts(tools) if published is None else _others(published)
     results = [_verified(case, models, parse_seconds(budget), store) for case in chosen]
 
     def rows(every: Sequence[Result]) -> list[Row]:
-        known = {case.name: others.get(case.other, "") for case in CASES}
-        return [Row(**each["row"], published=known[each["row"]["name"]]) for each in every]
+        return [Row(**each["row"], published=known.get(each["row"]["name"], "")) for each in every]
 
     def section() -> list[str]:
         every = [*store.all().values()]
@@ -193,6 +200,7 @@ def ainncs(
             *listed("ainncs", rows(every), COLUMNS).markdown(),
             "",
             *provenance(every, "closed loops"),
+            *(line for tool in tools for line in _source(tool)),
         ]
 
     publish("ainncs", output, section, {"rows": listed("ainncs", rows(results), COLUMNS)})
@@ -235,13 +243,44 @@ def _verified(case: Case, models: Path, seconds: float, store: ResultStore) -> R
     return store.get(Key(case.name, values), compute)
 
 
-def _others(path: Path) -> Mapping[tuple[str, str], str]:
-    """Results of another tool: (benchmark, instance) -> result and time."""
+def published_in(folder: Path) -> list[dict[str, Any]]:
+    """Return the published results of other tools in a folder of results, tool by tool."""
+    path = folder / PUBLISHED
+    return list(json.loads(path.read_text(encoding="utf-8"))["tools"]) if path.is_file() else []
+
+
+def _texts(tools: Sequence[Mapping[str, Any]]) -> Mapping[str, str]:
+    """Published results as text: name of the instance -> tools with result and time."""
+    texts: dict[str, list[str]] = {}
+    for tool in tools:
+        for each in tool["results"]:
+            told = ", ".join(filter(None, (each.get("result"), _duration(each.get("seconds")))))
+            texts.setdefault(each["instance"], []).append(f"{tool['tool']}: {told}")
+    return {name: "; ".join(parts) for name, parts in texts.items()}
+
+
+def _source(tool: Mapping[str, Any]) -> list[str]:
+    """Markdown bullet on where the results of a tool were read, line by line."""
+    at = f"github.com/{tool['repository']} at `{tool['commit'][:10]}`, `{tool['path']}`"
+    line = f"- {tool['tool']}, {tool['year']}: {tool['about']}; {at}"
+    return wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+def _duration(seconds: float | None) -> str:
+    """Time as text: two digits of seconds, from 99 s on whole minutes."""
+    if seconds is None:
+        return ""
+    return f"{seconds:.2g} s" if seconds < 99 else f"{seconds / 60:.0f} min"
+
+
+def _others(path: Path) -> Mapping[str, str]:
+    """Results in a file of another program as text: name of the instance -> result and time."""
     with path.open(encoding="utf-8", newline="") as file:
-        return {
+        found = {
             (row["benchmark"], row["instance"]): f"{row['result']}, {float(row['time']):.1f} s"
             for row in csv.DictReader(file)
         }
+    return {case.name: found[case.other] for case in CASES if case.other in found}
 
 
 # --------------------------------------------------------------------------------- networks

@@ -10,7 +10,7 @@ import pytest
 from helpers.documents import misfits
 
 from benchmarks.__main__ import main as measure
-from benchmarks.tables.ainncs import layers_of
+from benchmarks.tables.ainncs import CASES, PUBLISHED, layers_of, published_in
 from benchmarks.tables.schema import document_schema
 from stlc.cli.framework.app import main
 from stlc.diagnostics import UsageError
@@ -84,6 +84,36 @@ def test_a_closed_loop_is_verified_beside_another_tool(
     (row,) = document["result"]["rows"]
     assert row["result"] in ("falsified", "verified", "unknown")
     assert (row["published"], row["violations"]) == ("falsified, 0.2 s", 0)
+
+
+def test_published_results_are_shown_with_their_sources(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    models = tmp_path / "models" / "Single-Pendulum"
+    models.mkdir(parents=True)
+    (models / "controller_single_pendulum.nnet").write_text(NNET, encoding="utf-8")
+    results = {"instance": "single pendulum", "result": "falsified", "seconds": 150}
+    place = {"repository": "o/r", "commit": "0123456789abcdef", "path": "times.csv"}
+    tool = {"tool": "T", "year": 2025, **place, "about": "whole scripts", "results": [results]}
+    (tmp_path / PUBLISHED).write_text(json.dumps({"tools": [tool]}), encoding="utf-8")
+    page = tmp_path / "page.md"
+    line = ["ainncs", str(models.parent), "--only", "single_pendulum", "--json", "--out", str(tmp_path)]
+    assert measure([*line, "--page", str(page)]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["result"]["rows"]
+    assert row["published"] == "T: falsified, 2 min"
+    source = "- T, 2025: whole scripts; github.com/o/r at `0123456789`, `times.csv`\n"
+    assert source in page.read_text(encoding="utf-8")
+
+
+def test_published_results_name_instances_and_sources() -> None:
+    tools = published_in(ROOT / "benchmarks" / "results")
+    names = {case.name for case in CASES}
+    assert tools
+    for tool in tools:
+        assert tool["repository"].count("/") == 1
+        assert len(tool["commit"]) == 40
+        assert {each["instance"] for each in tool["results"]} <= names
+        assert all(each.get("result") or each.get("seconds", 0) > 0 for each in tool["results"])
 
 
 def test_networks_that_are_not_there_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
