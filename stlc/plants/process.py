@@ -255,7 +255,7 @@ def _started(decl: PlantDecl, scratch: str) -> subprocess.Popen[bytes]:
         "TMPDIR": scratch,
     }
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "stlc.plants.worker"],
+        [sys.executable, "-B", "-P", "-m", "stlc.plants.worker"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
