@@ -31,13 +31,15 @@ json.dump(failures, open("failures.json", "w"))
 
 
 def change(path: Path, diff: str) -> None:
-    """Replace the lines of a diff that are there now by those that should be."""
-    lines = diff.splitlines()
-    before = "".join(f"{line[1:]}\n" for line in lines if line[0] != "+")
-    after = "".join(f"{line[1:]}\n" for line in lines if line[0] != "-")
+    """Replace the lines of a diff that are there now by those that should be, at each of its places."""
     text = path.read_text(encoding="utf-8")
-    assert text.count(before) == 1, f"{path.name} has changed: docs/extending.md shows\n{before}"
-    path.write_text(text.replace(before, after), encoding="utf-8")
+    for place in re.split(r"^@@.*\n", diff, flags=re.MULTILINE):
+        lines = place.splitlines()
+        before = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "+")
+        after = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "-")
+        assert text.count(before) == 1, f"{path.name} has changed: docs/extending.md shows\n{before}"
+        text = text.replace(before, after)
+    path.write_text(text, encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -69,15 +71,15 @@ def failures(tmp_path_factory) -> dict[str, str]:
 
 
 def test_the_page_has_an_example_of_each_extension():
-    assert len(CHECKS) == 13
+    assert len(CHECKS) == 14
     assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 12
-    operator = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
-    assert len(operator) == 4  # an operator, a trace format, a function and a kind of plant
+    changed = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
+    assert len(changed) == 10  # an operator, a trace format, a function, a kind of plant; 6 for a node
 
 
 def test_an_extension_needs_the_files_that_the_page_promises():
     """New files and changed lines of source of each section; a table entry counts as one line."""
-    promised = dict(re.findall(r"^\| \[([\w -]+)\]\(#[\w-]+\) \| (.+?) \|", TEXT, re.MULTILINE))
+    promised = dict(re.findall(r"^\| \[([\w -]+)\]\(#[\w-]+\)[^|]* \| (.+?) \|", TEXT, re.MULTILINE))
     sections = re.split(r"^## An? ", TEXT, flags=re.MULTILINE)[1:]
     found = {}
     for section in sections:
@@ -94,7 +96,9 @@ def test_an_extension_needs_the_files_that_the_page_promises():
     assert {names.get(name, name) for name in found} == set(promised)
     for name, counts in found.items():
         text = promised[names.get(name, name)]
-        if "1 entry" in text:
+        if "changed" in text:
+            assert counts[:2] == (0, int(text.split()[0])), name
+        elif "1 entry" in text:
             assert counts[:2] == entry, name
         else:
             assert counts == (line if "1 line" in text else file), name
@@ -109,6 +113,12 @@ def test_the_examples_are_laid_out_like_the_source(tmp_path):
     for kind, name, body in BLOCKS:
         if kind == "file" and name.endswith(".py"):
             (tmp_path / Path(name).name).write_text(body, encoding="utf-8")
+        elif kind == "change":
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not path.exists():
+                shutil.copy(ROOT / name, path)
+            change(path, body)
     config = ["--config", str(ROOT / "pyproject.toml")]
     for action in (["check", "--ignore", "INP001"], ["format", "--check"]):
         command = [sys.executable, "-m", "ruff", *action, "-q", *config, str(tmp_path)]
