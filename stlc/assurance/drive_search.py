@@ -51,7 +51,7 @@ class SearchedDrives:
 
     @property
     def failing(self) -> NDArray[np.bool_]:
-        """Whether each drive violates a requirement, (count, agents)."""
+        """True if each drive violates a requirement, (count, agents)."""
         return np.asarray((self.margins < -TOLERANCE).any(2))
 
     @property

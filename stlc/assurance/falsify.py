@@ -270,7 +270,7 @@ class ViolationSearch:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the last points had no admissible initial state."""
+        """True if the last points had no admissible initial state."""
         return self._row >= REJECTED
 
     def ask(self, count: int) -> NDArray[np.float64]:

@@ -87,7 +87,7 @@ def scales_of(sizes: NDArray[np.float64]) -> tuple[float, ...] | None:
 
 
 def graded(formula: ir.Formula, signature: Signature) -> bool:
-    """Whether some predicate of a formula reads a real number, so that its margin varies continuously."""
+    """True if some predicate of a formula reads a real number, so that its margin varies continuously."""
     whole = {column.name for column in signature.columns if column.kind != "real"}
     predicates = [node for node in nodes(formula) if isinstance(node, ir.Predicate) and not node.guard]
     return not predicates or any(columns_of(each.num) - whole for each in predicates)

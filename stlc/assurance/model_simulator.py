@@ -120,7 +120,7 @@ class ModelSimulator:
         return min(self.task.rules[requirement].reach * self.task.system.dt / longest, 1.0)
 
     def graded(self, requirement: int) -> bool:
-        """Whether the robustness varies with real signals, rather than with whole numbers."""
+        """True if the robustness varies with real signals, rather than with whole numbers."""
         return graded(self.task.rules[requirement].formula, self.task.system.decl.signature)
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:

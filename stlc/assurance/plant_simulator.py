@@ -259,7 +259,7 @@ class PlantSimulator:
 
 
 def _reads_everything(rule: CompiledRequirement) -> bool:
-    """Whether a requirement reads a simulation to its end, whatever its length."""
+    """True if a requirement reads a simulation to its end, whatever its length."""
     ahead = (node for node in nodes(rule.formula) if isinstance(node, ir.Windowed) and not node.back)
     return rule.windowed or rule.uses_end or any(node.window.hi is None for node in ahead)
 

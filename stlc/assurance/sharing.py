@@ -159,7 +159,7 @@ class SharedSimulator:
         return self.local.seen(requirement)
 
     def graded(self, requirement: int) -> bool:
-        """Whether the robustness varies with real signals, rather than with whole numbers."""
+        """True if the robustness varies with real signals, rather than with whole numbers."""
         return self.local.graded(requirement)
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:

@@ -86,7 +86,7 @@ class Simulator(Protocol):
         """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
 
     def graded(self, requirement: int) -> bool:
-        """Whether the robustness varies with real signals, rather than with whole numbers."""
+        """True if the robustness varies with real signals, rather than with whole numbers."""
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim)."""

@@ -123,7 +123,7 @@ class PlantJudge:
 
     @property
     def long(self) -> bool:
-        """Whether a simulation is so long that it is judged while the plant runs."""
+        """True if a simulation is so long that it is judged while the plant runs."""
         return self.plant.decl.steps >= STREAMED
 
     def random_points(self, seeds: Sequence[int]) -> Floats:

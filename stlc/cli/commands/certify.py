@@ -197,7 +197,7 @@ def certify(
 
 @dataclass(frozen=True, slots=True)
 class _Chosen:
-    """What is to be certified, as given on the command line."""
+    """Subject of a certificate, as given on the command line."""
 
     name: str | None
     how: Driving

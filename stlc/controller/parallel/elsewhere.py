@@ -46,7 +46,7 @@ class SeenFile:
 
     @property
     def here(self) -> bool:
-        """Whether this machine sees the same file."""
+        """True if this machine sees the same file."""
         try:
             return SeenFile.of(Path(self.path)) == self
         except OSError:
@@ -90,7 +90,7 @@ class RemoteCall:
 
     @property
     def shared(self) -> bool:
-        """Whether this machine sees the folder and the files of the caller."""
+        """True if this machine sees the folder and the files of the caller."""
         return Path(self.folder).is_dir() and all(each.here for each in self.inputs)
 
 

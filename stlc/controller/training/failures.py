@@ -95,7 +95,7 @@ class FailureBank:
     repairing: int = 0
 
     def due(self, step: int, steps: int) -> bool:
-        """Whether a round is due after `step` of `steps` steps."""
+        """True if a round is due after `step` of `steps` steps."""
         return self.rounds < len(MOMENTS) and step >= MOMENTS[self.rounds] * steps
 
     def search(

@@ -103,7 +103,7 @@ class Conditions:
         self._margins = ArrayProgram({str(i): num for i, num in enumerate(margins)})
 
     def holds(self, states: Mapping[str, Floats]) -> Bools:
-        """Whether states meet every condition: name -> (n,) to (n,)."""
+        """True if states meet every condition: name -> (n,) to (n,)."""
         marks = [np.asarray(mark) > 0.5 for mark in self._truth(states, NUMPY).values()]
         found: Bools = np.logical_and.reduce(np.broadcast_arrays(*marks))
         return found

@@ -1,4 +1,4 @@
-"""What a verification is about: initial states, and the motion of a system over boxes of them."""
+"""Subject of a verification: initial states, and the motion of a system over boxes of them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class VerificationSubject(ABC):
         return torch.from_numpy(np.stack([np.broadcast_to(each, len(at)) for each in columns], 1).copy())
 
     def admits(self, mode: Mode, at: Floats) -> Bools:
-        """Whether the states at coordinates (B, coordinates) meet the conditions of `where`, (B,)."""
+        """True if the states at coordinates (B, coordinates) meet the conditions of `where`, (B,)."""
         if mode.conditions is None:
             return np.ones(len(at), dtype=bool)
         columns = dict(zip(self.names, self.states(mode, at).numpy().T, strict=True))

@@ -143,7 +143,7 @@ class _Front:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Samples:
-    """What sampled states say about boxes.
+    """Verdicts on boxes from sampled states.
 
     Attributes:
         refuted: whether a state in the box violates the specification, (boxes,).
