@@ -255,7 +255,7 @@ class LocalProcesses:
 
 
 def end_in_words(code: int) -> str:
-    """How a worker process ended, by its exit code; negative if a signal ended it."""
+    """End of a worker process in words, from its exit code; negative if a signal ended it."""
     if code >= 0:
         return f"its process ended with exit code {code}"
     name = signal.Signals(-code).name if -code in {*signal.Signals} else f"signal {-code}"

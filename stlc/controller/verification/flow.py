@@ -20,10 +20,10 @@ from stlc.controller.verification.forms import FORMS, SLACK, Bools, Floats, Form
 from stlc.dynamics.declaration.decl import SystemDecl
 
 _ROUNDS = 2
-"""How often the derivative is evaluated over the solution."""
+"""Number of evaluations of the derivative over the solution."""
 
 _TRIES = 8
-"""How often a first enclosure is enlarged."""
+"""Number of times that a first enclosure is enlarged."""
 
 
 class Flow:
