@@ -73,7 +73,7 @@ class Selection:
         """Return the requested closed-loop measurements.
 
         They are those of each planner at one time budget, and those of the best policy of each training
-        method.
+        method among the policies whose run folder still exists.
         """
         if not self.comparing.asks("drives"):
             return []
@@ -84,10 +84,11 @@ class Selection:
             if each.plans
             for name in self.benchmarks
         ]
-        best: dict[tuple[str, str], Result] = {}
+        best: dict[tuple[str, str], PlanCell] = {}
         for result in sorted(place.valid(), key=lambda result: float(result["accuracy"])):
-            best[result["key"]["benchmark"], Cell.of(result).contender] = result
-        cells += [each for result in best.values() for each in self._policy(result, place)]
+            for each in self._policy(result, place):
+                best[each.benchmark, each.contender.name] = each
+        cells += best.values()
         return [
             Drive(
                 each,
