@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.assurance.drive_simulator import DriveSimulator
-from stlc.assurance.falsify import Portfolio
-from stlc.assurance.search_space import Point
+from stlc.assurance.falsify import Portfolio, Proposal
+from stlc.assurance.search_space import Point, SearchSpace
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, SimulationStep, Watch
@@ -23,10 +23,12 @@ from stlc.controller.training.failures import SearchRound
 from stlc.controller.training.run import Run
 from stlc.native import Stop
 
-DRIVE_SEARCH_VERSION = 1
+DRIVE_SEARCH_VERSION = 2
 """Version of the search; results of older versions are recomputed."""
 ROUND = 16
 """Simulations side by side in a round of a training."""
+PATIENCE = 100
+"""Simulations without progress after which a requirement has only its turns."""
 EARLIER = 3
 """Decisions before the first wrong one whose states are kept too."""
 WRONG = 8
@@ -76,8 +78,11 @@ def search_drives(
 ) -> SearchedDrives:
     """Search for drives that violate any requirement, in `count` simulations.
 
-    For guidance, the robustness of each requirement is divided by its median size in the first batch, so that
-    a requirement in radians and one in metres count alike.
+    The points of the first batch are uniform. Then every requirement has a search of its own, which sees all
+    simulations: half of the points are proposed for the requirement that is closest to a violation, or
+    violated most, while that makes progress, and the rest for all requirements in turn. For this comparison,
+    the robustness of each requirement is divided by its median size in the first batch, so that a requirement
+    in radians and one in metres count alike.
 
     Args:
         simulator: simulator of the policy in its world.
@@ -88,29 +93,78 @@ def search_drives(
         seen: function that receives the recorded drives of each batch.
         watch: function that is called at every step of the simulations.
     """
-    space = simulator.space
-    portfolio = Portfolio(space, np.random.default_rng(seed), lambda _point: None, random=random)
-    points, margins, values = list[Point](), list[NDArray[np.float64]](), list[float]()
-    scale: NDArray[np.float64] | None = None
+    space, generator = simulator.space, np.random.default_rng(seed)
+    points, margins = list[Point](), list[NDArray[np.float64]]()
+    searches: _Searches | None = None
     first = [] if starts is None else [each for each in starts if each.shape == (space.dim,)][:count]
     while len(points) < count:
-        given = first[len(points) : len(points) + simulator.batch]
-        wanted = min(simulator.batch, count - len(points)) - len(given)
-        proposals = [portfolio.next() for _ in range(wanted)]
-        batch = [*given, *(each.point for each in proposals)]
+        size = min(simulator.batch, count - len(points))
+        asked = [_Asked(each) for each in first[len(points) : len(points) + size]]
+        while len(asked) < size:
+            if random or searches is None:
+                asked.append(_Asked(generator.random(space.dim)))
+            else:
+                asked.append(searches.ask())
+        batch = [each.point for each in asked]
         recording = simulator.drive(np.stack(batch), watch)
         found = simulator.margins_of_agents(recording)
         seen(recording, found)
         points += batch
         margins += list(found)
-        scale = scale_of(found) if scale is None else scale
-        least = (found / scale).min((1, 2)).tolist()
-        values += least
-        for point, value in zip(given, least, strict=False):
-            portfolio.observe(point, value)
-        for proposal, value in zip(proposals, least[len(given) :], strict=True):
-            portfolio.tell(proposal, value)
-    return SearchedDrives(np.stack(points), np.stack(margins), np.array(values))
+        if searches is None:
+            searches = _Searches(space, generator, scale_of(found))
+        for each, own in zip(asked, found.min(1), strict=True):
+            searches.tell(each, own)
+    every = np.stack(margins)
+    return SearchedDrives(np.stack(points), every, (every / scale_of(every[: simulator.batch])).min((1, 2)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """Point to simulate, and the search that proposed it: None for a uniform or given point."""
+
+    point: Point
+    search: int | None = None
+    proposal: Proposal | None = None
+
+
+class _Searches:
+    """One search per requirement; they take turns and see all simulations."""
+
+    def __init__(
+        self, space: SearchSpace, generator: np.random.Generator, scale: NDArray[np.float64]
+    ) -> None:
+        """`scale`: sizes by which robustness is divided for comparison, (requirements,)."""
+        self._scale = scale
+        self._each = [Portfolio(space, generator, lambda _point: None) for _ in scale]
+        self._least = np.full(len(scale), np.inf)
+        self._idle = np.zeros(len(scale), dtype=int)  # own simulations since the last progress
+        self._turn = 0
+
+    def ask(self) -> _Asked:
+        """Return the next point: of the requirement that is violated most, or of all in turn."""
+        live = [index for index, each in enumerate(self._each) if not each.flat] or [*range(len(self._each))]
+        lively = [index for index in live if self._idle[index] < PATIENCE]
+        self._turn += 1
+        if self._turn % 2 and lively:
+            search = min(lively, key=lambda index: self._least[index])
+        else:
+            search = live[self._turn // 2 % len(live)]
+        proposal = self._each[search].next()
+        return _Asked(proposal.point, search, proposal)
+
+    def tell(self, asked: _Asked, margins: NDArray[np.float64]) -> None:
+        """Report the robustness of each requirement at a point, (requirements,)."""
+        values = margins / self._scale
+        if asked.search is not None:
+            self._idle[asked.search] += 1
+        self._idle[values < self._least] = 0
+        self._least = np.minimum(self._least, values)
+        for index, (portfolio, value) in enumerate(zip(self._each, values.tolist(), strict=True)):
+            if index == asked.search and asked.proposal is not None:
+                portfolio.tell(asked.proposal, value)
+            else:
+                portfolio.observe(asked.point, value)
 
 
 def scale_of(margins: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
 from stlc.assurance.drive_search import EARLIER, WRONG, round_of, search_drives, wrong_states
 from stlc.assurance.drive_simulator import DriveSimulator
+from stlc.assurance.search_space import SearchSpace
 from stlc.assurance.simulation import Focus
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
@@ -53,6 +55,29 @@ def test_a_search_makes_as_many_simulations_as_asked_and_repeats(simulator: Driv
     for requirement in range(len(simulator.requirements)):
         alone = simulator.simulate(found.points[3:4], Focus(requirement)).margins
         assert alone[0] == pytest.approx(found.margins[3].min(0)[requirement], abs=1e-5)  # but for rounding
+
+
+class _Bowls:
+    """Stand-in for drives: two requirements, each the distance from an own corner of three coordinates."""
+
+    space = SearchSpace(200, sparse=True)
+    batch = 16
+
+    def drive(self, points: np.ndarray, _watch: object = None) -> np.ndarray:
+        return points
+
+    def margins_of_agents(self, points: np.ndarray) -> np.ndarray:
+        low, high = points[:, 10:13], 100.0 * (1.0 - points[:, 20:23])
+        return np.stack([low.mean(1) - 0.02, high.mean(1) - 2.0], 1)[:, None]
+
+
+@pytest.mark.parametrize("seed", [101, 102, 103])
+def test_a_search_finds_failures_of_several_requirements(seed: int) -> None:
+    bowls = cast("DriveSimulator", _Bowls())
+    assert not search_drives(bowls, 1000, seed=seed, random=True).failing.any()
+    searched = search_drives(bowls, 1000, seed=seed)
+    assert searched.failing.sum() > 50
+    assert (searched.margins.min((0, 1)) < 0.0).all()
 
 
 def test_numbers_without_a_coordinate_differ_between_points(simulator: DriveSimulator) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stlc.controller.training.run import Run
     from stlc.native import Stop
 
-FAILURES_VERSION = 1
+FAILURES_VERSION = 2
 """Version of the rounds and of the use of their states; results of older versions are recomputed."""
 MOMENTS = (0.25, 0.4, 0.55, 0.7, 0.82)
 """Shares of the planned steps after which a round is due."""
