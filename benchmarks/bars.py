@@ -79,8 +79,9 @@ def _grid(shown: Sequence[Facet], drawn: Callable[[Axes, Facet], None], height: 
             if index < len(shown):
                 axes.set_title(shown[index].title)
                 drawn(axes, shown[index])
-                if index % columns:
+                if index % columns:  # the first column labels the others too
                     axes.set_ylabel("")
+                    axes.tick_params(labelleft=False)
         handles = {
             label: handle
             for axes in grid.flat
