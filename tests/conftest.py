@@ -1,4 +1,4 @@
-"""What holds for every test: one torch thread, reproducible hypothesis, no settings from outside."""
+"""Settings of every test: one torch thread, reproducible hypothesis, no settings from outside."""
 
 from __future__ import annotations
 

@@ -436,7 +436,7 @@ def test_importing_the_grammar_does_not_import_lark():
 
 
 def findings(read: Callable[[Source], object], text: str) -> tuple[Diagnostic, ...] | None:
-    """What is wrong with a text; None if it can be read. Any other exception is a bug."""
+    """Finding about a text; None if it can be read. Any other exception is a bug."""
     try:
         read(Source("damaged.stl", text))
     except SpecError as error:
