@@ -23,6 +23,7 @@ from stlc.compile.backends.array.interval import (
     Intervals,
     RoundingError,
     add,
+    bound,
     div,
     mul,
 )
@@ -275,6 +276,15 @@ def test_a_root_of_squares_is_known_at_0() -> None:
     found = pair(values(num, {"x": one(0.0, 0.0), "y": one(0.0, 0.0)}, INTERVALS))
     assert found[0] == 0.0
     assert found[1] == pytest.approx(0.0, abs=1e-150)
+
+
+def test_numbers_and_arrays_are_operands() -> None:
+    box, weights = Intervals(np.zeros(3), np.ones(3)), np.array([1.0, -2.0, 4.0])
+    assert mul(box, weights).low == pytest.approx([0.0, -2.0, 0.0])
+    assert add(box, weights).high == pytest.approx([2.0, -1.0, 5.0])
+    assert float(add(0.25, 0.5).high) == pytest.approx(0.75)
+    assert bound(add(box, -3.0)) == pytest.approx(4.0)
+    assert (bound(weights), bound(Intervals.point([1.0, math.nan]))) == (4.0, math.inf)
 
 
 def test_overflow_is_contained() -> None:

@@ -353,7 +353,7 @@ def add(a: Operand, b: Operand) -> Intervals:
     """`a + b`; a number is added when the ends are read."""
     (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
     most = (bound(a) + bound(b)) * _GROWTH
-    if most < _LARGE and isinstance(b, float):
+    if most < _LARGE and isinstance(a, Intervals) and isinstance(b, float):
         return Intervals(a_low, a_high, SUM, most, b)
     low = a_low + b_low
     high = low if a_low is a_high and b_low is b_high else a_high + b_high
@@ -362,7 +362,9 @@ def add(a: Operand, b: Operand) -> Intervals:
 
 def bound(x: Operand) -> float:
     """Number above the magnitudes of all values; infinite if there is none."""
-    return x._bound() if isinstance(x, Intervals) else abs(x)
+    if isinstance(x, Intervals):
+        return x._bound()
+    return abs(x) if isinstance(x, float) else _largest(x, x)
 
 
 def mul(a: Operand, b: Operand) -> Intervals:
