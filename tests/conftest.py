@@ -1,7 +1,8 @@
-"""What holds for every test: one torch thread, reproducible hypothesis, no settings from outside."""
+"""Settings of every test: one torch thread, reproducible hypothesis, no settings from outside."""
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -11,6 +12,8 @@ from hypothesis import HealthCheck, settings
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of tests start the program
+sys.dont_write_bytecode = False
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what runs in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -29,6 +32,12 @@ settings.load_profile("explore" if os.environ.get("STLC_EXPLORE") else "stlc")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--regenerate", action="store_true", help="write the golden files anew")
+
+
+def pytest_collection_finish() -> None:
+    """Modules and test items, some 600,000 objects, are not searched for garbage again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

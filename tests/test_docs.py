@@ -195,7 +195,7 @@ def command_lines() -> Iterator[Any]:
 
 
 def inline_commands(text: str) -> list[str]:
-    """What follows `stlc` in running text; a single word only names a command."""
+    """Words after `stlc` in running text; a single word only names a command."""
     return re.findall(r"`(?:\$ )?stlc ([^`\n]+)`", FENCE.sub("", text))
 
 
@@ -215,7 +215,7 @@ def test_command_lines_in_the_documents_can_be_parsed():
 
 
 def misread(words: list[str]) -> str:
-    """What is wrong with a command line; "" where nothing is."""
+    """Fault of a command line; "" if there is none."""
     try:
         with PROGRAM.make_context("stlc", list(words)) as context:
             rest = [*context._protected_args, *context.args]

@@ -84,7 +84,7 @@ def test_no_path_is_an_option() -> None:
 
 
 def built(text: str, folder: Path, *options: str) -> bytes:
-    """What a program prints."""
+    """Output of a program."""
     (folder / "main.c").write_text(text, encoding="utf-8")
     using = native.compiler()
     assert using is not None

@@ -46,7 +46,7 @@ def change(path: Path, diff: str) -> None:
 def failures(tmp_path_factory) -> dict[str, str]:
     """Check -> traceback, of those that fail in the extended copy."""
     tree = tmp_path_factory.mktemp("extended")
-    skipped = shutil.ignore_patterns("__pycache__", "results")
+    skipped = shutil.ignore_patterns("results")
     for folder in ("stlc", "benchmarks", "specs", "examples"):
         shutil.copytree(ROOT / folder, tree / folder, ignore=skipped)
     for kind, name, body in BLOCKS:

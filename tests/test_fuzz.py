@@ -51,9 +51,9 @@ def test_drawn_specifications() -> None:
 
 
 def test_bombs_of_every_construct() -> None:
-    for _, text in every(list(fuzz_bombs.specifications(12)), 45):
+    for _, text in every(list(fuzz_bombs.specifications(12)), 30):
         laws(Source("a.stl", text), SECONDS)
-    for _, text in every(list(fuzz_bombs.systems(12, SYSTEM)), 25):
+    for _, text in every(list(fuzz_bombs.systems(12, SYSTEM)), 17):
         tread_system(text)
 
 

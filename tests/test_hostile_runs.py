@@ -129,7 +129,7 @@ def test_a_specification_from_a_system_means_its_words(folder: Path) -> None:
 
 
 def without_comments(text: str) -> str:
-    """What a preprocessor leaves of a text; what it includes stays out."""
+    """Text after a preprocessor, without the files that it includes."""
     using = native.compiler()
     assert using is not None
     own = re.sub(r"^#include.*$", "", text, flags=re.M)
@@ -202,7 +202,7 @@ def test_a_header_compiles_without_a_warning_and_gives_names_back(names: list[st
 
 
 class Page(HTMLParser):
-    """What stands in a page: its elements, their attributes, the words of each."""
+    """Contents of a page: its elements, their attributes, the words of each."""
 
     def __init__(self, text: str) -> None:
         super().__init__(convert_charrefs=True)

@@ -46,7 +46,7 @@ def whole(example: Example) -> tuple[Source, int]:
 
 
 def findings(source: Source, example: Example) -> list[Diagnostic]:
-    """What the compiler says."""
+    """Findings of the compiler."""
     try:
         spec = parse(source)
         grid, interface = Grid(trace().dt, trace().horizon), None

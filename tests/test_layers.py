@@ -251,7 +251,7 @@ def test_nothing_that_a_user_gives_is_run():
 
 
 def danger(function: str, call: ast.Call) -> str:
-    """What is wrong with a call; "" where nothing is."""
+    """Fault of a call; "" if there is none."""
     options = {word.arg: ast.unparse(word.value) for word in call.keywords if word.arg in LOOKED_AT}
     if function in DANGEROUS:
         return DANGEROUS[function]

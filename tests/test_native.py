@@ -130,7 +130,7 @@ class Built:
         return self.path.parent
 
     def refused(self, why: str) -> None:
-        """What is in the cache is not loaded."""
+        """Check that a library in the cache is not loaded."""
         with pytest.warns(Notice, match=why):
             assert answer(self.text) == 42
 

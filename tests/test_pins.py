@@ -1,4 +1,4 @@
-"""What monitors, guards and commands say today, pinned in golden files that hold on every machine."""
+"""Answers of monitors, guards and commands, pinned in golden files that hold on every machine."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def hold(pins: ModuleType, name: str, found: Any, regenerate: bool) -> None:
 
 
 def test_random_formulas(pins: ModuleType, regenerate: bool) -> None:
-    """What the golden file asks is judged anew: it does not depend on the generator."""
+    """Cases of the golden file, judged anew: they do not depend on the generator."""
     path = GOLDEN / "formulas.json"
     if regenerate:
         cases = [pins.drawn(seed) for seed in range(FORMULAS)]

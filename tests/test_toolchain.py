@@ -101,7 +101,7 @@ def test_one_that_is_left_alone_ends_by_itself():
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_the_middle_of_a_start_comes_after_it(monkeypatch, tmp_path, sleeper, number):
-    """What is half begun could not be ended: a compiler would stay."""
+    """Order of starting and noting a compiler: one that is half begun could not be ended."""
 
     class StoppedError(Exception):
         pass

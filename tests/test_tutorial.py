@@ -9,7 +9,7 @@ from helpers.walkthrough import labels, steps, walk
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 ANY = (0, 1, 4)
-"""What a policy that was hardly trained does is left open."""
+"""Exit codes that a hardly trained policy may give."""
 
 
 def test_the_files_were_found():

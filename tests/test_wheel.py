@@ -62,12 +62,12 @@ def test_nothing_of_the_tree_is_seen(bare, folder):
 
 
 def named(pattern: str, system: Path) -> list[str]:
-    """What the lines of a system file name, such as its specification."""
+    """Names in the lines of a system file, such as its specification."""
     return re.findall(rf"^ *{pattern}: *([^\s#]+)", system.read_text(encoding="utf-8"), re.MULTILINE)
 
 
 JUDGES = {Path(name).name for path in (ROOT / "examples").glob("*.yaml") for name in named("judge", path)}
-"""What only judges drives may look back farther than a policy remembers: no task."""
+"""Specifications that only judge drives: they may look back farther than a policy remembers."""
 
 
 def test_every_shipped_specification_compiles_and_names_what_is_there(bare, folder):
@@ -184,7 +184,7 @@ def recordings(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def without(bare, recordings) -> dict[str, Said]:
-    """What is said where no extra is installed."""
+    """Messages where no extra is installed."""
     return dict(zip(QUICK, bare.run(recordings, *(line for _, line in QUICK.values())), strict=True))
 
 
@@ -284,7 +284,7 @@ def test_every_extra_is_tried():
 
 @pytest.mark.slow
 def test_a_real_installation(wheel, folder):
-    """What `pip install` makes of the wheel, the base dependencies taken from the package index."""
+    """Installation of the wheel by `pip install`, the base dependencies taken from the package index."""
     subprocess.run([sys.executable, "-m", "venv", "env"], check=True)
     pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt")]
     subprocess.run([*pip, str(wheel)], check=True)

@@ -302,7 +302,7 @@ class Statement:
         return int(self.low.counts.sum())
 
     def answer(self, claim: Claim) -> Answer:
-        """Whether the share of the claim is certified or refuted, each with the confidence of the claim."""
+        """Answer to the claim: certified or refuted, each with the confidence of the claim."""
         if claim.share is None:
             return "measured"
         if self.deployed >= claim.share:

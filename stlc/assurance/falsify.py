@@ -79,7 +79,7 @@ class Counterexample:
 
     @property
     def spurious(self) -> bool:
-        """Whether the requirement is satisfied at half the time step."""
+        """Satisfaction of the requirement at half the time step."""
         return self.half_step is not None and self.half_step >= -TOLERANCE
 
 
@@ -186,7 +186,7 @@ class Portfolio:
 
     @property
     def flat(self) -> bool:
-        """Whether nearly all of the last values are the same."""
+        """True if nearly all of the last values are the same."""
         count = len(self._values)
         return count > 1 and Counter(self._values).most_common(1)[0][1] >= FLAT * count
 

@@ -112,7 +112,7 @@ def _multiplied(formula: ir.Formula, factors: Mapping[ir.Num, float]) -> ir.Form
 
 
 def _freezes(formula: ir.Formula) -> bool:
-    """Whether a predicate may read a frozen value, which has no size outside of its formula."""
+    """True if a predicate may read a frozen value, which has no size outside of its formula."""
     return any(isinstance(node, ir.Freeze) for node in nodes(formula))
 
 

@@ -363,7 +363,7 @@ class CovarianceAdaptation(Strategy):
 
     @classmethod
     def available(cls, space: SearchSpace) -> bool:
-        """Whether the package is installed, and the space small enough for a covariance matrix."""
+        """True if the package is installed, and the space is small enough for a covariance matrix."""
         return importlib.util.find_spec("cma") is not None and 1 < space.dim <= CMA_DIMENSIONS
 
     def propose(self) -> Point:

@@ -105,10 +105,10 @@ def _around(values: Floats, known: Uncertainty, column: Column) -> Intervals:
     centre = Intervals.point(values)
     factor = float(known.unit.ratio / column.unit.ratio) if known.unit.text else 1.0
     share, amount = known.relative * (1.0 + EPSILON), known.absolute * factor * (1.0 + 2.0 * EPSILON)
-    error = mul(magnitudes(centre), share) + amount
-    if not error.high.any():
+    if not share and not amount:
         return centre
-    return widened(values - error.high, values + error.high)
+    error = (mul(magnitudes(centre), share) + amount).high if share else amount
+    return widened(values - error, values + error)
 
 
 # -------------------------------------------------------------------------- what is refused

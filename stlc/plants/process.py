@@ -185,7 +185,7 @@ class PlantProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether the process can take further requests."""
+        """True if the process can take further requests."""
         return self._process.poll() is None and not self._process.stdin.closed  # type: ignore[union-attr]
 
     def end(self) -> None:

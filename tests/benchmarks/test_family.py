@@ -128,7 +128,7 @@ def test_from_training_to_the_page_and_again(
 
 
 def _train(place: Place) -> None:
-    """What a process that trains ship_radius leaves behind."""
+    """Files that a process that trains ship_radius leaves behind."""
     cell = Cell(FAMILIES[0].name, "guided", 0, Length(steps=2), held_out=20)
     launch = Launch(root=place.runs_of(cell.key), command=("train",))
     task = load(cell.benchmark)

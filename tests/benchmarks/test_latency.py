@@ -53,7 +53,8 @@ def test_guards_are_timed_and_the_page_is_written(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     spec = str(ROOT / "specs/traffic.stl")
-    assert main(["train", spec, "--steps", "3", "--held-out", "20", "--no-pictures", "--name", "a"]) == 0
+    small = ["--steps", "3", "--held-out", "20", "--drives", "0", "--set", "test.steps=40"]
+    assert main(["train", spec, *small, "--no-pictures", "--name", "a"]) == 0
     capsys.readouterr()
     page = tmp_path / "page.md"
     page.write_text("# Page\n")

@@ -1,4 +1,4 @@
-"""What is timed is the same robustness, and the figures are what the targets ask for."""
+"""Timed formulas: they have the same robustness, and the figures meet the targets."""
 
 from __future__ import annotations
 

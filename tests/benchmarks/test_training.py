@@ -57,7 +57,7 @@ def quick(**changes: Any) -> Cell:
 
 
 def trained(cell: Cell, place: Place, watch: Watch | None = None) -> Run:
-    """What a process leaves behind."""
+    """Files that a process leaves behind."""
     task = load(cell.benchmark, tuple(cell.overrides.items()))
     launch = Launch(root=place.runs_of(cell.key), overrides=cell.overrides, command=("train",))
     return train(task, cell.config(), open_folder(task, cell.config(), launch), watch).run

@@ -1,4 +1,4 @@
-"""What cannot be trained ends in a diagnosis of what and where, and the last good weights are kept."""
+"""Tasks that cannot be trained end in a diagnosis of what and where; the last good weights are kept."""
 
 from __future__ import annotations
 

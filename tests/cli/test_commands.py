@@ -1,4 +1,4 @@
-"""What the commands for writing specifications do to files, and what they print."""
+"""Commands for writing specifications: their changes of files, and their output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of requirements that no plan was found for, and what of it is proved."""
+"""Diagnosis of requirements for which no plan was found, and its proved parts."""
 
 from __future__ import annotations
 

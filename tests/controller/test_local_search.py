@@ -49,7 +49,7 @@ def test_a_plan_that_is_good_enough_is_left_alone(task: Task) -> None:
 
 
 def test_a_plan_without_any_margin_solves_its_state() -> None:
-    """Where an allowance is counted in whole steps, the best plan may have a robustness of exactly 0."""
+    """Best plan with a robustness of exactly 0, where an allowance is counted in whole steps."""
     rho = torch.tensor([-1e-3, -1e-7, 0.0, 0.3])
     found = SearchResult(torch.zeros(4, 2), torch.zeros(4, 3, 1), rho)
     assert found.solved.tolist() == [False, True, True, True]
@@ -115,7 +115,7 @@ def test_a_search_that_is_stopped_gives_what_it_has(task: Task) -> None:
 
 
 def test_a_search_beside_the_steps_can_be_begun_again(task: Task) -> None:
-    """What it gives depends on what it begins with; a share of the work is done with every step."""
+    """Results that depend on the first plan; a share of the work is done with every step."""
     x0 = task.sample(20, seed=7)
     start = torch.zeros(20, task.horizon, 1)
     searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)

@@ -1,4 +1,4 @@
-"""What plans lose in the world of a scenario, against what can be said by hand; and margins as asked for."""
+"""Losses of plans in the world of a scenario, compared with values by hand; and margins as asked for."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_margin_is_what_is_lost_until_the_guard_looks_again(
 
 
 def test_noise_is_lost_where_a_plan_begins() -> None:
-    """Who believes to be lower than it is loses that; 99 % of even noise of 0.2 m is 0.196 m."""
+    """Loss of a system that believes to be lower than it is; 99 % of even noise of 0.2 m is 0.196 m."""
     assert margins("blurred") == {"q_low": pytest.approx(0.196, abs=0.003)}
     assert margins("blurred", 3) == margins("blurred")
     task = task_of("blurred")

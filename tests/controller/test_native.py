@@ -1,4 +1,4 @@
-"""Which part runs as C, and why another does not; what cannot be C gives the same results in torch."""
+"""Parts that run as C, and reasons why others do not; those give the same results in torch."""
 
 from __future__ import annotations
 

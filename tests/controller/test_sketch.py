@@ -1,4 +1,4 @@
-"""What worlds draw with: colours of who decided, and paths."""
+"""Drawing by worlds: colours of who decided, and paths."""
 
 import numpy as np
 import pytest

@@ -125,7 +125,7 @@ def test_a_network_chooses_among_its_plans_by_what_they_spare() -> None:
 
 
 def test_a_margin_makes_up_for_a_mistaken_model() -> None:
-    """What a guard without one lets pass, actuators that give more than they are told run into."""
+    """Violation that a guard without a margin lets pass, by actuators that give more than they are told."""
     passed = {margin: driven("paper", margin, "mismatch-80").states[:, :, 0].max() for margin in (0.0, 0.9)}
     assert passed[0.0] > 2.0
     assert passed[0.9] <= 2.0
@@ -152,7 +152,7 @@ def test_what_nobody_has_planned_is_no_danger() -> None:
 
 
 def test_the_full_guard_looks_at_all_that_is_left_of_a_plan() -> None:
-    """Who will be unsafe after the next planning alone, by what is planned now, plans at once."""
+    """Plans at once of an agent that the present plan makes unsafe only after the next planning."""
     task = task_of("disturb-50")
     guard, recorder = Guard(task, Onward(task), "full", limits=Limits(seconds=None)), Recorder(8)
     planned: list[int] = []

@@ -1,4 +1,4 @@
-"""What else a system does: controls, observations, objective, health, description."""
+"""Further parts of a system: controls, observations, objective, health, description."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Client:
         return self.findings(uri)
 
     def findings(self, uri: str) -> list[dict[str, Any]]:
-        """What is published next for a text."""
+        """Diagnostics that are published next for a text."""
         queue = self.published.setdefault(uri, [])
         while not queue:
             self._next()

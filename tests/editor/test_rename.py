@@ -111,7 +111,7 @@ def test_the_formulas_stay_whatever_is_renamed(path):
 
 
 def formulas(text: str) -> list[object]:
-    """What the compiler makes of a text: formulas over columns, or the codes of its findings."""
+    """Compiled text: formulas over columns, or the codes of its findings."""
     grid = Grid(Fraction(1, 10), 20)
     try:
         compiled = compile_spec(parse(Source("t.stl", text)), grid=grid, purpose="check")

@@ -187,7 +187,7 @@ def test_a_system_that_is_wrong_and_then_mended(session, project, spec):
 
 
 def wait_for(session: Client, address: str, *, empty: bool) -> list[dict[str, object]]:
-    """What is published for a text, once it is (not) empty: other texts may be open."""
+    """Diagnostics of a text, once there are (not) any: other texts may be open."""
     while bool(found := session.findings(address)) is empty:
         pass
     return found

@@ -185,7 +185,7 @@ def stops(rows: list[Seen]) -> list[list[float]]:
 
 
 def long_here(rows: list[Seen], k: int) -> bool:
-    """Whether a car has been in the stop area for 1 s."""
+    """True if a car has been in the stop area for 1 s."""
     return k >= 10 and all(row.left <= AREA and row.passed == rows[k].passed for row in rows[k - 10 : k + 1])
 
 

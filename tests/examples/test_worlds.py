@@ -1,4 +1,4 @@
-"""What every world of the examples keeps, whatever happens in it."""
+"""Laws of every world of the examples, whatever happens in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is exported as ONNX: files that say what they are, of any task or with the reason why not."""
+"""Export as ONNX: files that describe themselves, of any task or with the reason why not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is taken away decides as the run does, and nothing that does not is handed out."""
+"""Exported controllers decide as their run does; others are not written."""
 
 from __future__ import annotations
 

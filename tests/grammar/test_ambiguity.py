@@ -1,4 +1,4 @@
-"""Where other tools read a formula differently."""
+"""Formulas that other tools read differently."""
 
 from __future__ import annotations
 

@@ -436,7 +436,7 @@ def test_importing_the_grammar_does_not_import_lark():
 
 
 def findings(read: Callable[[Source], object], text: str) -> tuple[Diagnostic, ...] | None:
-    """What is wrong with a text; None if it can be read. Any other exception is a bug."""
+    """Finding about a text; None if it can be read. Any other exception is a bug."""
     try:
         read(Source("damaged.stl", text))
     except SpecError as error:
@@ -471,3 +471,16 @@ def test_any_text_gives_findings_or_a_tree(text):
     for read in (parse, parse_expr):
         found = findings(read, text)
         assert found is None or found
+
+
+def test_expressions_of_equal_texts_share_their_tree() -> None:
+    text, other = "# a comment\nx + 1", "# a comment\nx + 2"
+    first = parse_expr(Source("a.yaml", text), 12)
+    assert parse_expr(Source("a.yaml", "".join([text[:5], text[5:]])), 12) is first
+    for source in (Source("b.yaml", text), Source("a.yaml", other)):
+        assert parse_expr(source, 12).span.source == source
+    long = Source("a.yaml", text + " " * 40_000)
+    assert parse_expr(long, 12) is not parse_expr(long, 12)
+    for _ in range(2):
+        with pytest.raises(SpecError):
+            parse_expr(Source("a.yaml", "x +"))

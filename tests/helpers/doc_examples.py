@@ -32,7 +32,7 @@ BOUNDS = re.compile(r"\[(?P<low>-?(?:inf|[\d.]+)), (?P<high>-?(?:inf|[\d.]+))\]"
 
 @dataclass(frozen=True)
 class Claim:
-    """What a page says of a line of an example."""
+    """Statement of a page about a line of an example."""
 
     line: int
     what: str
@@ -54,12 +54,12 @@ class Example:
 
     @property
     def stands_alone(self) -> bool:
-        """Whether it declares signals of its own."""
+        """True if it declares signals of its own."""
         return re.search(r"^\s*(?:(?:state|env) +)?signal\b", self.text, re.MULTILINE) is not None
 
     @property
     def for_training(self) -> bool:
-        """Whether it is about plans."""
+        """True if it is about plans."""
         return self.text.startswith("# for training")
 
 

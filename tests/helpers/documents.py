@@ -1,4 +1,4 @@
-"""What a JSON document should look like, for the tests of all commands that print one."""
+"""Schemas of JSON documents, for the tests of all commands that print one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jsonschema import Draft202012Validator
 
 
 def misfits(value: Any, schema: dict[str, Any]) -> list[str]:
-    """Where a document is not what its schema says, and what it has that the schema does not speak of."""
+    """Places where a document is not what its schema says, and its keys that the schema lacks."""
     found = Draft202012Validator(closed(schema)).iter_errors(value)
     return [f"{error.json_path}: {error.message}"[:400] for error in found]
 

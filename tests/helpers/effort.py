@@ -1,4 +1,4 @@
-"""How much a piece of work takes, in calls: the same number on every machine, however loaded it is."""
+"""Effort of a piece of work in calls: the same number on every machine, however loaded it is."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def effort(work: Callable[[], object]) -> int:
-    """How many functions, of Python and of C, `work` calls; what it raises goes on."""
+    """Number of functions, of Python and of C, that `work` calls; its exceptions are not caught."""
     count = 0
 
     def counted(_frame: FrameType, event: str, _what: object) -> None:
@@ -26,7 +26,7 @@ def effort(work: Callable[[], object]) -> int:
 
 
 def refused(work: Callable[[], object], error: type[BaseException]) -> tuple[Any, int]:
-    """What `work` raises, and what it takes until then."""
+    """Exception of `work`, and the effort until then."""
     caught: list[BaseException] = []
 
     def attempt() -> None:

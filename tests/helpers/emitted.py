@@ -1,4 +1,4 @@
-"""What tests of emitted C share."""
+"""Shared parts of the tests of emitted C."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _is_folded(num: ir.Num) -> bool:
 
 
 def _decided(cond: ir.Formula) -> bool:
-    """Whether an atom compares constants."""
+    """True if an atom compares constants."""
     if isinstance(cond, ir.BoolOp):
         return any(map(_decided, cond.items))
     return isinstance(cond, ir.Predicate) and isinstance(cond.num, ir.Const)

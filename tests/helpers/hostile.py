@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 CANARY = "canary_ran"
-"""What a name that runs as code would leave behind: a file of that name, or this word on its own."""
+"""Mark that a name leaves behind if it runs as code: a file of that name, or this word on its own."""
 
 RUNS = f'__attribute__((constructor)) static void boom(void) {{ fopen("{CANARY}", "w"); }}'
 

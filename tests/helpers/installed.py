@@ -31,7 +31,7 @@ def build_wheel(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Said:
-    """What a command gave."""
+    """Result of a command."""
 
     code: int
     out: str
@@ -122,7 +122,7 @@ def _unpacked(wheel: Path) -> Path:
 
 
 def _closure(root: PathDistribution, extras: Sequence[str]) -> Iterator[Distribution]:
-    """What a distribution requires, and what that requires, as it is installed here."""
+    """Requirements of a distribution, and theirs, as they are installed here."""
     seen: set[tuple[str, str]] = set()
     queue = [(root, extra) for extra in ("", *extras)]
     while queue:

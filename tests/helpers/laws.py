@@ -204,7 +204,7 @@ def equivalence(draw: Draw) -> tuple[Formula, Formula]:
 
 
 def exclusion(draw: Draw) -> tuple[Formula, Formula]:
-    """Which is `if p then not q else q`."""
+    """Formula `if p then not q else q`."""
     p, q = draw(part), draw(part)
     return logic("xor", p, q), logic("or", logic("and", p, negated(q)), logic("and", negated(p), q))
 
@@ -319,7 +319,7 @@ def check_clock(draw: Draw, env: dict[str, Any]) -> None:
 
 
 def check_compiled(formula: Formula, env: Mapping[str, np.ndarray]) -> None:
-    """What the compiler makes of a formula has its robustness under every semantics."""
+    """Law: a compiled formula has the robustness of the written one under every semantics."""
     for name in ALL:
         compiled_as_defined(formula, env, name)
 

@@ -1,4 +1,4 @@
-"""What the tests of the paper's benchmarks share: our files against references that were written by hand."""
+"""Shared parts of the tests of the paper's benchmarks: our files against hand-written references."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _changed(text: str, changes: Changes) -> str:
 
 
 def apart(benchmark: Benchmark, task: Task, count: int = COUNT) -> tuple[float, float, float]:
-    """How far states, robustness and robustness of phi_safe are from the reference, at most."""
+    """Largest differences of states, robustness and robustness of phi_safe from the reference."""
     assert task.system.names == benchmark.columns
     x0, u = benchmark.cases(1, count)
     wanted = benchmark.rollout(x0, u)
@@ -105,7 +105,7 @@ def apart(benchmark: Benchmark, task: Task, count: int = COUNT) -> tuple[float, 
 
 
 def kernel_apart(benchmark: Benchmark, task: Task) -> tuple[float, float]:
-    """How far the native kernel is from the torch graph: states and robustness, at most."""
+    """Largest differences of the native kernel from the torch graph: states and robustness."""
     x0, u = (torch.tensor(part) for part in benchmark.cases(2))
     assert task.native is not None
     rho, columns = task.native.judge(x0, u, columns=True)

@@ -32,9 +32,9 @@ class Trace:
     grid: Grid
     end: Literal["strict", "truncate", "open"] = "strict"
     held: Mapping[str, float | None] = field(default_factory=dict)
-    """What `freeze` binds around; None where it has no value."""
+    """Values of the enclosing `freeze`; None where it has no value."""
     stop: int = 0
-    """How many samples there will be, where the end is "open" and that is more than are known."""
+    """Final number of samples, where the end is "open" and that is more than are known."""
 
     @property
     def samples(self) -> int:
@@ -42,14 +42,14 @@ class Trace:
 
     @property
     def length(self) -> int:
-        """Where windows to the end end."""
+        """End of windows that reach to the end."""
         return max(self.samples, self.stop) if self.end == "open" else self.samples
 
     def row(self, t: int) -> Row:
         return Row(self, t)
 
     def has(self, num: ir.Num, t: int) -> bool:
-        """Whether everything exists that a number reads at sample `t`."""
+        """True if everything exists that a number reads at sample `t`."""
         return 0 <= t < self.samples and all(self._there(leaf, t) for leaf in _leaves(num))
 
     def _there(self, leaf: ir.Num, t: int) -> bool:

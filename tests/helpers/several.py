@@ -14,7 +14,7 @@ import torch
 from stlc.controller.parallel.ddp import Ranks, joined
 
 ENVIRONMENT = {"WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1"}
-"""What `torchrun` tells each of two."""
+"""Environment that `torchrun` gives each of two ranks."""
 SECONDS = 60
 
 
@@ -27,7 +27,7 @@ def free_port() -> int:
 
 
 def together(work: Callable[[Ranks], Any]) -> list[Any]:
-    """What `work` gives on each of two ranks: its value, or what it raised; None of one that died."""
+    """Results of `work` on each of two ranks: its value, or the exception; None of one that died."""
     fork = multiprocessing.get_context("fork")
     port = free_port()
     answers = [fork.Pipe(duplex=False) for _ in range(2)]

@@ -1,4 +1,4 @@
-"""What tests of graphs share: a sheet is run by onnxruntime."""
+"""Shared parts of the tests of graphs: a sheet is run by onnxruntime."""
 
 from __future__ import annotations
 

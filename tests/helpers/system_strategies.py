@@ -156,7 +156,7 @@ STEPWISE = (
     "mode == sport", "mode in {eco, rest}", "armed", "count >= 3", "count % 2 == 0", "held < 0.537 s",
     "mode != eco", "true", "round(heat * 3) >= 1", "floor(x / 1 m) < 1",
 )  # fmt: skip
-"""What stays as it is for some steps: at ties a gradient has more than one right value."""
+"""Columns that stay constant for some steps: at ties a gradient has more than one right value."""
 INTERVALS = (
     "[0, T]",
     "[0.1 s, 0.4 s]",

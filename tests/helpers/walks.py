@@ -29,7 +29,7 @@ CORNERS = {
     "swims": [(0, 0), (4, 0), (0, 2), (4, 4)],
     "late": [(0, 0), (0, 0), (4, 4), (4, 4)],
 }
-"""Where each is at 0, 2, 4 and 6 seconds; straight lines between."""
+"""Positions at 0, 2, 4 and 6 seconds; straight lines between."""
 
 
 def walk(names=tuple(CORNERS), text=SPEC):

@@ -24,7 +24,7 @@ BLOCK = re.compile(r"^(?:<!-- file: ([\w./]+) -->\n)?```(\w*)\n(.*?)^```", re.MU
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What a reader does, or sees, next.
+    """Next action of a reader, or output that the reader sees.
 
     Attributes:
         kind: what `text` is: a file to write, a command or program to run, lines that were printed.
@@ -102,7 +102,7 @@ def _run(step: Step, special: dict[str, tuple[int, ...]], capsys: pytest.Capture
 
 
 def labels(text: str) -> list[str]:
-    """What lines begin with, up to a wide gap; numbers are those of one run."""
+    """Beginnings of lines, up to a wide gap; numbers are those of one run."""
     lines = [line.strip() for line in text.splitlines()]
     found = [re.split(r"\s{2,}", line)[0] for line in lines if re.search(r"\S\s{2,}\S", line)]
     return [label for label in found if not re.search(r"(?<!_)\d", label)]

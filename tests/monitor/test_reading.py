@@ -1,4 +1,4 @@
-"""What a specification says about the files that are judged by it."""
+"""Statements of a specification about the files that are judged by it."""
 
 from __future__ import annotations
 

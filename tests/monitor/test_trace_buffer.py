@@ -1,4 +1,4 @@
-"""Why a stream violates a requirement: what `explain` says of the whole recording."""
+"""Causes of violations in a stream: those that `explain` gives for the whole recording."""
 
 from __future__ import annotations
 

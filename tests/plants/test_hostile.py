@@ -160,7 +160,7 @@ def test_children_of_a_plant_end_with_it(runs):
 
 
 def gone(pid: int) -> bool:
-    """Whether a process ends within a minute."""
+    """True if a process ends within a minute."""
     for _ in range(3000):
         try:
             state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]

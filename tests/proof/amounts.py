@@ -1,4 +1,4 @@
-"""How many cases the tests of this folder look at."""
+"""Numbers of cases of the tests of this folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must be true of the cause that is told of one violated case.
+"""Properties of the cause that is reported for one violated case.
 
 The value at the end of the path is the robustness of the requirement. Where it is said that it decides alone,
 a change of a signal there that brings its predicate closer to what is wanted raises the robustness. What is
@@ -81,7 +81,7 @@ def _rho(cause: Cause) -> float:
 
 
 def _known_by_folding(case: Case, monitor: Monitor, cause: Cause) -> bool:
-    """Whether `true` and `false` tell the compiler what the definition leaves open: nothing is behind it."""
+    """True if `true` and `false` tell the compiler what the definition leaves open: nothing is behind it."""
     if not case.folds or np.isfinite(_rho(cause)):
         return False
     (rule,) = monitor.compiled.requirements
@@ -90,7 +90,7 @@ def _known_by_folding(case: Case, monitor: Monitor, cause: Cause) -> bool:
 
 
 def _values(case: Case, cause: Cause) -> Iterator[str]:
-    """Whether the leaf and the readings have the values that they are told to have."""
+    """Check that the leaf and the readings have their reported values."""
     leaf, rho = cause.tree.leaf, _rho(cause)
     if not np.isclose(-leaf.rho if leaf.holds else leaf.rho, rho, rtol=0, atol=1e-9):
         yield f"value: {leaf.rho} at the leaf, {rho} is the robustness"
@@ -119,7 +119,7 @@ class _Definition(reference.Robustness):
 
 
 def _labels(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
-    """Whether what is said beside the parts is what the definition says of them."""
+    """Check that the statements beside the parts are those of the definition."""
     judge = _Definition(_seen(case, monitor, cause))
     for node in _said(cause.tree):
         formula: typed.Formula = node.formula
@@ -145,7 +145,7 @@ def _body(formula: typed.Formula) -> typed.Formula:
 
 
 def _change(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
-    """Whether a change that brings the predicate closer to what is wanted raises the robustness."""
+    """Check that a change of the predicate towards the wanted value raises the robustness."""
     rho, leaf = _rho(cause), cause.tree.leaf
     if not cause.alone or not np.isfinite(rho):
         return

@@ -42,7 +42,7 @@ MODES = {"idle": 0, "go": 1, "halt": 3}
 
 @dataclass(frozen=True)
 class Taste:
-    """What may be drawn.
+    """Choices of what may be drawn.
 
     Attributes:
         constants: `true` and `false`.
@@ -382,7 +382,7 @@ def _in_block(x: float, y: float) -> float:
 
 
 def _ends(row: Row) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Where a segment starts and ends, off the grid of ties; at the last sample it is a point."""
+    """Start and end of a segment, off the grid of ties; at the last sample it is a point."""
     x, y = row["x"], row["y"]
     return (x + 0.03, y - 0.07), (row.get("x+1", x) + 0.03, row.get("y+1", y) - 0.07)
 

@@ -45,7 +45,7 @@ from proof.language import (
 Instants: TypeAlias = int
 End: TypeAlias = Literal["truncate", "lower", "upper"]
 Met: TypeAlias = Callable[[Atom, float], bool]
-"""Whether a predicate with this margin counts as true."""
+"""Truth of a predicate with this margin."""
 
 FUTURE = ("always", "eventually", "until", "release", "unless")
 
@@ -63,7 +63,7 @@ class Record:
     stop: int = 0
     growing: bool = False
     margins: dict[tuple[object, ...], float | None] = field(default_factory=dict)
-    """What predicates were worth: (predicate, instant, frozen values) -> margin."""
+    """Margins of predicates: (predicate, instant, frozen values) -> margin."""
 
     @property
     def samples(self) -> int:
@@ -76,7 +76,7 @@ class Record:
 
     @property
     def length(self) -> int:
-        """Where windows to the end of the trace end."""
+        """End of windows that reach to the end of the trace."""
         return self.samples if self.end == "truncate" else max(self.samples, self.stop)
 
     @cached_property
@@ -89,12 +89,12 @@ class Record:
 
     @property
     def assume_missing_true(self) -> Instants:
-        """What optimists take for true where nothing is known."""
+        """Truth that an upper bound assumes where nothing is known."""
         return self.unknown if self.end == "upper" else 0
 
 
 def inside(window: Window, k: int, *, outward: bool) -> bool:
-    """Whether a window reads the instant k steps away; `outward` adds neighbours of bounds off the grid."""
+    """True if a window reads the instant k steps away; `outward` adds neighbours of bounds off the grid."""
     low, high = window.lo, window.hi
     if outward and low.denominator != 1 and k == math.floor(low):
         return True
@@ -121,7 +121,7 @@ class Sets:
         self._known: dict[tuple[int, bool], Instants] = {}
 
     def of(self, formula: Formula, truth: bool = True) -> Instants:
-        """Where `formula` is met (`truth`), or its negation is."""
+        """Instants at which `formula` is met (`truth`), or its negation is."""
         key = (id(formula), truth)
         if key not in self._known:
             self._known[key] = self._of(formula, truth) & self.record.everywhere
@@ -160,7 +160,7 @@ class Sets:
         raise TypeError(formula)
 
     def _atom(self, atom: Atom, truth: bool) -> Instants:
-        """What reads a sample or a frozen value that does not exist is what is thought of the unknown."""
+        """Truth of the unknown, where a sample or a frozen value that is read does not exist."""
         ask, found, end = self._asks[truth], self.record.assume_missing_true, self.record.end
         for t, row in enumerate(self.record.rows):
             key = (atom, t, *self.held.items())
@@ -241,7 +241,7 @@ class Sets:
 
 @dataclass(frozen=True)
 class _Look:
-    """How the instants of a record look through a window: at all they see (`every`) or for some of it."""
+    """View of the instants of a record through a window: all that they see (`every`), or some of it."""
 
     record: Record
     window: Window
@@ -258,11 +258,11 @@ class _Look:
 
     @property
     def _endless(self) -> bool:
-        """Whether the window may take samples for ever."""
+        """True if the window may take samples for ever."""
         return self._to_the_end and self.record.growing and self.every is (self.record.end == "lower")
 
     def _steady(self, instants: Instants) -> Instants:
-        """Where no window reaches back to a sample any more, all instants are alike.
+        """Last instant that differs: later ones, whose windows reach no sample, are alike.
 
         The record is finite and has to be cut somewhere; what looks beyond the cut must not decide.
         """
@@ -278,7 +278,7 @@ class _Look:
         return (1 << self.record.length) - 1 if self._to_the_end else self.record.everywhere
 
     def at(self, instants: Instants, k: int) -> Instants:
-        """Who finds himself in the set k steps away; where there is nothing to see, `every` is content."""
+        """Instants that are in the set k steps away; where there is nothing to see, `every` is content."""
         if self._endless:
             instants = self._steady(instants)
         if self.forward:
@@ -353,7 +353,7 @@ def margin_of(atom: Atom, row: Row, held: Row) -> float | None:
 
 
 def kept(formula: Frozen, row: Row, held: Row) -> Row:
-    """What is frozen inside of the formula at an instant; names without a value are left out."""
+    """Values frozen inside of the formula at an instant; names without a value are left out."""
     found = {name: value for name, value in held.items() if name not in {n for n, _, _ in formula.bindings}}
     for name, _, value in formula.bindings:
         try:

@@ -48,7 +48,7 @@ def _bounds(
 
 
 def _planned(formula: typed.Formula, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Whether the rewritten formula holds in every planning window, (starts, batch)."""
+    """Truth of the rewritten formula in every planning window, (starts, batch)."""
     sink: list[Diagnostic] = []
     table = TimerTable(frozenset(columns))
     found = augment(requirement(formula), GRID, table, sink)
@@ -135,7 +135,7 @@ def check_past(formula: typed.Formula, seed: int) -> None:
 
 
 def _formula(formula: typed.Formula, table: TimerTable) -> ir.Formula:
-    """What plans are asked for."""
+    """Formula that plans are asked for."""
     sink: list[Diagnostic] = []
     found = augment(requirement(formula), GRID, table, sink)
     assert not [finding for finding in sink if finding.severity == "error"]

@@ -1,4 +1,4 @@
-"""What a monitor must say of one case: checks against the definitions, one a case.
+"""Checks of a monitor against the definitions, one a case.
 
 Every case goes the whole way: a formula is written as `.stl`, parsed, resolved, compiled and judged by
 `stlc.Monitor`. `proof.levels` says what has to come out; `reference`, which shares no idea with it, says so
@@ -126,7 +126,7 @@ def check_clock(seed: int) -> None:
 
 
 def check_windows(seed: int) -> None:
-    """Where `T` and `end` are both meant, `end` is the end of each planning window."""
+    """Formula in which `end` is the end of each planning window, where `T` and `end` are both meant."""
     case = Case(seed, Taste(windows=True, constants=False, bools=seed % 2 == 0, depth=3))
     monitor = case.monitor()
     (rule,) = monitor.compiled.requirements

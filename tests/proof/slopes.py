@@ -30,13 +30,13 @@ def moved(case: Case, name: str, place: tuple[int, ...], by: float) -> dict[str,
 
 
 def check_gradient(seed: int, name: str) -> tuple[int, int]:
-    """How many slopes were compared under a semantics, and how many of them left out."""
+    """Numbers of slopes that were compared under a semantics, and of those left out."""
     case = Case(seed, SMOOTH, longest=9, generic=True)
     return compare(case, SMOOTHED.get(name, semantics_of("exact")))
 
 
 def compare(case: Case, semantics: Semantics) -> tuple[int, int]:
-    """How many slopes were compared, and how many of them left out."""
+    """Numbers of slopes that were compared, and of those left out."""
     monitor, at = case.monitor(), case.seed % case.samples
 
     def robustness(signals: dict[str, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""What a stream must say of one case, sample by sample.
+"""Checks of a stream on one case, sample by sample.
 
 After every sample the bounds of all open starts are those of `Monitor.bounds` on what came so far, or where
 windows run to the end of the trace those of the definition for a trace that may end with any sample. A
@@ -142,7 +142,7 @@ def check_end(case: Case, monitor: Monitor, online: Online, at: Any) -> None:
 
 
 def asked(question: Callable[[], Any]) -> Any:
-    """What is said of the requirement, or why nothing can be said."""
+    """Statement about the requirement, or the reason why there is none."""
     try:
         return question()["r"]
     except TraceError as error:

@@ -50,7 +50,7 @@ def written(case: Case, folder: Path) -> list[str]:
 
 
 def asked(capsys: pytest.CaptureFixture[str], words: list[str]) -> Any:
-    """What the command answers about the requirement; its exit code says the same."""
+    """Answer of the command about the requirement; its exit code says the same."""
     code = main(["check", *words, "--json"])
     document = json.loads(capsys.readouterr().out)
     (rule,) = document["result"]["requirements"]

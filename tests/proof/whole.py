@@ -1,4 +1,4 @@
-"""Where a formula has a value on a recording without cutting anything."""
+"""Instants at which a formula has a value on a recording without cutting anything."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Names: TypeAlias = frozenset[str]
 def defined(  # noqa: C901 - one case a node
     formula: Formula, rows: Rows, positive: bool = True, held: Names = frozenset()
 ) -> Instants:
-    """Where nothing that is read leaves the trace; `held`: names that are frozen around."""
+    """Instants at which nothing that is read leaves the trace; `held`: names that are frozen around."""
     everywhere = (1 << len(rows)) - 1
     match formula:
         case Atom(_, margin):
@@ -107,7 +107,7 @@ def _there(value: Callable[[Row], Any], rows: Rows, held: Names) -> Instants:
 
 
 def read_in(formula: Formula) -> Names:
-    """What the predicates of a formula read, and the numbers that it freezes."""
+    """Reads of the predicates of a formula, and of the numbers that it freezes."""
     found: Names = frozenset()
     for node in nodes(formula):
         match node:
@@ -119,7 +119,7 @@ def read_in(formula: Formula) -> Names:
 
 
 def names_of(value: Callable[[Row], Any]) -> Names:
-    """What a number reads, found by giving it one name after the other."""
+    """Names that a number reads, found by giving it one after the other."""
     row: dict[str, Any] = {}
     while True:
         try:

@@ -66,7 +66,7 @@ SPELLINGS = {
 
 
 class Level(IntEnum):
-    """How tightly a formula binds, loosest first."""
+    """Precedence of a formula, loosest first."""
 
     IFF = 0
     IMPLIES = 1
@@ -151,7 +151,7 @@ class _Writer:
                 return self._called(formula)
 
     def _after(self, window: Window, body: Formula) -> str:
-        """What a temporal operator governs; a `[` right after the word would start an interval."""
+        """Operand of a temporal operator; a `[` right after the word would start an interval."""
         text = self.text(body, Level.PREFIX)
         return f"({text})" if text.startswith("[") and not window.text else text
 

@@ -34,7 +34,7 @@ def test_a_grid_that_fits_is_tried_whole_and_in_order() -> None:
 
 
 def test_prefixes_of_one_control_lie_in_memory_in_order() -> None:
-    """What does not, torch.export keeps with a warning."""
+    """Parts that do not; torch.export keeps them with a warning."""
     assert grid([5]).prefixes(2).flags.c_contiguous
 
 

@@ -29,7 +29,7 @@ X = np.sin(T)
 ON = T > 1.0
 
 MUTATIONS = int(os.environ.get("STLC_FUZZ", "40"))
-"""How many damaged files of each format are tried."""
+"""Number of damaged files of each format."""
 
 POSE = """geometry_msgs/Point position
 bool ok

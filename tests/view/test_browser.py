@@ -58,7 +58,7 @@ def written(deployed, recording):
 
 
 def opened(folder, width, scheme):
-    """What the browser finds, and what it complains of."""
+    """Findings of the browser, and its complaints."""
     probe = folder / "probe.html"
     probe.write_text(PROBE % width)
     done = subprocess.run(

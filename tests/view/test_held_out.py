@@ -1,4 +1,4 @@
-"""Where a policy fails, as numbers and as a sentence."""
+"""States in which a policy fails, as numbers and as a sentence."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is said of a training is true of a policy at 3 %, at 50 % and at 97 %."""
+"""Statements about a training, which are true of a policy at 3 %, at 50 % and at 97 %."""
 
 from __future__ import annotations
 

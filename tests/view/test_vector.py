@@ -1,4 +1,4 @@
-"""What is drawn, kept as commands."""
+"""Drawings, kept as commands."""
 
 import numpy as np
 import pytest

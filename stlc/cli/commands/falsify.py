@@ -171,7 +171,7 @@ class _Target:
 
     @property
     def model(self) -> bool:
-        """Whether the target is a specification, rather than a run."""
+        """True if the target is a specification, rather than a run."""
         return self.name.endswith((".stl", ".stlc"))
 
     def simulator(self, overrides: Mapping[str, str], runs: Path, jobs: int = 1) -> _Simulator:

@@ -22,7 +22,7 @@ from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, Limits, best, finite, rank
 from stlc.controller.guard.margins import with_margins
-from stlc.controller.guard.search import RelaxedSearch, StagedSearch
+from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
 from stlc.controller.streams import seeded
 from stlc.controller.verification.tubes import TubeModel
 from stlc.diagnostics import usage
@@ -116,7 +116,7 @@ def _growth(tube: Tube, names: Iterable[str]) -> float:
     return max(wide / float(share[wide]), 1.0)
 
 
-class CertifiedSearch:
+class CertifiedSearch(GuardSearch):
     """Search of the guard "certified": other proposals of the policy, then the stages of the guard "full".
 
     If no certified plan is found, a plan is taken that is certified until the next decision, else one that is
@@ -144,43 +144,30 @@ class CertifiedSearch:
     ) -> None:
         self.task, self.limits = task, limits or Limits()
         self._policy, self._certifier = policy, certifier
-        self._stages: StagedSearch | RelaxedSearch
+        self._stages: GuardSearch
         if sought is task:
             self._stages = StagedSearch(task, policy, "full", grid=grid, limits=self.limits)
         else:
             self._stages = RelaxedSearch(task, sought, policy, grid=grid, limits=self.limits)
 
-    @torch.no_grad()
-    def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
-        """Search for better plans in states whose plan was rejected.
-
-        Args:
-            x: states, (agents, n) float64.
-            plan: (agents, T, m), the policy's plan; entries that are not finite are replaced.
-            previous: (agents, T, m), remainders of the previous plans.
-
-        Returns:
-            The plan that ranks highest, one per agent.
-        """
-        plan = finite(plan.to(x.dtype), self.task)
-        previous = None if previous is None else finite(previous.to(x.dtype), self.task)
+    def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
         others = finite(self._policy.candidates(x).to(x.dtype).flatten(0, 1), self.task)
         others = others.view(len(x), -1, *plan.shape[1:])
         pool = [plan[:, None], others] if previous is None else [plan[:, None], others, previous[:, None]]
-        found, tier = self._best(x, torch.cat(pool, 1))
+        found, tier = self._chosen(x, torch.cat(pool, 1))
         found.source[(found.plans == plan).flatten(1).all(1)] = POLICY
         rows = (tier < _CERTIFIED).nonzero()[:, 0]
         if len(rows):
             searched = self._stages.search(x[rows], plan[rows], None if previous is None else previous[rows])
             both = torch.stack((found.plans[rows], searched.plans), 1)
-            better, _ = self._best(x[rows], both)
+            better, _ = self._chosen(x[rows], both)
             new = (better.plans == searched.plans).flatten(1).all(1)
             source, length = (getattr(searched, name)[new] for name in ("source", "prefix_length"))
             taken = replace(better.of(new), source=source, prefix_length=length)
             found.put(rows[new], taken)
         return found
 
-    def _best(self, x: Tensor, plans: Tensor) -> tuple[Candidates, Tensor]:
+    def _chosen(self, x: Tensor, plans: Tensor) -> tuple[Candidates, Tensor]:
         """Choose among several plans of each agent, (agents, choices, T, m).
 
         Returns:

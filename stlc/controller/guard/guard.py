@@ -13,7 +13,7 @@ from stlc.controller.guard.candidates import Candidates, Limits, Mode, finite
 from stlc.controller.guard.certified import CertifiedSearch, Certifier
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
-from stlc.controller.guard.search import RelaxedSearch, StagedSearch
+from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
 from stlc.controller.problem.task import rank
 from stlc.runtime.prefixes import PrefixGrid
 
@@ -111,7 +111,7 @@ class Guard:
         margin = {} if mode == "none" or limits is None else limits.margin
         self.strict = sought = with_margins(task, margin)
         self.certifier: Certifier | None = None
-        self.backup: StagedSearch | RelaxedSearch | CertifiedSearch | None = None
+        self.backup: GuardSearch | None = None
         if mode == "certified":
             self.certifier = Certifier(task)
             sought = self.certifier.sought(policy, margin)

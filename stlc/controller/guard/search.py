@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,38 @@ if TYPE_CHECKING:
     from stlc.runtime.prefixes import PrefixGrid
 
 
-class StagedSearch:
+class GuardSearch(ABC):
+    """Search of a guard for better plans.
+
+    Attributes:
+        task: specification and system by which plans are judged.
+        limits: computational limits of a decision.
+    """
+
+    task: Task
+    limits: Limits
+
+    @torch.no_grad()
+    def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
+        """Search for better plans in states whose plan was rejected.
+
+        Args:
+            x: states, (agents, n) float64.
+            plan: (agents, T, m), the policy's plan; entries that are not finite are replaced.
+            previous: (agents, T, m), remainders of the previous plans.
+
+        Returns:
+            The plan that ranks highest among the proposals, one per agent.
+        """
+        plan = finite(plan.to(x.dtype), self.task)
+        return self._best(x, plan, None if previous is None else finite(previous.to(x.dtype), self.task))
+
+    @abstractmethod
+    def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
+        """`search`, from finite plans of the dtype of `x`."""
+
+
+class StagedSearch(GuardSearch):
     """Search for better plans: runs the stages (search methods) of a guard in order.
 
     Args:
@@ -48,21 +80,8 @@ class StagedSearch:
         setup = Setup(task, policy, grid or grid_of(task), self.limits, guard, generator)
         self.stages = [stage(setup) for stage in stages_of(guard)]
 
-    @torch.no_grad()
-    def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
-        """Search for better plans in states whose plan was rejected.
-
-        Args:
-            x: states, (agents, n) float64.
-            plan: (agents, T, m), the policy's plan; entries that are not finite are replaced.
-            previous: (agents, T, m), remainders of the previous plans.
-
-        Returns:
-            The plan that ranks highest among the proposals of all stages, one per agent.
-        """
+    def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
         deadline = Deadline(self.seconds, len(x))
-        plan = finite(plan.to(x.dtype), self.task)
-        previous = None if previous is None else finite(previous.to(x.dtype), self.task)
         rejected = Rejected(x, plan, previous, Candidates.unjudged(plan))
         for stage in self.stages:
             rows = stage.wanted(rejected.best).nonzero()[:, 0]
@@ -75,12 +94,16 @@ class StagedSearch:
         return best
 
 
-class RelaxedSearch:
+class RelaxedSearch(GuardSearch):
     """Search of the guard "full" with robustness margins of safety requirements.
 
     If no plan keeps the required margins, the safe plan with the largest margin is taken. Example: a rover is
     already closer to a wall than the margin allows. It may continue at this distance. A plan that keeps the
     full margin for some steps and then becomes unsafe would be worse.
+
+    If the present state itself is nearer to a violation than the margin, no plan can keep the margin. Then
+    the stages (search methods) ignore the margin, and their plans start a search for the largest margin.
+    Verdicts include the margins.
 
     Args:
         task: specification without margins, and system.
@@ -102,23 +125,8 @@ class RelaxedSearch:
         self._searcher = Searcher(safety_task(strict), generator, enough=0.0)
         self._formulas = [rule.formula for rule in strict.compiled.safety]
 
-    @torch.no_grad()
-    def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
-        """Search for better plans in states whose plan was rejected; verdicts include the margins.
-
-        Args:
-            x: states, (agents, n) float64.
-            plan: (agents, T, m), the policy's plan.
-            previous: (agents, T, m), remainders of the previous plans.
-
-        Returns:
-            One plan per agent: the best plan of the stages if it keeps the margin, else the safe plan with
-            the largest margin found. If the present state itself is nearer to a violation than the margin, no
-            plan can keep the margin. Then the stages (search methods) ignore the margin, and a search for the
-            largest margin starts from their plans.
-        """
-        plan = finite(plan.to(x.dtype), self.task)
-        previous = plan if previous is None else finite(previous.to(x.dtype), self.task)
+    def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
+        previous = plan if previous is None else previous
         lacking = self._lacking(x, plan)
         found = self._plain_found(x, plan, previous, lacking)
         far = (~lacking).nonzero()[:, 0]

@@ -75,7 +75,7 @@ class InputDecl:
 
     @property
     def moves(self) -> bool:
-        """Whether the signal may change over time."""
+        """True if the signal may change over time."""
         return self.points > 1
 
     @property

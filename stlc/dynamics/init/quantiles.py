@@ -114,7 +114,7 @@ class InitialPoints:
 
     @cached_property
     def _sensitive(self) -> Tensor:
-        """Whether each coordinate affects each column, (dim, n): each is changed at a few points."""
+        """Mask of the columns that each coordinate affects, (dim, n): each is changed at a few points."""
         generator = torch.Generator().manual_seed(0)
         base = torch.rand((_BASES, self.dim), generator=generator, dtype=torch.float64)
         moved = base[None].repeat(self.dim, 1, 1)

@@ -8,6 +8,7 @@ Only the modules of `stlc.grammar.parse` use Lark.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from itertools import islice
 from types import MappingProxyType
 from typing import Any
@@ -28,6 +29,8 @@ MAX_ERRORS = 20
 MAX_DEPTH = 150
 MAX_TEXT = 1_000_000
 MAX_LEXEMES = 30_000
+_SHARED_TEXT = 32_768
+"""Characters of the longest text whose trees are shared: they keep the text in memory."""
 
 _RULES: Mapping[str, BuildRule] = MappingProxyType({**EXPRESSIONS, **DECLARATIONS})
 
@@ -64,12 +67,17 @@ def parse(source: Source) -> ast.Spec:
 def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Expr:
     """Return the syntax tree of the expression between the offsets `start` and `end` of a text.
 
-    Source locations in the tree refer to the whole text.
+    Source locations in the tree refer to the whole text. Trees of equal texts are shared, because a system
+    file is often read several times by one command.
 
     Raises:
         SpecError: the expression has an error in its syntax, a unit or a number.
     """
     end = len(source.text) if end is None else end
+    return (_shared if len(source.text) <= _SHARED_TEXT else _parsed)(source, start, end)
+
+
+def _parsed(source: Source, start: int, end: int) -> ast.Expr:
     _check_size(source, start, end)
     context = BuildContext(source)
     piece = Piece(source, start, end, "expr")
@@ -80,6 +88,9 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
     if context.findings:
         raise SpecError(*context.findings[:MAX_ERRORS])
     return expr
+
+
+_shared = lru_cache(maxsize=1024)(_parsed)
 
 
 class _PieceError(Exception):

@@ -133,6 +133,7 @@ class _Tied:
         env: name of a column -> predicate values (samples, 1). The method `coded` adds missing columns.
         raised: (predicate, sample) of the value to increase; None increases no value.
         stop: number of samples that the complete trace would have, if the recording is shorter; else None.
+        done: identity of a formula -> this formula, and the result of `coded`.
     """
 
     record: Record
@@ -140,6 +141,7 @@ class _Tied:
     env: dict[str, Floats]
     raised: Spot | None = None
     stop: int | None = None
+    done: dict[int, tuple[ir.Formula, ir.Formula]] = field(default_factory=dict)
 
     @property
     def columns(self) -> dict[str, Floats]:
@@ -156,12 +158,17 @@ class _Tied:
 
         The values of a predicate without a column are computed and added to `env`.
         """
+        known = self.done.get(id(formula))
+        if known is not None:
+            return known[1]
         for leaf in _leaves_of(formula):
             if leaf not in self.names:
                 self.names[leaf] = f"#{len(self.names)}"
                 values = self.record.values([leaf], range(self.record.samples), "upper", self.stop)[0]
                 self.env[self.names[leaf]] = np.asarray(values, np.float64)
-        return _over_columns(formula, self.names)
+        over = _over_columns(formula, self.names)
+        self.done[id(formula)] = formula, over  # which keeps the formula, and so its identity
+        return over
 
     def worth(self, formula: ir.Formula, sample: int, raised: Sequence[Spot]) -> float:
         """Return the robustness of `formula` at `sample`, with one predicate value slightly increased.

@@ -20,7 +20,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Reason: TypeAlias = Literal[
     "crash", "time limit", "memory", "error", "not finite", "wrong shape", "bad message"
 ]
-"""Why a simulation gave no trace."""
+"""Reason for which a simulation gave no trace."""
 SCRATCH = "stlc-plant-"
 """Prefix of the names of folders for temporary files, one for each process of a plant."""
 KINDS: PackageRegistry[Any] = PackageRegistry("kind of plant", "stlc.plants.kinds", "KIND", default="python")
@@ -134,7 +134,7 @@ class BlackBox(Protocol):
 
     @property
     def ended(self) -> bool:
-        """Whether the plant has ended the simulation by itself."""
+        """True if the plant has ended the simulation by itself."""
 
     def start(self, initial: Floats, param: Floats, inputs: Floats, seed: int) -> ArrayLike:
         """Begin a new simulation at time 0, and return the outputs.

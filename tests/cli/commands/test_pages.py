@@ -207,7 +207,7 @@ def no_number(policy, x0):
 
 @pytest.fixture
 def machine(monkeypatch, tmp_path):
-    """What a wrong example needs that is about the machine."""
+    """Machine that a wrong example needs."""
 
     def arrange(code: str) -> None:
         if code == "W701":
@@ -228,7 +228,7 @@ def machine(monkeypatch, tmp_path):
 
 @pytest.fixture
 def arranged(monkeypatch, machine):
-    """What a wrong example of a code needs."""
+    """Surroundings that a wrong example of a code needs."""
 
     def arrange(code: str) -> None:
         machine(code)

@@ -1,4 +1,4 @@
-"""What a shell completes: runs and requirements, from what stands on the line already."""
+"""Completion in a shell: runs and requirements, from the words on the line."""
 
 from __future__ import annotations
 

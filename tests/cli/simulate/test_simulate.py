@@ -246,7 +246,7 @@ def test_margins_are_measured_and_what_is_wrong_is_told(
 def test_fail_under_is_the_share_of_drives_that_satisfy_everything(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    many = ["--seeds", "0..1", "--agents", "20", "--steps", "120", "--no-pictures"]
+    many = ["--seeds", "0", "--agents", "10", "--steps", "60", "--no-pictures"]
     assert main(["simulate", *many, "--json", "--fail-under", "1"]) == 1
     drives = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]["drives"]
     share = drives["obeyed"] / drives["count"]

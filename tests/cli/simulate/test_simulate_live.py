@@ -58,7 +58,7 @@ def shown(
     steps: int = 20,
     size: tuple[int, int] = (110, 30),
 ) -> str:
-    """What the view of a deployment has written, all pictures after one another."""
+    """Output of the view of a deployment, all pictures after one another."""
     task = Task.of(
         parse(Source("a.stl", SPEC)), System(parse_system(Source("dot.yaml", SYSTEM), Path("dot.yaml")))
     )  # type: ignore[arg-type]

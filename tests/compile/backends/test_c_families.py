@@ -71,7 +71,7 @@ def balls(count: int, seed: int = 1) -> list[ir.Num]:
 
 
 def loops(rules: Sequence[ir.Formula]) -> list[int]:
-    """How many rows the outermost tables of a plan have."""
+    """Numbers of rows of the outermost tables of a plan."""
     steps = plan_of(rules, STEPS + 1).schedule.steps
     return [step.node.table.rows for step in steps if isinstance(step.node, Tabled)]
 

@@ -179,7 +179,7 @@ def test_extrema_of_many_operands_stand_side_by_side() -> None:
 
 
 def _depth(line: str) -> int:
-    """How deep macros that repeat their operands stand in each other."""
+    """Depth of macros that repeat their operands, nested in each other."""
     deepest, around = 0, []
     for name in re.findall(r"(\w*\()|(\))", line):
         if name[0]:

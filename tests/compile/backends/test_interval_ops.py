@@ -12,11 +12,23 @@ from helpers import formula_strategies as random_formulas
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from stlc.compile.backends.array import interval
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.interval import Intervals, add, div, mul
+from stlc.compile.backends.array.interval import (
+    EPSILON,
+    PRODUCT,
+    SUM,
+    TINY,
+    Intervals,
+    RoundingError,
+    add,
+    bound,
+    div,
+    mul,
+)
 from stlc.compile.backends.array.interval_ops import INTERVALS, IntervalOps, _anything
-from stlc.compile.backends.array.namespace import Ops
+from stlc.compile.backends.array.namespace import Ops, Sliding
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
@@ -114,6 +126,67 @@ def holds(found: Intervals, exact: Fraction) -> bool:
     return (low == -math.inf or Fraction(low) <= exact) and (high == math.inf or exact <= Fraction(high))
 
 
+def floats(bits: list[int]) -> np.ndarray:
+    """Finite numbers and their float64 neighbours, ascending."""
+    found = np.array(bits, dtype=np.int64).view(np.float64)
+    found = np.concatenate([-found, found])
+    found = found[np.isfinite(found) & (np.abs(found) < 1e290)]
+    return np.sort(np.concatenate([found, np.nextafter(found, np.inf), np.nextafter(found, -np.inf)]))
+
+
+@given(st.lists(st.one_of(st.integers(0, 2**62), st.integers(0, 2**54)), min_size=1, max_size=20))
+@pytest.mark.parametrize("error", [SUM, PRODUCT, RoundingError(10 * EPSILON, 8 * TINY)])
+def test_moved_ends_ascend_with_the_computed_ones_and_pass_their_neighbours(error, bits) -> None:
+    computed = floats(bits)
+    found = Intervals(computed, computed, error)
+    assert (np.diff(found.low) >= 0).all()
+    assert (np.diff(found.high) >= 0).all()
+    normal = np.abs(computed) >= 2.0**-1022
+    moved = normal | (error.absolute > 0.0)
+    assert (found.low <= np.where(moved, np.nextafter(computed, -np.inf), computed)).all()
+    assert (found.high >= np.where(moved, np.nextafter(computed, np.inf), computed)).all()
+
+
+def moved(x: Intervals) -> Intervals:
+    """The same intervals, moved outward now."""
+    return Intervals(x.low, x.high)
+
+
+def selections(parts: list[Intervals]) -> list[Intervals]:
+    """Extrema and other selections from arrays of shape (100, 4), and sums with some of them."""
+    window = Sliding(100, 94, 7)
+    padded = INTERVALS.cat([parts[1], INTERVALS.full((1, 4), math.inf, parts[1])])
+    return [
+        *(INTERVALS.join(parts, "min"), INTERVALS.join(parts, "max"), INTERVALS.cat(parts), padded),
+        *(INTERVALS.extrema(parts[0], "min", window), INTERVALS.until(parts[3], parts[4], "max", window)),
+        *(INTERVALS.minimum(*parts[:2]), INTERVALS.maximum(*parts[3:5]), -parts[2], parts[0][::-1]),
+        *(INTERVALS.rows(np.arange(100) < 50, parts[1], math.inf), add(padded, 1.0), mul(padded, padded)),
+    ]
+
+
+def test_selections_of_sums_are_those_of_moved_sums() -> None:
+    rng = np.random.default_rng(5)
+    sums = [add(boxes(rng, 400).reshape(100, 4), 0.1 * (k + 1)) for k in range(4)]
+    sums += [mul(sums[0], 0.3), boxes(rng, 400).reshape(100, 4), add(Intervals.point(np.ones((100, 4))), 0.1)]
+    with np.errstate(invalid="ignore"):
+        late, early = selections(sums), selections([moved(each) for each in sums])
+    for one, other in zip(late, early, strict=True):
+        assert (one.low == other.low).all()
+        assert (one.high == other.high).all()
+
+
+def test_the_minimum_of_ten_sums_is_moved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    apart = interval._moved_apart
+    monkeypatch.setattr(interval, "_moved_apart", lambda ends: calls.append(1) or apart(ends))
+    atoms = tuple(ir.Predicate(ir.Op("sub", (X, ir.Const(0.1 * k)))) for k in range(1, 11))
+    box = Intervals(np.zeros((20, 2)), np.ones((20, 2)))
+    formula = ir.Temporal("always", ir.Window(0, 5), ir.BoolOp("and", atoms))
+    (found,) = evaluate([formula], {"x": box}, ops=INTERVALS, count=15)
+    assert pair(found[:1, 0]) == pytest.approx((-1.0, 0.0))
+    assert len(calls) == 1
+
+
 # ------------------------------------------------------------------------------- special cases
 
 
@@ -203,6 +276,15 @@ def test_a_root_of_squares_is_known_at_0() -> None:
     found = pair(values(num, {"x": one(0.0, 0.0), "y": one(0.0, 0.0)}, INTERVALS))
     assert found[0] == 0.0
     assert found[1] == pytest.approx(0.0, abs=1e-150)
+
+
+def test_numbers_and_arrays_are_operands() -> None:
+    box, weights = Intervals(np.zeros(3), np.ones(3)), np.array([1.0, -2.0, 4.0])
+    assert mul(box, weights).low == pytest.approx([0.0, -2.0, 0.0])
+    assert add(box, weights).high == pytest.approx([2.0, -1.0, 5.0])
+    assert float(add(0.25, 0.5).high) == pytest.approx(0.75)
+    assert bound(add(box, -3.0)) == pytest.approx(4.0)
+    assert (bound(weights), bound(Intervals.point([1.0, math.nan]))) == (4.0, math.inf)
 
 
 def test_overflow_is_contained() -> None:

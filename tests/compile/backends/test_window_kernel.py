@@ -134,7 +134,7 @@ def test_no_traces_are_no_values() -> None:
 
 
 def test_one_gradient_for_all_rows() -> None:
-    """What `sum` hands back has no strides."""
+    """Gradient of `sum`, which has no strides."""
     x = torch.randn(200, 40, dtype=torch.float64, requires_grad=True)
     by_kernel([x], "max", Sliding(200, 200, 9)).sum().backward()
     (wanted,) = torch.autograd.grad(by_loops([x], "max", Sliding(200, 200, 9)).sum(), x)

@@ -44,7 +44,7 @@ def operators(*windows: tuple[int, int | None]) -> Iterator[Callable[[ir.Formula
 
 
 def pairs() -> Iterator[ir.Formula]:
-    """What changes beyond the trace, below what looks far beyond it."""
+    """Changes beyond the trace, below an operator that looks far beyond it."""
     inner = [make(X, Y) for make in operators((0, 3), (2, 4), (0, None), (2, None))]
     inner += [ir.Shift(steps, X) for steps in (-4, 4)]
     inner += [

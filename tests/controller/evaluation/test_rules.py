@@ -227,7 +227,7 @@ GO = "spec go\nsignal x [m]\n@safety\nrequire near: always x < 3\nrequire go: al
 
 
 def searched(monkeypatch: pytest.MonkeyPatch, known: float) -> list[tuple[int, list[float]]]:
-    """What is searched from now on, as (requirements, starts): a plan is known where x is more than this."""
+    """Record of further searches, as (requirements, starts): a plan is known where x exceeds `known`."""
     asked = []
 
     def solvable(task: Task, x0: torch.Tensor) -> torch.Tensor:

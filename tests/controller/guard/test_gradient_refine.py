@@ -30,7 +30,7 @@ def made(task: Task, *, by_torch: bool = False) -> GradientAscent:
 
 
 def worth(task: Task, x: Tensor, plans: Tensor) -> Tensor:
-    """What plans (agents, k, T, m) are worth, by the monitor: (agents, k)."""
+    """Robustness of plans (agents, k, T, m) by the monitor: (agents, k)."""
     judged = task.judge(x.repeat_interleave(plans.shape[1], 0), plans.flatten(0, 1))
     below = torch.where(judged.safe >= -1e-6, judged.rho, judged.safe - APART)
     return torch.where(judged.rho >= -1e-6, judged.rho + APART, below).view(plans.shape[:2])

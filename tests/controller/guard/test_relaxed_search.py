@@ -1,4 +1,4 @@
-"""Where no plan has as much to spare as is asked for, a safe one with the most is followed."""
+"""Relaxed search: where no plan keeps the margin, the safe one with the largest is followed."""
 
 from __future__ import annotations
 

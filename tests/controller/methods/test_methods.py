@@ -146,8 +146,8 @@ def test_an_unknown_method_is_a_finding_with_a_way_out(car_task: Task) -> None:
 def test_a_method_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert METHODS.names[:3] == ("guided", "coasting", "gradient")
     assert System.load(CAR, {"train.method": "coasting"}).decl.train.method == "coasting"
-    options = ["--method", "coasting", "--held-out", "40", "--drives", "4", "--no-pictures", "--json"]
-    code = main(["train", SPEC, "--system", CAR, *options])
+    options = ["--method", "coasting", "--held-out", "40", "--drives", "4", "--set", "test.steps=15"]
+    code = main(["train", SPEC, "--system", CAR, *options, "--no-pictures", "--json"])
     document = json.loads(capsys.readouterr().out)
     result = document["result"]
     assert code == 0, document["diagnostics"]
@@ -173,7 +173,8 @@ def test_a_method_of_one_action_a_step_is_one_file(capsys: pytest.CaptureFixture
         assert main(["train", *words, "--no-pictures", "--json"]) == 0
         return Run.open(json.loads(capsys.readouterr().out)["result"]["run"])
 
-    options = [SPEC, "--system", CAR, "--method", "climbing", "--held-out", "40", "--drives", "4"]
+    options = [SPEC, "--system", CAR, "--method", "climbing", "--held-out", "40"]
+    options += ["--drives", "4", "--set", "test.steps=15"]
     whole, part = trained(*options, "--steps", "60"), trained(*options, "--steps", "30")
     rows = [json.loads(line) for line in (whole.dir.path / "train.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [50]

@@ -152,9 +152,8 @@ def test_a_run_is_reported_and_exported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    made = trained(
-        capsys, SPEC, "--system", CAR, "--method", "ppo", *OPTIONS, "--steps", "2", "--drives", "0"
-    )
+    small = ["--steps", "2", "--drives", "0", "--held-out", "40"]
+    made = trained(capsys, SPEC, "--system", CAR, "--method", "ppo", *OPTIONS, *small)
     run = Run.open(made["run"])
     assert json.loads((run.dir.path / "config.resolved.yaml").read_text())["environments"] == 32
     if native.compiler() is not None:

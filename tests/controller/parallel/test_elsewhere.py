@@ -14,7 +14,7 @@ from stlc.diagnostics import MissingError
 
 @dataclass(frozen=True)
 class Order:
-    """What `copied` shall do."""
+    """Action that `copied` performs."""
 
     names: tuple[str, ...]
     out: Path

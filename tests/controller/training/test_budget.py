@@ -256,7 +256,7 @@ def test_a_budget_that_was_interrupted_is_repeated_too(
 
 @pytest.mark.usefixtures("ticking")
 def test_a_run_that_goes_on_past_its_end_is_repeated_too(car_task: Task, tmp_path: Path) -> None:
-    config = TrainConfig(held_out=50, steps=60, seed=3, batch=16, threads=1)
+    config = TrainConfig(held_out=50, drives=0, steps=60, seed=3, batch=16, threads=1)
     folder = _folder(car_task, tmp_path / "a", config)
     train(car_task, config, folder)
     resume(folder, steps=80)

@@ -65,7 +65,7 @@ def test_the_system_file_may_ask_for_a_training_set() -> None:
 def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
     car_task: Task, tmp_path: Path, method: str
 ) -> None:
-    config = TrainConfig(held_out=50, method=method, steps=STEPS, seed=3, batch=64)  # type: ignore[arg-type]
+    config = TrainConfig(held_out=50, drives=0, method=method, steps=STEPS, seed=3, batch=64)  # type: ignore[arg-type]
     whole = train(car_task, config, _folder(car_task, tmp_path / "a", config))
     count = []
     first = _folder(car_task, tmp_path / "b", config)
@@ -83,7 +83,7 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
 
 def test_a_run_that_ends_at_a_look_repeats_it(car_task: Task, tmp_path: Path) -> None:
     """The checkpoint of step 50 is older than the row of the look there, written or not."""
-    config = TrainConfig(held_out=50, method="gradient", steps=52, seed=3, batch=16)
+    config = TrainConfig(held_out=50, drives=0, method="gradient", steps=52, seed=3, batch=16)
     whole = train(car_task, config, _folder(car_task, tmp_path / "a", config)).run.dir.rows()
     count = []
     first = _folder(car_task, tmp_path / "b", config)
@@ -103,7 +103,7 @@ def test_a_run_that_ends_at_a_look_repeats_it(car_task: Task, tmp_path: Path) ->
 def test_a_resumed_run_has_the_threads_it_was_started_with(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = TrainConfig(held_out=50, steps=4, batch=16, threads=1)
+    config = TrainConfig(held_out=50, drives=0, steps=4, batch=16, threads=1)
     folder = _folder(car_task, tmp_path, config)
     train(car_task, config, folder, Watch(stop=lambda: True))
     told: list[int] = []
@@ -124,7 +124,7 @@ def test_a_slow_run_is_saved_by_the_clock(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stlc.controller.training.loop.SAVE_SECONDS", 0.0)
-    config = TrainConfig(held_out=50, steps=3, batch=16)
+    config = TrainConfig(held_out=50, drives=0, steps=3, batch=16)
     folder = _folder(car_task, tmp_path, config)
     seen: list[bool] = []
     pointer = folder.path / "ckpt" / "last.json"
@@ -135,7 +135,7 @@ def test_a_slow_run_is_saved_by_the_clock(
 
 def test_seeds_matter_and_repeat(car_task: Task, tmp_path: Path) -> None:
     def weights(seed: int, root: str) -> torch.Tensor:
-        config = TrainConfig(held_out=50, steps=20, seed=seed, batch=32)
+        config = TrainConfig(held_out=50, drives=0, steps=20, seed=seed, batch=32)
         return _saved(train(car_task, config, _folder(car_task, tmp_path / root, config)).run.dir)[
             "network.body.0.weight"
         ]
@@ -164,7 +164,7 @@ def test_a_short_run_learns_and_opens_again(car_task: Task, tmp_path: Path) -> N
 
 
 def test_resuming_a_finished_run_says_so(car_task: Task, tmp_path: Path) -> None:
-    config = TrainConfig(held_out=50, steps=5, batch=32)
+    config = TrainConfig(held_out=50, drives=0, steps=5, batch=32)
     folder = _folder(car_task, tmp_path, config)
     train(car_task, config, folder)
     with pytest.raises(RunError) as caught:
@@ -174,7 +174,7 @@ def test_resuming_a_finished_run_says_so(car_task: Task, tmp_path: Path) -> None
 
 
 def test_a_changed_spec_is_refused(car_task: Task, tmp_path: Path) -> None:
-    config = TrainConfig(held_out=50, steps=5, batch=32)
+    config = TrainConfig(held_out=50, drives=0, steps=5, batch=32)
     folder = _folder(car_task, tmp_path, config)
     train(car_task, config, folder)
     path = folder.path / "spec.stl"
@@ -186,7 +186,7 @@ def test_a_changed_spec_is_refused(car_task: Task, tmp_path: Path) -> None:
 
 
 def test_the_deployment_may_be_edited_but_not_what_is_learnt(car_task: Task, tmp_path: Path) -> None:
-    config = TrainConfig(held_out=50, steps=5, batch=32)
+    config = TrainConfig(held_out=50, drives=0, steps=5, batch=32)
     folder = _folder(car_task, tmp_path, config)
     train(car_task, config, folder)
     path = folder.path / "system.yaml"
@@ -216,7 +216,7 @@ def test_a_device_that_is_not_there(car_task: Task, tmp_path: Path) -> None:
 
 
 def test_held_out_states_are_always_the_same(car_task: Task, tmp_path: Path) -> None:
-    config = TrainConfig(held_out=50, steps=5, batch=32)
+    config = TrainConfig(held_out=50, drives=0, steps=5, batch=32)
     policy = train(car_task, config, _folder(car_task, tmp_path, config)).run.policy
     first, second = score(car_task, policy, n=200), score(car_task, policy, n=200)
     assert torch.equal(first.states, second.states)
@@ -235,7 +235,7 @@ def test_wilson_interval_of_known_cases() -> None:
 def test_a_run_that_was_interrupted_before_its_first_checkpoint_begins_again(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = TrainConfig(held_out=50, steps=4, seed=3, batch=16)
+    config = TrainConfig(held_out=50, drives=0, steps=4, seed=3, batch=16)
     whole = train(car_task, config, _folder(car_task, tmp_path / "a", config))
     folder = _folder(car_task, tmp_path / "b", config)
     with monkeypatch.context() as patch:

@@ -56,7 +56,7 @@ def verifier() -> Verifier:
 
 @cache
 def verified() -> Verification:
-    return verifier().run(1e6, boxes=60)
+    return verifier().run(1e6, boxes=30)
 
 
 def small_boxes(rng: np.random.Generator, count: int, coordinates: int) -> list[Box]:

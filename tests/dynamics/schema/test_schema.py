@@ -1,4 +1,4 @@
-"""What a well-formed system file means, and what `--set` does to it."""
+"""Meaning of well-formed system files, and of `--set` for them."""
 
 from __future__ import annotations
 

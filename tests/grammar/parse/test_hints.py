@@ -1,4 +1,4 @@
-"""What is said about malformed texts: one golden text for each slip."""
+"""Messages about malformed texts: one golden text for each slip."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def fresh():
-    """What a new process would get."""
+    """Parser that a new process would get."""
     return load_parser.__wrapped__()
 
 

@@ -39,7 +39,7 @@ from stlc.monitor.values import Record, bounds
 from stlc.monitor.verdict import Monitor
 
 EXAMPLES = int(os.environ.get("STLC_CASES", "30"))
-"""How many random formulas and traces are tried."""
+"""Number of random formulas and traces."""
 
 
 def at_ends(

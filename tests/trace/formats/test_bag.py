@@ -28,7 +28,7 @@ def message_of(path: Path) -> str:
 
 
 def check_state(trace: Trace) -> None:
-    """What every log of `robot_logs` holds."""
+    """Contents of every log of `robot_logs`."""
     assert (trace.dt, trace.samples, trace.t0) == (0.1, 21, 0.0)
     np.testing.assert_array_equal(trace.data["robot.state.position.x"][0], X)
     assert trace.data["robot.state.q[2]"][0].tolist() == [3.0] * 21

@@ -20,20 +20,26 @@ import numpy as np
 
 from stlc.compile.backends.array.interval import (
     EPSILON,
+    PRODUCT,
     TINY,
     Belief,
     Bools,
     End,
+    Floats,
     Intervals,
     Operand,
+    RoundingError,
     add,
+    bound,
     corners,
     div,
     ends,
+    extremum,
     hull,
     known,
     magnitudes,
     mul,
+    selected_from,
     unbounded_where,
     widened,
     within,
@@ -49,13 +55,17 @@ from stlc.diagnostics import Diagnostic, UsageError
 _ULPS = 8.0
 """Rounding error of functions, in units of the last place, both ways."""
 
-_ERROR = (_ULPS + 2.0) * EPSILON
+_RELATIVE = (_ULPS + 2.0) * EPSILON
 """The same relative to the value: a unit in the last place is at most `EPSILON` times the value."""
+
+_ERROR = RoundingError(_RELATIVE, _ULPS * TINY)
 
 _SMALLEST = 1e-150
 """Error of a norm whose squares are below the range of float64."""
 
-_TURN = 2.0 * np.pi
+_FEW_TURNS = 1024.0
+_FEW_TURNS_ERROR = 4.0 * EPSILON * (1.0 + _FEW_TURNS)
+"""Error of positions in half periods, up to `_FEW_TURNS`."""
 
 _WINDOWS = Windows(Exact(), NUMPY)
 
@@ -80,7 +90,7 @@ class IntervalOps(FloatConstants):
     def square(self, x: Operand) -> Intervals:
         """`x * x`."""
         size = magnitudes(x)
-        found = widened(*_mapped(np.square, size), absolute=TINY)
+        found = widened(*_mapped(np.square, size), PRODUCT)
         return Intervals(np.maximum(found.low, 0.0), found.high)
 
     def sqrt(self, x: Operand) -> Intervals:
@@ -142,7 +152,7 @@ class IntervalOps(FloatConstants):
             high = low
         else:
             high = np.sqrt(reduce(np.add, (np.square(size.high) for size in sizes)))
-        found = widened(low, high, error, _SMALLEST)
+        found = widened(low, high, RoundingError(error, _SMALLEST))
         return Intervals(np.maximum(found.low, 0.0), found.high)
 
     # ----------------------------------------------------------------------------- functions
@@ -154,7 +164,7 @@ class IntervalOps(FloatConstants):
 
     def sin(self, x: Operand) -> Intervals:
         """Sine: 1 or -1 where an extremum may lie in the interval, else the values at its ends."""
-        return _wave(np.sin, x, 0.25)
+        return _wave(np.sin, x, 0.5)
 
     def cos(self, x: Operand) -> Intervals:
         """Cosine."""
@@ -163,7 +173,8 @@ class IntervalOps(FloatConstants):
     def tan(self, x: Operand) -> Intervals:
         """Tangent; unknown where a pole may lie in the interval."""
         low, high = ends(x)
-        return unbounded_where(_reaches(low, high, np.pi, 0.5), _monotone(np.tan, x))
+        first, last = _crossed(low, high, np.pi, 0.5)
+        return unbounded_where(~(first > last), _monotone(np.tan, x))
 
     def acos(self, x: Operand) -> Intervals:
         """Arc cosine, which falls; unknown outside of [-1, 1]."""
@@ -172,7 +183,7 @@ class IntervalOps(FloatConstants):
 
     def sigmoid(self, x: Operand) -> Intervals:
         """`1 / (1 + exp(-x))`."""
-        return within(widened(*_mapped(NUMPY.sigmoid, x), _ERROR, _ERROR), 0.0, 1.0)
+        return within(widened(*_mapped(NUMPY.sigmoid, x), RoundingError(_RELATIVE, _RELATIVE)), 0.0, 1.0)
 
     def sign(self, x: Intervals) -> Intervals:
         """-1, 0 or 1."""
@@ -192,11 +203,11 @@ class IntervalOps(FloatConstants):
 
     def minimum(self, a: Operand, b: Operand) -> Intervals:
         """Elementwise minimum."""
-        return _joined(np.minimum, a, b)
+        return _smaller_or_greater(np.minimum, a, b)
 
     def maximum(self, a: Operand, b: Operand) -> Intervals:
         """Elementwise maximum."""
-        return _joined(np.maximum, a, b)
+        return _smaller_or_greater(np.maximum, a, b)
 
     # --------------------------------------------------------------------------------- truth
 
@@ -254,10 +265,10 @@ class IntervalOps(FloatConstants):
     # ---------------------------------------------------------------------------- along time
 
     def amin(self, x: Intervals) -> Intervals:
-        return x.each(NUMPY.amin)
+        return x.selected(NUMPY.amin)
 
     def amax(self, x: Intervals) -> Intervals:
-        return x.each(NUMPY.amax)
+        return x.selected(NUMPY.amax)
 
     def sum(self, x: Intervals) -> Intervals:
         """Sum over axis 0, which is kept with length 1 (error: Higham 2002, section 4.2)."""
@@ -267,10 +278,10 @@ class IntervalOps(FloatConstants):
         return known(low - error, high + error)
 
     def cummin(self, x: Intervals) -> Intervals:
-        return x.each(NUMPY.cummin)
+        return x.selected(NUMPY.cummin)
 
     def cummax(self, x: Intervals) -> Intervals:
-        return x.each(NUMPY.cummax)
+        return x.selected(NUMPY.cummax)
 
     def softmax(self, x: Intervals, k: float) -> Intervals:  # noqa: ARG002
         """Not available.
@@ -285,20 +296,16 @@ class IntervalOps(FloatConstants):
         return self.softmax(a, k)
 
     def join(self, items: Sequence[Intervals], pick: Pick) -> Intervals:
-        low = NUMPY.join([item.low for item in items], pick)
-        if all(item.is_point for item in items):
-            return Intervals(low, low)
-        return Intervals(low, NUMPY.join([item.high for item in items], pick))
+        return extremum(partial(NUMPY.join, pick=pick), items)
 
     def extrema(self, x: Intervals, pick: Pick, window: Sliding) -> Intervals:
         """Exact extrema over sliding windows."""
-        return x.each(lambda end: _WINDOWS.extrema(end, pick, count=window.count, width=window.width))
+        return x.selected(lambda end: _WINDOWS.extrema(end, pick, count=window.count, width=window.width))
 
     def until(self, left: Intervals, right: Intervals, pick: Pick, window: Sliding) -> Intervals:
         """Exact `until` or `release` over sliding windows."""
         until = partial(_WINDOWS.until, pick=pick, count=window.count, width=window.width)
-        low = until(left.low, right.low)
-        return Intervals(low, low if left.is_point and right.is_point else until(left.high, right.high))
+        return selected_from(lambda both: until(*both), (left, right))
 
     # ------------------------------------------------------------------- constants and shapes
 
@@ -314,10 +321,10 @@ class IntervalOps(FloatConstants):
         return Intervals(np.empty(shape), np.empty(shape))
 
     def cat(self, parts: Sequence[Intervals]) -> Intervals:
-        return _gathered(np.concatenate, parts)
+        return selected_from(np.concatenate, parts)
 
     def stack(self, parts: Sequence[Intervals]) -> Intervals:
-        return _gathered(np.stack, parts)
+        return selected_from(np.stack, parts)
 
     def flip(self, x: Intervals) -> Intervals:
         return x[::-1]
@@ -326,9 +333,7 @@ class IntervalOps(FloatConstants):
         return x.each(lambda end: NUMPY.rows(keep, end, value))
 
     def columns(self, x: Intervals) -> Sequence[Intervals]:
-        lows = NUMPY.columns(x.low)
-        highs = lows if x.is_point else NUMPY.columns(x.high)
-        return [Intervals(low, high) for low, high in zip(lows, highs, strict=True)]
+        return [x.selected(partial(_column, index=index)) for index in range(x.shape[-1])]
 
     def quiet(self) -> AbstractContextManager[object]:
         return NUMPY.quiet()
@@ -349,7 +354,7 @@ def _mapped(function: Callable[[Any], Any], x: Operand) -> tuple[End, End]:
 
 
 def _widened(low: End, high: End) -> Intervals:
-    return widened(low, high, _ERROR, _ULPS * TINY)
+    return widened(low, high, _ERROR)
 
 
 def _monotone(function: Callable[[Any], Any], x: Operand) -> Intervals:
@@ -357,17 +362,12 @@ def _monotone(function: Callable[[Any], Any], x: Operand) -> Intervals:
     return _widened(*_mapped(function, x))
 
 
-def _joined(function: Callable[[Any, Any], Any], a: Operand, b: Operand) -> Intervals:
+def _smaller_or_greater(function: Callable[[Any, Any], Any], a: Operand, b: Operand) -> Intervals:
+    if isinstance(a, Intervals) and isinstance(b, Intervals):
+        return selected_from(lambda both: function(*both), (a, b))
     (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
     low = function(a_low, b_low)
     return Intervals(low, low if a_low is a_high and b_low is b_high else function(a_high, b_high))
-
-
-def _gathered(function: Callable[[Any], Any], parts: Sequence[Intervals]) -> Intervals:
-    low = function([part.low for part in parts])
-    if all(part.is_point for part in parts):
-        return Intervals(low, low)
-    return Intervals(low, function([part.high for part in parts]))
 
 
 def _chosen(mask: Bools, yes: End, no: End) -> Any:
@@ -378,27 +378,37 @@ def _infinite(mask: Bools) -> Any:
     return np.where(mask, np.inf, -np.inf)
 
 
-def _reaches(low: End, high: End, period: float, offset: float) -> Bools:
-    """Whether an interval may contain `period * (k + offset)` for a whole number k.
+def _crossed(low: End, high: End, spacing: float, offset: float) -> tuple[Floats, Floats]:
+    """Least and greatest whole number k for which `spacing * (k + offset)` may lie in an interval.
 
-    The positions in periods are computed with an error below 4 `EPSILON` of their magnitude, and more than
-    2^52 periods from 0 the answer is always yes.
+    There is none if the least is above the greatest. The positions in units of `spacing` are computed with an
+    error below 4 `EPSILON` of their magnitude; more than 2^52 units from 0 there is always such a number.
     """
-    first, last = low / period - offset, high / period - offset
-    error = 4.0 * EPSILON * (1.0 + np.maximum(np.abs(first), np.abs(last)))
-    return np.asarray(~(np.floor(last + error) < np.ceil(first - error)))
+    first, last = np.asarray(low / spacing), np.asarray(high / spacing)
+    first -= offset
+    last -= offset
+    error: Any = _FEW_TURNS_ERROR
+    if first.size and not (first.min() > -_FEW_TURNS and last.max() < _FEW_TURNS):
+        error = 4.0 * EPSILON * (1.0 + np.maximum(np.abs(first), np.abs(last)))
+    first -= error
+    last += error
+    return np.ceil(first, out=first), np.floor(last, out=last)
 
 
 def _wave(function: Callable[[Any], Any], x: Operand, offset: float) -> Intervals:
-    """Sine or cosine: its maxima are at `offset` periods, its minima half a period later."""
+    """Sine or cosine: its extrema are half a period apart, a maximum at `offset` half periods."""
     low, high = ends(x)
     one, other = _mapped(function, x)
     least, most = (one, one) if one is other else (np.minimum(one, other), np.maximum(one, other))
-    found = _widened(least, most)
-    top = 1.0 + EPSILON
-    highest = _reaches(low, high, _TURN, offset)
-    lowest = _reaches(low, high, _TURN, offset + 0.5)
-    return Intervals(np.where(lowest, -top, found.low), np.where(highest, top, found.high))
+    first, last = _crossed(low, high, np.pi, offset)
+    inside = ~(first > last)
+    if inside.any():
+        several = ~(first >= last)
+        half = 0.5 * first
+        even = np.floor(half) == half
+        least = np.where(inside & (several | ~even), -1.0, least)
+        most = np.where(inside & (several | even), 1.0, most)
+    return widened(least, most, _ERROR, 1.1 if bound(x) < np.inf else None)
 
 
 def _whole_power(a: Operand, exponent: float | Any) -> Intervals:
@@ -418,11 +428,16 @@ def _whole_power(a: Operand, exponent: float | Any) -> Intervals:
     return unbounded_where(np.asarray(pole), found)
 
 
+def _column(values: Floats, index: int) -> Floats:
+    """One column of an array `(batch, time, dim)`, as `(time, batch)`."""
+    return np.ascontiguousarray(values[..., index].T)
+
+
 def _anything(bounds: object, *args: Operand) -> Intervals:
     """Result of a function that has no method here: the constant range of its table entry, or all numbers."""
     shape = np.broadcast_shapes(*(np.shape(ends(arg)[0]) for arg in args))
     low, high = bounds if isinstance(bounds, tuple) else (-np.inf, np.inf)
-    return Intervals(np.full(shape, low - _ERROR * abs(low)), np.full(shape, high + _ERROR * abs(high)))
+    return Intervals(np.full(shape, low - _RELATIVE * abs(low)), np.full(shape, high + _RELATIVE * abs(high)))
 
 
 for _name, _function in {

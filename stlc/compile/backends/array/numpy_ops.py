@@ -100,7 +100,13 @@ class NumpyOps(FloatConstants):
 
     def join(self, items: Sequence[Array], pick: Pick) -> Array:
         choose = np.minimum if pick == "min" else np.maximum
-        return choose(*items) if len(items) == 2 else reduce(choose, items)
+        if len(items) == 1:
+            return items[0]
+        out = choose(items[0], items[1])
+        for item in items[2:]:
+            here = out.ndim and item.shape == out.shape and item.dtype == out.dtype
+            out = choose(out, item, out=out) if here else choose(out, item)
+        return out
 
     def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
         """Exact extrema over sliding windows by the C kernel.
