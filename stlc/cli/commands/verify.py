@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,7 +27,7 @@ from stlc.escape import visible
 if TYPE_CHECKING:
     from stlc.controller.verification.around import Around
     from stlc.controller.verification.loop import NetworkLoop
-    from stlc.controller.verification.subject import VerificationSubject
+    from stlc.controller.verification.plans import PolicySource
     from stlc.controller.verification.verify import ModeResult, Verification
 
 _MOST = 3
@@ -68,6 +70,7 @@ def verify(
     clock: Annotated[
         str, typer.Option(metavar="wall|processor", help="Clock of the search for proofs.")
     ] = "wall",
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that prove.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sampled states.")] = 0,
     fail_under: FailUnderOption = None,
     runs: RunsOption = Path("runs"),
@@ -76,7 +79,8 @@ def verify(
 
     Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion and
     robustness show that one proposal of the network satisfies the specification from every state in it. It is
-    refuted if the policy violates the specification from a sampled state. More time proves more. With
+    refuted if the policy violates the specification from a sampled state. More time proves more, and so do
+    more processes; with --clock processor, the budget is that of each process. With
     --states, boxes are also searched around random initial states; the number of states with a proof bounds
     the share of all states that have one, with 95 % confidence. Exit code: 0 all proved, 1 a counterexample
     was found, 4 open; with --fail-under, 0 if at least that share is proved.
@@ -87,42 +91,65 @@ def verify(
     import torch
 
     from stlc.controller.training.budget import clock_of
-    from stlc.controller.training.run import Run
-    from stlc.controller.verification.plans import ProposedPlans
+    from stlc.controller.verification.examine import SharedExaminer
+    from stlc.controller.verification.plans import PolicySource
     from stlc.controller.verification.verify import Verifier
+    from stlc.rundir import RunDir
 
     torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
-    seconds = parse_seconds(budget)
-    subject: VerificationSubject
+    seconds, measured = parse_seconds(budget), parse_clock(clock)
+    source: PolicySource | _LoopSource
     if controller is None:
         if period is not None or system is not None or continuous:
             raise usage("--period, --system and --continuous are for a network: --controller FILE")
-        opened = Run.open(run, root=runs)
-        name, subject = opened.dir.shown, ProposedPlans(opened.task, opened.policy)
+        folder = RunDir.open(run, runs)
+        name, source = folder.shown, PolicySource(folder.path)
     else:
-        name, subject = run, _closed_loop(run, system, controller, period, continuous)
-    verifier = Verifier(subject, seed=seed, clock=clock_of(parse_clock(clock)))
-    with PULSE.doing("proving"):
-        found = verifier.run(seconds, boxes=boxes)
+        name, source = run, _LoopSource(run, system, controller, period, continuous)
+    subject = source.load()
+    with nullcontext() if jobs == 1 else SharedExaminer(source, jobs) as shared:
+        tick = clock_of(measured)
+        if shared is not None and measured == "processor":
+            tick = shared.processor_time
+        verifier = Verifier(subject, seed=seed, clock=tick, examiner=shared)
+        with PULSE.doing("proving"):
+            found = verifier.run(seconds, boxes=boxes)
+    with PULSE.doing("proving boxes around random states"):
         near = {each.mode.name: each for each in verifier.around(states, seed=seed)} if states else {}
     record = _record(name, found, near)
     return Answer(record, lambda: emit("\n".join(_lines(record))), _exit_code(found, fail_under))
 
 
-def _closed_loop(
-    spec: str, system: str | None, controller: Path, period: str | None, continuous: bool
-) -> NetworkLoop:
-    """Load the closed loop of a system and a network."""
-    from stlc.controller.problem.load import load_task
-    from stlc.controller.verification.loop import NetworkLoop
-    from stlc.controller.verification.onnx_layers import read_onnx
+@dataclass(frozen=True, slots=True)
+class _LoopSource:
+    """Closed loop of a system and a network, for this process and others.
 
-    task = load_task(spec, system)
-    dt = float(task.system.decl.dt)
-    steps = 1.0 if period is None else parse_seconds(period) / dt
-    if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
-        raise usage(f"the control period `{period}` is not a multiple of the time step {dt:g} s")
-    return NetworkLoop(task, read_onnx(controller), round(steps), continuous=continuous)
+    Attributes:
+        spec: path or name of the specification.
+        system: path or name of the system; None: that of the specification.
+        controller: file of the network.
+        period: control period with its unit; None: the time step.
+        continuous: whether solutions of the differential equations are bounded, not the model's.
+    """
+
+    spec: str
+    system: str | None
+    controller: Path
+    period: str | None
+    continuous: bool
+
+    def load(self) -> NetworkLoop:
+        """Load the closed loop."""
+        from stlc.controller.problem.load import load_task
+        from stlc.controller.verification.loop import NetworkLoop
+        from stlc.controller.verification.onnx_layers import read_onnx
+
+        task = load_task(self.spec, self.system)
+        dt = float(task.system.decl.dt)
+        steps = 1.0 if self.period is None else parse_seconds(self.period) / dt
+        if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
+            raise usage(f"the control period `{self.period}` is not a multiple of the time step {dt:g} s")
+        return NetworkLoop(task, read_onnx(self.controller), round(steps), continuous=self.continuous)
 
 
 def _exit_code(found: Verification, fail_under: float | None) -> int:
