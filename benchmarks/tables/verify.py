@@ -19,6 +19,7 @@ from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.parallel.workers import LocalProcesses
 from stlc.controller.training.budget import clock_of
 from stlc.controller.training.run import Run
 from stlc.controller.verification.boxes import Box
@@ -167,7 +168,8 @@ def _verified(folder: RunDir, sizes: _Sizes, store: ResultStore) -> Result:
 
     def compute() -> Result:
         say(f"verifying {folder.shown}")
-        with one_thread(), SharedExaminer(PolicySource(folder.path), sizes.jobs) as examiner:
+        workers = LocalProcesses(sizes.jobs, fresh=True)
+        with one_thread(), SharedExaminer(PolicySource(folder.path), workers) as examiner:
             subject = ProposedPlans(run.task, run.policy)
             verifier = Verifier(subject, clock=examiner.processor_time, examiner=examiner)
             found = verifier.run(sizes.seconds)

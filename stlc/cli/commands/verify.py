@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +19,9 @@ from stlc.cli.framework.options import (
     parse_clock,
     parse_seconds,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, table
+from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics, table
 from stlc.cli.framework.program import command
-from stlc.diagnostics import usage
+from stlc.diagnostics import Diagnostic, usage
 from stlc.escape import visible
 
 if TYPE_CHECKING:
@@ -90,6 +90,7 @@ def verify(
     """
     import torch
 
+    from stlc.controller.parallel.workers import LocalProcesses
     from stlc.controller.training.budget import clock_of
     from stlc.controller.verification.examine import SharedExaminer
     from stlc.controller.verification.plans import PolicySource
@@ -107,7 +108,7 @@ def verify(
     else:
         name, source = run, _LoopSource(run, system, controller, period, continuous)
     subject = source.load()
-    with nullcontext() if jobs == 1 else SharedExaminer(source, jobs) as shared:
+    with nullcontext() if jobs == 1 else SharedExaminer(source, LocalProcesses(jobs, fresh=True)) as shared:
         tick = clock_of(measured)
         if shared is not None and measured == "processor":
             tick = shared.processor_time
@@ -117,7 +118,20 @@ def verify(
     with PULSE.doing("proving boxes around random states"):
         near = {each.mode.name: each for each in verifier.around(states, seed=seed)} if states else {}
     record = _record(name, found, near)
-    return Answer(record, lambda: emit("\n".join(_lines(record))), _exit_code(found, fail_under))
+    lost = () if shared is None or not shared.lost else (_lost(shared.lost),)
+
+    def show() -> None:
+        show_diagnostics(lost)
+        emit("\n".join(_lines(record)))
+
+    return Answer(record, show, _exit_code(found, fail_under), lost)
+
+
+def _lost(reasons: Sequence[str]) -> Diagnostic:
+    """The finding R406 about batches of boxes that were lost with their processes."""
+    count = f"{len(reasons):,} batch{'es' if len(reasons) > 1 else ''} of boxes"
+    message = f"{count} stayed open: lost with the processes that examined them"
+    return Diagnostic("R406", message, note=tuple(dict.fromkeys(reasons)))
 
 
 @dataclass(frozen=True, slots=True)

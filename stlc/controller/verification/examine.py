@@ -9,14 +9,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 import torch
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.parallel import workers_of
-from stlc.controller.parallel.workers import LostCall, results
+from stlc.controller.parallel.workers import CallWorkers, LostCall, results
 from stlc.controller.verification.around import narrowed
 from stlc.controller.verification.judged import PROVED
 
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 POINTS = 8
 """States that are sampled in each box: its centre and others at random."""
+
+_TOGETHER = 4
+"""Batches of one call, so that workers seldom wait for the process that shares them out."""
 
 _EDGE = 1e-6
 """Volume from which a proved box on the border of `where` is divided, to find its part inside."""
@@ -228,16 +231,17 @@ class SubjectSource(Protocol):
 
 
 class SharedExaminer:
-    """Examination of batches by processes of this machine, as a context; each loads the subject once.
+    """Examination of batches by worker processes, as a context; each loads the subject once.
 
     Attributes:
-        lost: number of batches that were lost with their processes, three times each.
+        lost: causes of the losses of batches that were lost with their processes, three times each.
     """
 
-    def __init__(self, source: SubjectSource, count: int) -> None:
-        self._source, self._calls = source, workers_of(count, fresh=True)
+    def __init__(self, source: SubjectSource, calls: CallWorkers) -> None:
+        """Use workers that make calls; local ones must be `fresh`, since this process has used PyTorch."""
+        self._source, self._calls = source, calls
         self._seconds = 0.0
-        self.lost = 0
+        self.lost: list[str] = []
 
     def __enter__(self) -> Self:
         """Return the object; processes start when they are needed."""
@@ -254,27 +258,46 @@ class SharedExaminer:
 
     def __call__(self, batches: Iterable[BoxBatch]) -> Iterator[BatchResult | LostCall]:
         """Yield the results of batches in their order."""
-        ended: dict[int, BatchResult | LostCall] = {}
+        ended: dict[int, list[BatchResult] | LostCall] = {}
+        sent: list[int] = []
         following = 0
-        for each in results(self._calls, _call, ((self._source, batch) for batch in batches)):
+        for each in results(self._calls, _call, self._orders(batches, sent)):
             ended[each.index] = each.value
-            if isinstance(each.value, LostCall):
-                self.lost += 1
-            else:
-                self._seconds += each.value.seconds
             while following in ended:
-                yield ended.pop(following)
+                yield from self._results(ended.pop(following), sent[following])
                 following += 1
+
+    def _orders(self, batches: Iterable[BoxBatch], sent: list[int]) -> Iterator[_Order]:
+        """Calls of `_TOGETHER` batches each; their sizes are added to `sent`."""
+        waiting = iter(batches)
+        while chosen := tuple(islice(waiting, _TOGETHER)):
+            sent.append(len(chosen))
+            yield _Order(self._source, chosen)
+
+    def _results(self, found: list[BatchResult] | LostCall, size: int) -> list[BatchResult | LostCall]:
+        """Results of the batches of a call."""
+        if isinstance(found, LostCall):
+            self.lost += [found.reason] * size
+            return [found] * size
+        self._seconds += sum(each.seconds for each in found)
+        return [*found]
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """Batches for a worker process, and the source of their subject."""
+
+    source: SubjectSource
+    batches: tuple[BoxBatch, ...]
 
 
 _loaded: list[tuple[SubjectSource, Examiner]] = []
 """The examiner of a worker process, and the source of its subject."""
 
 
-def _call(order: tuple[SubjectSource, BoxBatch]) -> BatchResult:
-    """Examine a batch in a worker process, which has one core."""
-    source, batch = order
-    if not _loaded or _loaded[0][0] != source:
+def _call(order: _Order) -> list[BatchResult]:
+    """Examine batches in a worker process, which has one core."""
+    if not _loaded or _loaded[0][0] != order.source:
         torch.set_num_threads(1)
-        _loaded[:] = [(source, Examiner(source.load()))]
-    return _loaded[0][1].examined(batch)
+        _loaded[:] = [(order.source, Examiner(order.source.load()))]
+    return list(_loaded[0][1](order.batches))

@@ -38,7 +38,7 @@ DIVES = 16
 LITTLE = 0.01
 """Proved share of a mode up to which boxes around single states are searched."""
 
-ROUND = 16
+ROUND = 64
 """Batches that are chosen at once, and may be examined at the same time."""
 
 HOPELESS = 64.0
