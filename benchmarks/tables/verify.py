@@ -133,14 +133,15 @@ def verify(
         return [Row(**mode) for each in every for mode in each["modes"]]
 
     def section() -> list[str]:
-        every = [*store.all().values()]
-        spent = ", ".join(
-            f"{name} {each['seconds']:.0f} s in {_counted(each['key']['jobs'])}, for the states "
+        stored = store.all()
+        spent = [
+            f"- {name}: {each['seconds']:.0f} s in {_counted(each['key']['jobs'])}, for the states "
             f"{each['seconds_of_states']:.0f} s"
-            for name, each in store.all().items()
-        )
+            for name, each in stored.items()
+        ]
+        every = [*stored.values()]
         table = listed("verify", rows(every), COLUMNS).markdown()
-        return [TEXT, *table, "", f"- {spent}", *provenance(every, "runs")]
+        return [TEXT, *table, "", *spent, *provenance(every, "runs")]
 
     publish("verify", output, section, {"rows": listed("verify", rows(results), COLUMNS)})
 
