@@ -184,18 +184,21 @@ class Verifier:
         most = math.inf if boxes is None else boxes
         found = [ModeResult(mode) for mode in self.modes]
         fronts = [_Front(mode) for mode in self.modes]
-        while self._clock() - begun < seconds and (chosen := self._chosen(fronts, most)):
+
+        def going(_: object = None) -> bool:
+            refuted = until_refuted and any(each.witness for each in found)
+            return not refuted and self._clock() - begun < seconds
+
+        while going() and (chosen := self._chosen(fronts, most)):
             examined = 0
-            batches = takewhile(lambda _: self._clock() - begun < seconds, chosen)
+            batches = takewhile(going, chosen)
             for batch, result in zip(chosen, self._examiner(batches), strict=False):
                 examined += 1
                 if isinstance(result, BatchResult):
                     self._take(found[batch.mode], fronts[batch.mode], batch, result)
-            for batch in chosen[examined:]:  # the time is over
+            for batch in chosen[examined:]:  # the search is over
                 for box in batch.boxes:
                     fronts[batch.mode].add(box)
-            if until_refuted and any(each.witness for each in found):
-                break
         for each, front in zip(found, fronts, strict=True):
             self._close(each, front)
         return Verification(tuple(found), self._clock() - begun)
