@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,22 +19,29 @@ from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.parallel.workers import LocalProcesses
 from stlc.controller.training.budget import clock_of
 from stlc.controller.training.run import Run
-from stlc.controller.verification.plans import ProposedPlans
+from stlc.controller.verification.boxes import Box
+from stlc.controller.verification.examine import SharedExaminer
+from stlc.controller.verification.plans import PolicySource, ProposedPlans
 from stlc.controller.verification.subject import VerificationSubject
 from stlc.controller.verification.verify import Verification, Verifier
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
+BOXES = 1000
+"""Proved boxes of each mode at most in which random points are drawn."""
+
 _OUTPUT = Output(Path("docs/assurance.md"))
 TEXT = """\
-Written by `python -m benchmarks verify` from `benchmarks/results/verify.json`. `proved`, `refuted` and
-`open`: shares of the initial states by branch and bound. `states`: random initial states that are in a box
-with a proof, of all that were drawn; the others are violated or open. `with a proof`: share of all initial
-states of the mode with such a box, at least, with 95 % confidence. `violations`: random points of proved
-boxes from which the policy violates the specification, of all that were drawn. Times are processor times of
-one thread.
+Written by `python -m benchmarks verify` from `benchmarks/results/verify.json`. `network`: widths of the
+hidden layers of the policy. `proved`, `refuted` and `open`: shares of the initial states by branch and bound.
+`states`: random initial states that are in a box with a proof, of all that were drawn; the others are
+violated or open. `with a proof`: share of all initial states of the mode with such a box, at least, with
+95 % confidence. `violations`: random points of proved boxes from which the policy violates the specification,
+of all that were drawn, in 1,000 boxes of each mode at most. Times are processor times of each process, which
+has one thread.
 """
 
 
@@ -54,6 +61,7 @@ class Row:
         violated: number of these from which the policy violates the specification.
         violations: number of violations among random points of proved boxes.
         points: number of these points.
+        network: sizes of the hidden layers of the policy's network.
     """
 
     spec: str
@@ -67,6 +75,7 @@ class Row:
     violated: int
     violations: int
     points: int
+    network: str
 
     @property
     def least(self) -> float:
@@ -76,6 +85,7 @@ class Row:
 
 COLUMNS: Columns[Row] = {
     "policy": "{spec}",
+    "network": "{network}",
     "initial states": "{mode}",
     "probability": "{probability:.1%}",
     "proved": lambda row: _share(row.proved),
@@ -89,7 +99,7 @@ COLUMNS: Columns[Row] = {
 
 @command(
     "python -m benchmarks verify runs/traffic/latest",
-    "python -m benchmarks verify runs/*/latest --budget 10min --states 1000 --page docs/assurance.md",
+    "python -m benchmarks verify runs/*/latest --budget 10min -j 2 --states 1000 --page docs/assurance.md",
 )
 def verify(
     runs: RunsArgument = None,
@@ -100,8 +110,12 @@ def verify(
         int, typer.Option("--states", metavar="N", min=1, help="Random initial states of each run.")
     ] = 1000,
     points: Annotated[
-        int, typer.Option("--points", metavar="N", min=1, help="Random points in each proved box.")
+        int,
+        typer.Option("--points", metavar="N", min=1, help="Random points in each drawn box."),
     ] = 1000,
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", min=1, help="Processes of branch and bound, with the budget each.")
+    ] = 1,
     out: ResultsOption = Path("benchmarks/results"),
     output: Output = _OUTPUT,
 ) -> None:
@@ -111,71 +125,92 @@ def verify(
     """
     store = ResultStore("verify", out)
     folders = [RunDir.open(name) for name in runs or ["latest"]]
-    results = [_verified(folder, parse_seconds(budget), states, points, store) for folder in folders]
+    results = [
+        _verified(folder, _Sizes(parse_seconds(budget), states, points, jobs), store) for folder in folders
+    ]
 
     def rows(every: Sequence[Result]) -> list[Row]:
         return [Row(**mode) for each in every for mode in each["modes"]]
 
     def section() -> list[str]:
-        every = [*store.all().values()]
-        spent = ", ".join(
-            f"{each['key']['spec']} {each['seconds']:.0f} s, for the states {each['seconds_of_states']:.0f} s"
-            for each in every
-        )
+        stored = store.all()
+        spent = [
+            f"- {name}: {each['seconds']:.0f} s in {_counted(each['key']['jobs'])}, for the states "
+            f"{each['seconds_of_states']:.0f} s"
+            for name, each in stored.items()
+        ]
+        every = [*stored.values()]
         table = listed("verify", rows(every), COLUMNS).markdown()
-        return [TEXT, *table, "", f"- {spent}", *provenance(every, "runs")]
+        return [TEXT, *table, "", *spent, *provenance(every, "runs")]
 
     publish("verify", output, section, {"rows": listed("verify", rows(results), COLUMNS)})
 
 
-def _verified(folder: RunDir, seconds: float, states: int, points: int, store: ResultStore) -> Result:
+@dataclass(frozen=True, slots=True)
+class _Sizes:
+    """Sizes of a measurement: budget in seconds, states, points of a box, and processes."""
+
+    seconds: float
+    states: int
+    points: int
+    jobs: int
+
+
+def _verified(folder: RunDir, sizes: _Sizes, store: ResultStore) -> Result:
     """Result for a run, from the store or computed."""
     run = Run.open(folder.path)
+    spec, network = run.task.compiled.name, "x".join(map(str, run.task.system.decl.policy.hidden))
     values: dict[str, Any] = {
-        "spec": run.task.compiled.name,
+        "spec": spec,
         **inputs_of(run.task),
         "policy_sha256": sha256((folder.path / "ckpt" / "last.json").read_text(encoding="utf-8")),
-        "seconds": seconds,
-        "states": states,
-        "points": points,
+        **asdict(sizes),
     }
 
     def compute() -> Result:
-        one_thread()
         say(f"verifying {folder.shown}")
-        clock = clock_of("processor")
-        subject = ProposedPlans(run.task, run.policy)
-        verifier = Verifier(subject, clock=clock)
-        found = verifier.run(seconds)
-        begun = clock()
-        around = {each.mode.name: each for each in verifier.around(states)}
-        spent = clock() - begun
-        modes = []
-        for each in found.modes:
-            near = around.get(each.mode.name)
-            boxes = [*each.boxes, *(near.boxes if near else [])]
-            modes.append(
-                {
-                    "spec": values["spec"],
-                    "mode": each.mode.name,
-                    "probability": found.probability(each),
-                    "proved": each.proved,
-                    "refuted": each.refuted,
-                    "open": each.open,
-                    "states": near.states if near else 0,
-                    "with_proof": near.proved if near else 0,
-                    "violated": near.violated if near else 0,
-                    "violations": _violations(subject, found, each.mode.name, boxes, points),
-                    "points": len(boxes) * points,
-                }
-            )
+        workers = LocalProcesses(sizes.jobs, fresh=True)
+        with one_thread(), SharedExaminer(PolicySource(folder.path), workers) as examiner:
+            subject = ProposedPlans(run.task, run.policy)
+            verifier = Verifier(subject, clock=examiner.processor_time, examiner=examiner)
+            found = verifier.run(sizes.seconds)
+            clock = clock_of("processor")
+            begun = clock()
+            around = {each.mode.name: each for each in verifier.around(sizes.states)}
+            spent = clock() - begun
+            modes = []
+            for each in found.modes:
+                near = around.get(each.mode.name)
+                boxes = [*_some(each.boxes), *(near.boxes if near else [])]
+                modes.append(
+                    {
+                        "spec": spec,
+                        "network": network,
+                        "mode": each.mode.name,
+                        "probability": found.probability(each),
+                        "proved": each.proved,
+                        "refuted": each.refuted,
+                        "open": each.open,
+                        "states": near.states if near else 0,
+                        "with_proof": near.proved if near else 0,
+                        "violated": near.violated if near else 0,
+                        "violations": _violations(subject, found, each.mode.name, boxes, sizes.points),
+                        "points": len(boxes) * sizes.points,
+                    }
+                )
         return {"run": folder.name, "seconds": found.seconds, "seconds_of_states": spent, "modes": modes}
 
-    return store.get(Key(values["spec"], values), compute)
+    return store.get(Key(f"{spec} {network}", values), compute)
+
+
+def _some(boxes: Sequence[Box]) -> list[Box]:
+    """`BOXES` of the boxes at most, drawn at random."""
+    rng = np.random.default_rng(12)
+    return [boxes[i] for i in rng.permutation(len(boxes))[:BOXES]]
 
 
 def _violations(
-    subject: VerificationSubject, found: Verification, name: str, boxes: Sequence[Any], points: int
+    subject: VerificationSubject, found: Verification, name: str, boxes: Sequence[Box], points: int
 ) -> int:
     """Number of violations among random points of proved boxes of a mode."""
     rng = np.random.default_rng(11)
@@ -187,6 +222,10 @@ def _violations(
         if len(at):
             count += int((subject.robustness(subject.states(mode, at)) < -TOLERANCE).sum())
     return count
+
+
+def _counted(jobs: int) -> str:
+    return "one process" if jobs == 1 else f"each of {jobs} processes"
 
 
 def _share(value: float) -> str:

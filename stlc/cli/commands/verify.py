@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,15 +19,15 @@ from stlc.cli.framework.options import (
     parse_clock,
     parse_seconds,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, table
+from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics, table
 from stlc.cli.framework.program import command
-from stlc.diagnostics import usage
+from stlc.diagnostics import Diagnostic, usage
 from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.controller.verification.around import Around
     from stlc.controller.verification.loop import NetworkLoop
-    from stlc.controller.verification.subject import VerificationSubject
+    from stlc.controller.verification.plans import PolicySource
     from stlc.controller.verification.verify import ModeResult, Verification
 
 _MOST = 3
@@ -34,7 +36,7 @@ _MOST = 3
 
 @command(
     "stlc verify latest",
-    "stlc verify traffic --budget 10min --fail-under 0.5",
+    "stlc verify traffic --budget 10min --jobs 2 --fail-under 0.5",
     "stlc verify latest --states 1000",
     "stlc verify loop.stl --controller network.onnx --period 0.1s",
 )
@@ -68,6 +70,7 @@ def verify(
     clock: Annotated[
         str, typer.Option(metavar="wall|processor", help="Clock of the search for proofs.")
     ] = "wall",
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that prove.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the sampled states.")] = 0,
     fail_under: FailUnderOption = None,
     runs: RunsOption = Path("runs"),
@@ -76,53 +79,91 @@ def verify(
 
     Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion and
     robustness show that one proposal of the network satisfies the specification from every state in it. It is
-    refuted if the policy violates the specification from a sampled state. More time proves more. With
-    --states, boxes are also searched around random initial states; the number of states with a proof bounds
-    the share of all states that have one, with 95 % confidence. Exit code: 0 all proved, 1 a counterexample
-    was found, 4 open; with --fail-under, 0 if at least that share is proved.
+    refuted if the policy violates the specification from a sampled state. More time proves more, and so do
+    more processes (--jobs), each of which has the whole budget if --clock is processor. With --states, boxes
+    are also searched around random initial states; the number of states with a proof bounds the share of all
+    states that have one, with 95 % confidence. Exit code: 0 all proved, 1 a counterexample was found, 4 open;
+    with --fail-under, 0 if at least that share is proved.
 
     With --controller, a network acts on the system of SPEC once per period, and the whole horizon is proved,
     at the samples of the model or, with --continuous, of the exact solutions.
     """
     import torch
 
+    from stlc.controller.parallel.workers import LocalProcesses
     from stlc.controller.training.budget import clock_of
-    from stlc.controller.training.run import Run
-    from stlc.controller.verification.plans import ProposedPlans
+    from stlc.controller.verification.examine import SharedExaminer
+    from stlc.controller.verification.plans import PolicySource
     from stlc.controller.verification.verify import Verifier
+    from stlc.rundir import RunDir
 
     torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
-    seconds = parse_seconds(budget)
-    subject: VerificationSubject
+    seconds, measured = parse_seconds(budget), parse_clock(clock)
+    source: PolicySource | _LoopSource
     if controller is None:
         if period is not None or system is not None or continuous:
             raise usage("--period, --system and --continuous are for a network: --controller FILE")
-        opened = Run.open(run, root=runs)
-        name, subject = opened.dir.shown, ProposedPlans(opened.task, opened.policy)
+        folder = RunDir.open(run, runs)
+        name, source = folder.shown, PolicySource(folder.path)
     else:
-        name, subject = run, _closed_loop(run, system, controller, period, continuous)
-    verifier = Verifier(subject, seed=seed, clock=clock_of(parse_clock(clock)))
-    with PULSE.doing("proving"):
-        found = verifier.run(seconds, boxes=boxes)
+        name, source = run, _LoopSource(run, system, controller, period, continuous)
+    subject = source.load()
+    with nullcontext() if jobs == 1 else SharedExaminer(source, LocalProcesses(jobs, fresh=True)) as shared:
+        tick = clock_of(measured)
+        if shared is not None and measured == "processor":
+            tick = shared.processor_time
+        verifier = Verifier(subject, seed=seed, clock=tick, examiner=shared)
+        with PULSE.doing("proving"):
+            found = verifier.run(seconds, boxes=boxes)
+    with PULSE.doing("proving boxes around random states"):
         near = {each.mode.name: each for each in verifier.around(states, seed=seed)} if states else {}
     record = _record(name, found, near)
-    return Answer(record, lambda: emit("\n".join(_lines(record))), _exit_code(found, fail_under))
+    lost = () if shared is None or not shared.lost else (_lost(shared.lost),)
+
+    def show() -> None:
+        show_diagnostics(lost)
+        emit("\n".join(_lines(record)))
+
+    return Answer(record, show, _exit_code(found, fail_under), lost)
 
 
-def _closed_loop(
-    spec: str, system: str | None, controller: Path, period: str | None, continuous: bool
-) -> NetworkLoop:
-    """Load the closed loop of a system and a network."""
-    from stlc.controller.problem.load import load_task
-    from stlc.controller.verification.loop import NetworkLoop
-    from stlc.controller.verification.onnx_layers import read_onnx
+def _lost(reasons: Sequence[str]) -> Diagnostic:
+    """The finding R406 about batches of boxes that were lost with their processes."""
+    count = f"{len(reasons):,} batch{'es' if len(reasons) > 1 else ''} of boxes"
+    message = f"{count} stayed open: lost with the processes that examined them"
+    return Diagnostic("R406", message, note=tuple(dict.fromkeys(reasons)))
 
-    task = load_task(spec, system)
-    dt = float(task.system.decl.dt)
-    steps = 1.0 if period is None else parse_seconds(period) / dt
-    if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
-        raise usage(f"the control period `{period}` is not a multiple of the time step {dt:g} s")
-    return NetworkLoop(task, read_onnx(controller), round(steps), continuous=continuous)
+
+@dataclass(frozen=True, slots=True)
+class _LoopSource:
+    """Closed loop of a system and a network, for this process and others.
+
+    Attributes:
+        spec: path or name of the specification.
+        system: path or name of the system; None: that of the specification.
+        controller: file of the network.
+        period: control period with its unit; None: the time step.
+        continuous: whether solutions of the differential equations are bounded, not the model's.
+    """
+
+    spec: str
+    system: str | None
+    controller: Path
+    period: str | None
+    continuous: bool
+
+    def load(self) -> NetworkLoop:
+        """Load the closed loop."""
+        from stlc.controller.problem.load import load_task
+        from stlc.controller.verification.loop import NetworkLoop
+        from stlc.controller.verification.onnx_layers import read_onnx
+
+        task = load_task(self.spec, self.system)
+        dt = float(task.system.decl.dt)
+        steps = 1.0 if self.period is None else parse_seconds(self.period) / dt
+        if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
+            raise usage(f"the control period `{self.period}` is not a multiple of the time step {dt:g} s")
+        return NetworkLoop(task, read_onnx(self.controller), round(steps), continuous=self.continuous)
 
 
 def _exit_code(found: Verification, fail_under: float | None) -> int:

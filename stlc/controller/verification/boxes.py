@@ -41,12 +41,14 @@ class Box:
         half: half of its width in each coordinate, (coordinates,).
         refuted: whether a state in it is known to violate the specification.
         inside: whether all states in it are known to meet the conditions of `where`.
+        hopeless: whether all choices violate the specification from all states that were sampled in it.
     """
 
     centre: Floats
     half: Floats
     refuted: bool = False
     inside: bool = True
+    hopeless: bool = False
 
     @property
     def volume(self) -> float:
@@ -59,7 +61,7 @@ class Box:
         half[axis] *= 0.5
         step = np.zeros_like(half)
         step[axis] = half[axis]
-        known = self.refuted, self.inside
+        known = self.refuted, self.inside, self.hopeless
         return Box(self.centre - step, half, *known), Box(self.centre + step, half, *known)
 
 

@@ -1,8 +1,10 @@
 """Bounds on the outputs of a feed-forward network over boxes of inputs, and on the plans of a policy.
 
 All neurons of a layer are affine forms in the same symbols. A neuron has a symbol of its own for what a line
-cannot follow of its activation (Singh et al. 2018). Where a network computes in float32, a sum of n products,
-in any order, is within n 2^-24 / (1 - n 2^-24) of the sum of the magnitudes (Higham 2002, section 3.1).
+cannot follow of its activation (Singh et al. 2018). Symbols belong to one box, and are numbered without gaps
+in each: their number is that of the unstable neurons of a box, not of the batch. Where a network computes in
+float32, a sum of n products, in any order, is within n 2^-24 / (1 - n 2^-24) of the sum of the magnitudes
+(Higham 2002, section 3.1).
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from stlc.controller.policies.policy import PlanNetwork
@@ -68,17 +71,23 @@ class NetworkBounds:
         """Forms (batch, outputs) for forms (batch, inputs); `rows` selects outputs of the last layer."""
         neurons = inputs
         for layer in self._layers[:-1]:
-            neurons = own_symbols(self._layer(neurons, layer))
+            neurons = self._layer(neurons, layer)
         last = self._layers[-1]
         return self._layer(neurons, NetworkLayer(last.weight[rows], last.bias[rows], last.activation))
 
     def _layer(self, x: Forms, layer: NetworkLayer) -> Forms:
+        """Outputs of a layer; each large remainder of an input becomes a symbol."""
         weight, size = layer.weight.T, np.abs(layer.weight.T)
         symbols, batch, width = x.generators.shape
-        generators = (x.generators.reshape(-1, width) @ weight).reshape(symbols, batch, -1)
+        chosen, own, rest = _large(x.rest, _LARGE)
+        generators = np.empty((symbols + len(chosen), batch, weight.shape[1]))
+        np.matmul(
+            x.generators.reshape(-1, width), weight, out=generators[:symbols].reshape(-1, weight.shape[1])
+        )
+        np.multiply(own[:, :, None], weight[chosen], out=generators[symbols:])
         terms = width + 2.0
         most = (np.abs(x.centre) + x.radius) @ size + np.abs(layer.bias)
-        error = x.rest @ size + most * (terms * self._unit / (1.0 - terms * self._unit)) + SLACK
+        error = rest @ size + most * (terms * self._unit / (1.0 - terms * self._unit)) + SLACK
         found = Forms(x.centre @ weight + layer.bias, generators, error)
         if layer.activation == "linear":
             return found
@@ -109,12 +118,24 @@ def columns(x: Forms) -> list[Forms]:
 
 def own_symbols(x: Forms, large: float = _LARGE) -> Forms:
     """The same forms (batch, width), in which each large remainder has become a symbol."""
-    chosen = np.flatnonzero(x.rest.max(0) > large)
+    chosen, size, rest = _large(x.rest, large)
     own = np.zeros((len(chosen), *x.rest.shape))
-    own[np.arange(len(chosen)), :, chosen] = x.rest[:, chosen].T
-    rest = x.rest.copy()
-    rest[:, chosen] = 0.0
+    np.put_along_axis(own, chosen[:, :, None], size[:, :, None], axis=2)
     return Forms(x.centre, np.concatenate((x.generators, own)), rest)
+
+
+def _large(rest: Floats, large: float) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Large remainders among those of quantities, (batch, width), and the remainders without them.
+
+    Returns:
+        Numbers of the quantities with the large remainders of each box, and these, (most of a box, batch)
+        both; a box with fewer has other quantities with a 0.
+    """
+    big = rest > large
+    most = int(big.sum(1).max(initial=0))
+    chosen = np.argsort(~big, axis=1, kind="stable")[:, :most]
+    own = np.take_along_axis(np.where(big, rest, 0.0), chosen, 1)
+    return np.ascontiguousarray(chosen.T), np.ascontiguousarray(own.T), np.where(big, 0.0, rest)
 
 
 def reduced(x: Forms, first: int, most: int) -> Forms:
@@ -124,11 +145,12 @@ def reduced(x: Forms, first: int, most: int) -> Forms:
     """
     if len(x.generators) <= first + most:
         return x
-    size = np.abs(x.generators[first:]).sum((1, 2))
-    order = np.argsort(-size)
-    kept = np.concatenate((np.arange(first), first + np.sort(order[:most])))
-    rest = x.rest + np.abs(x.generators[first + order[most:]]).sum(0)
-    return Forms(x.centre, x.generators[kept], rest)
+    others = x.generators[first:]
+    size = np.abs(others)
+    order = np.argsort(-size.sum(2), axis=0)[:most, :, None]
+    kept, known = np.take_along_axis(others, order, 0), np.take_along_axis(size, order, 0)
+    rest = x.rest + np.maximum(size.sum(0) - known.sum(0), 0.0) + SLACK
+    return Forms(x.centre, np.concatenate((x.generators[:first], kept)), rest)
 
 
 class PlanBounds:
@@ -160,8 +182,9 @@ class PlanBounds:
         first = max(len(each.generators) for each in observed)
         width = self._steps * self._width
         rows = slice(index * width, (index + 1) * width)
-        raw = self._network.outputs(self._inputs(observed), rows)
-        outputs = columns(own_symbols(reduced(raw, first, _KEPT)))
+        raw = reduced(self._network.outputs(self._inputs(observed), rows), first, _KEPT)
+        symbols = len(raw.generators)
+        outputs = [each.with_symbol(symbols + i) for i, each in enumerate(columns(raw))]
         return [
             self._squashed(outputs[step * self._width : (step + 1) * self._width])
             for step in range(self._steps)

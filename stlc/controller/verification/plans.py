@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +25,24 @@ _GROUP = 256
 
 _TOUCH = 1e-9
 """Overlap with the other side of a mirror symmetry up to which a box is taken to lie on one side."""
+
+
+@dataclass(frozen=True, slots=True)
+class PolicySource:
+    """Policy of a run, for this process and others.
+
+    Attributes:
+        run: folder of the run.
+    """
+
+    run: Path
+
+    def load(self) -> ProposedPlans:
+        """Load the plans of the policy."""
+        from stlc.controller.training.run import Run
+
+        opened = Run.open(self.run)
+        return ProposedPlans(opened.task, opened.policy)
 
 
 class ProposedPlans(VerificationSubject):

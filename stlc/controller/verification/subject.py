@@ -31,6 +31,9 @@ History: TypeAlias = dict[str, list[Forms]]
 _DRAWN, _SEED = 200_000, 7
 """Number and seed of the states from which the share that meets `where` is bounded."""
 
+_STATES = 0.1
+"""Weight of the effects on the states, beside those on the undecided predicates, in the choice of a split."""
+
 _LARGE = 1e-3
 """Remainder of a state, as a share of its range, from which it becomes a symbol of later steps."""
 
@@ -135,7 +138,8 @@ class VerificationSubject(ABC):
         with FORMS.quiet():
             history, decided = self._followed(start, np.broadcast_to(index, len(boxes)), count)
             found = self._judge(history, count)
-            effects = found.effects + self._effects(history, count)
+            states = self._effects(history, count)
+            effects = _shares(found.effects) + _STATES * _shares(states)
         low, high = np.where(decided, found.low, -np.inf), np.where(decided, found.high, np.inf)
         return BoxVerdicts(low, high, effects)
 
@@ -176,3 +180,9 @@ class VerificationSubject(ABC):
                 share = np.abs(form.generators[:count]) / self._sizes[name]
                 total[: len(share)] += share
         return total.T
+
+
+def _shares(effects: Floats) -> Floats:
+    """Effects as shares of those of all coordinates of a box, (boxes, coordinates)."""
+    found: Floats = effects / effects.sum(1, keepdims=True)
+    return found

@@ -12,22 +12,23 @@ the monitor.
 
 from __future__ import annotations
 
+import heapq
 import math
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count, takewhile
 from typing import TypeAlias
 
 import numpy as np
 import torch
 
-from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.verification.around import Around, StateProver, narrowed
+from stlc.controller.verification.around import Around, StateProver
 from stlc.controller.verification.boxes import Box, Mode, whole
-from stlc.controller.verification.forms import Bools, Floats
-from stlc.controller.verification.judged import PROVED, BoxVerdicts
-from stlc.controller.verification.subject import Indices, VerificationSubject
+from stlc.controller.verification.examine import BatchExaminer, BatchResult, BoxBatch, Examiner, Witness
+from stlc.controller.verification.forms import Floats
+from stlc.controller.verification.judged import BoxVerdicts
+from stlc.controller.verification.subject import VerificationSubject
 
 Clock: TypeAlias = Callable[[], float]
 
@@ -37,24 +38,11 @@ DIVES = 16
 LITTLE = 0.01
 """Proved share of a mode up to which boxes around single states are searched."""
 
-POINTS = 8
-"""States that are sampled in each box: its centre and others at random."""
+ROUND = 64
+"""Batches that are chosen at once, and may be examined at the same time."""
 
-_EDGE = 1e-6
-"""Volume from which a proved box on the border of `where` is divided, to find its part inside."""
-
-
-@dataclass(frozen=True, slots=True)
-class Witness:
-    """Initial state from which the policy's plan violates the specification.
-
-    Attributes:
-        state: name of a state -> value.
-        robustness: robustness of the selected plan, below 0.
-    """
-
-    state: dict[str, float]
-    robustness: float
+HOPELESS = 64.0
+"""Boxes of which all samples violate the specification are examined like boxes smaller by this factor."""
 
 
 @dataclass(slots=True)
@@ -115,152 +103,148 @@ class Verification:
         return sum(self.probability(each) * each.open for each in self.modes)
 
 
-@dataclass(slots=True)
 class _Front:
-    """Boxes of a mode that are left to examine.
+    """Boxes of a mode that are left to examine, the largest first.
 
     Attributes:
-        queue: the boxes, the oldest and so the largest first.
         effects: mean effect of each coordinate on the bounds, (coordinates,), of boxes of width 1.
+        planned: number of boxes that were taken to be examined.
+        dive: whether boxes around single states are searched next.
     """
 
-    queue: deque[Box]
-    effects: Floats
+    def __init__(self, mode: Mode) -> None:
+        self.effects = np.ones(len(mode.coordinates))
+        self.planned = 0
+        self.dive = False
+        self._heap: list[tuple[float, int, Box]] = []
+        self._numbers = count()
+        self.add(whole(mode))
 
-    def take(self, count: int) -> list[Box]:
-        """Take the oldest boxes, `count` at most."""
-        return [self.queue.popleft() for _ in range(min(count, len(self.queue)))]
+    def __len__(self) -> int:
+        return len(self._heap)
 
-    def split(self, box: Box, axis: int | None = None) -> None:
-        """Add the two halves of a box, along the coordinate `axis`, or that with the greatest mean effect."""
-        self.queue.extend(box.split(int(np.argmax(self.effects * box.half)) if axis is None else axis))
+    def __iter__(self) -> Iterator[Box]:
+        return (box for _, _, box in self._heap)
 
-    def learn(self, box: Box, effects: Floats) -> None:
-        """Take the effects in one box into the mean."""
-        share = effects / (effects.sum() * box.half)
-        self.effects += 0.02 * (share / share.mean() - self.effects)
+    @property
+    def size(self) -> float:
+        """Volume of the next box; of a hopeless one, a `HOPELESS`th of it."""
+        return -self._heap[0][0]
 
+    def add(self, box: Box) -> None:
+        """Add a box."""
+        size = box.volume / HOPELESS if box.hopeless else box.volume
+        heapq.heappush(self._heap, (-size, next(self._numbers), box))
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Samples:
-    """Verdicts on boxes from sampled states.
+    def take(self, most: int) -> tuple[Box, ...]:
+        """Remove the largest boxes, `most` at most."""
+        return tuple(heapq.heappop(self._heap)[2] for _ in range(min(most, len(self._heap))))
 
-    Attributes:
-        refuted: whether a state in the box violates the specification, (boxes,).
-        index: number of the proposal that is most robust in its worst state, (boxes,).
-        hopeful: whether this proposal satisfies the specification from all sampled states, (boxes,).
-    """
-
-    refuted: Bools
-    index: Indices
-    hopeful: Bools
+    def learn(self, share: Floats) -> None:
+        """Take the relative effects in one box into the mean."""
+        self.effects += 0.02 * (share - self.effects)
 
 
 class Verifier:
     """Branch and bound for one policy or closed loop.
+
+    Args:
+        plans: what is verified.
+        seed: seed of the sampled states.
+        clock: clock of the search.
+        examiner: what examines batches of boxes of `plans`; this process if not given.
 
     Attributes:
         plans: what is verified.
         modes: ways to draw an initial state.
     """
 
-    def __init__(self, plans: VerificationSubject, *, seed: int = 0, clock: Clock = time.monotonic) -> None:
+    def __init__(
+        self,
+        plans: VerificationSubject,
+        *,
+        seed: int = 0,
+        clock: Clock = time.monotonic,
+        examiner: BatchExaminer | None = None,
+    ) -> None:
         self.plans, self._clock = plans, clock
         self.modes = self.plans.modes
-        self._names = self.plans.names
+        self._examiner = Examiner(plans) if examiner is None else examiner
         self._rng = np.random.default_rng(seed)
 
     def run(self, seconds: float, *, boxes: int | None = None, until_refuted: bool = False) -> Verification:
         """Return the result after at most about `seconds` of the clock.
 
         The mode with the largest box is next, so that all modes are divided into boxes of about one size.
-        `boxes` is the number of boxes of each mode that are examined at most. With `until_refuted`, the
-        search ends with the first counterexample.
+        `boxes` is the number of boxes of each mode that are examined at most; with it, and without a limit
+        of the time, the result depends on the seed only. With `until_refuted`, the search ends with the
+        first counterexample. Batches that are lost with their process stay open.
         """
         begun = self._clock()
         most = math.inf if boxes is None else boxes
-        results = [ModeResult(mode) for mode in self.modes]
-        fronts = [_Front(deque([whole(mode)]), np.ones(len(mode.coordinates))) for mode in self.modes]
-        while self._clock() - begun < seconds:
-            ready = [i for i, each in enumerate(results) if fronts[i].queue and each.examined < most]
-            if not ready or (until_refuted and any(each.witness for each in results)):
+        found = [ModeResult(mode) for mode in self.modes]
+        fronts = [_Front(mode) for mode in self.modes]
+
+        def going(_: object = None) -> bool:
+            refuted = until_refuted and any(each.witness for each in found)
+            return not refuted and self._clock() - begun < seconds
+
+        while going() and (chosen := self._chosen(fronts, most)):
+            examined = 0
+            batches = takewhile(going, chosen)
+            for batch, result in zip(chosen, self._examiner(batches), strict=False):
+                examined += 1
+                if isinstance(result, BatchResult):
+                    self._take(found[batch.mode], fronts[batch.mode], batch, result)
+            for batch in chosen[examined:]:  # the search is over
+                for box in batch.boxes:
+                    fronts[batch.mode].add(box)
+        for each, front in zip(found, fronts, strict=True):
+            self._close(each, front)
+        return Verification(tuple(found), self._clock() - begun)
+
+    def _chosen(self, fronts: list[_Front], most: float) -> list[BoxBatch]:
+        """Batches of the next round."""
+        found: list[BoxBatch] = []
+        while len(found) < ROUND:
+            ready = [i for i, front in enumerate(fronts) if len(front) and front.planned < most]
+            if not ready:
                 break
-            largest = max(ready, key=lambda i: fronts[i].queue[0].volume)
-            self._advance(results[largest], fronts[largest])
-        for result, front in zip(results, fronts, strict=True):
-            self._close(result, front)
-        return Verification(tuple(results), self._clock() - begun)
+            number = max(ready, key=lambda i: fronts[i].size)
+            front = fronts[number]
+            boxes = front.take(DIVES if front.dive else self.plans.batch)
+            front.planned += len(boxes)
+            seed = int(self._rng.integers(2**32))
+            found.append(BoxBatch(number, boxes, front.effects.copy(), seed, front.dive))
+            front.dive = False
+        return found
+
+    def _take(self, result: ModeResult, front: _Front, batch: BoxBatch, found: BatchResult) -> None:
+        """Take the result of a batch into that of its mode.
+
+        While little is proved and a batch proves nothing, boxes around single states are next.
+        """
+        result.examined += len(batch.boxes)
+        result.boxes += found.proved
+        result.proved += sum(box.volume for box in found.proved if box.inside)
+        for box in found.left:
+            front.add(box)
+        for share in found.shares:
+            front.learn(share)
+        front.dive = not batch.dive and not found.proved and result.proved < LITTLE and len(front) >= DIVES
+        if found.witness is not None and (
+            result.witness is None or found.witness.robustness < result.witness.robustness
+        ):
+            result.witness = found.witness
 
     def _close(self, result: ModeResult, front: _Front) -> None:
         """Compute the shares of a mode at the end."""
         result.accepted = self.plans.acceptance(result.mode)
         sure = sum(box.volume for box in result.boxes if box.inside)
-        bad = sum(box.volume for box in front.queue if box.refuted)
+        bad = sum(box.volume for box in front if box.refuted)
         result.proved = min(1.0, sure / result.accepted)
         result.refuted = min(bad / result.accepted, 1.0 - result.proved)
         result.open = max(0.0, 1.0 - result.proved - result.refuted)
-
-    def _advance(self, result: ModeResult, front: _Front) -> None:
-        """Examine one batch of boxes of a mode, and search around states in some while little is proved."""
-        self._examine(result, front, front.take(self.plans.batch))
-        if result.proved < LITTLE and len(front.queue) >= DIVES:
-            self._dive(result, front, front.take(DIVES))
-
-    def _dive(self, result: ModeResult, front: _Front, taken: Sequence[Box]) -> None:
-        """Search boxes that can be proved around a random state in each of some boxes."""
-        half = np.stack([box.half for box in taken])
-        at = np.stack([box.centre for box in taken]) + self._rng.uniform(-1.0, 1.0, half.shape) * half
-        x0 = self.states(result.mode, at)
-        good = self.plans.admits(result.mode, at) & (self.plans.choices(x0).max(1) >= 0.0)
-        front.queue.extend(box for box, fine in zip(taken, good, strict=True) if not fine)
-        chosen = np.flatnonzero(good).tolist()
-        if len(chosen):
-            boxes = [replace(taken[i], refuted=False) for i in chosen]
-            proved = narrowed(self.plans, result.mode, boxes, at[chosen], spare=front.queue.append)
-            result.boxes += proved
-            result.proved += sum(box.volume for box in proved)
-            result.examined += len(boxes)
-
-    def _examine(self, result: ModeResult, front: _Front, taken: Sequence[Box]) -> None:
-        boxes = self._admitted(result.mode, taken, front)
-        result.examined += len(taken)
-        if not boxes:
-            return
-        samples = self._sampled(result, boxes)
-        for i, box in enumerate(boxes):
-            if samples.refuted[i] or not samples.hopeful[i]:
-                front.split(replace(box, refuted=bool(samples.refuted[i])))
-        good = np.flatnonzero(samples.hopeful & ~samples.refuted).tolist()
-        if not good:
-            return
-        found = self.plans.bound(result.mode, [boxes[i] for i in good], samples.index[good])
-        for row, i in enumerate(good):
-            box, least, effects = boxes[i], float(found.low[row]), found.effects[row]
-            if least < -PROVED:
-                front.learn(box, effects)
-                box = replace(box, refuted=False)
-                front.split(box, int(np.argmax(effects)))
-            elif box.inside or box.volume <= _EDGE:
-                result.boxes.append(box)
-                result.proved += box.volume * box.inside
-            else:  # its part inside of `where` is found by dividing it
-                front.split(replace(box, refuted=False))
-
-    def _admitted(self, mode: Mode, boxes: Sequence[Box], front: _Front) -> list[Box]:
-        """The boxes that may contain a state that meets `where`."""
-        asked = [box for box in boxes if not box.inside]
-        if not asked:
-            return list(boxes)
-        found = [box for box in boxes if box.inside]
-        try:
-            truth = mode.truths(asked, self._names)
-        except ValueError:
-            for box in asked:
-                front.split(box, int(np.argmax(box.half)))
-            return found
-        return found + [
-            replace(box, inside=bool(truth.sure[i])) for i, box in enumerate(asked) if truth.possible[i]
-        ]
 
     def around(self, states: int, *, seed: int = 0) -> list[Around]:
         """Search boxes with a proof around random initial states; one result per mode that was drawn."""
@@ -279,27 +263,3 @@ class Verifier:
     def bound(self, mode: Mode, boxes: Sequence[Box], index: int) -> BoxVerdicts:
         """Bounds on the robustness of proposal number `index` over boxes of a mode."""
         return self.plans.bound(mode, boxes, index)
-
-    def _sampled(self, result: ModeResult, boxes: Sequence[Box]) -> _Samples:
-        """Sample states in boxes; those that do not meet `where` do not count."""
-        centre, half = np.stack([b.centre for b in boxes]), np.stack([b.half for b in boxes])
-        moves = self._rng.uniform(-1.0, 1.0, (POINTS, *centre.shape))
-        moves[0] = 0.0
-        at = np.clip(centre + moves * half, 0.0, 1.0).reshape(-1, centre.shape[1])
-        x0 = self.states(result.mode, at)
-        met = self.plans.admits(result.mode, at)
-        rho = np.where(met[:, None], self.plans.choices(x0), np.inf)
-        failing = np.flatnonzero(rho.max(1) < -PROVED)
-        least = rho.reshape(POINTS, len(boxes), -1).min(0)
-        refuted = np.zeros(len(at), dtype=bool)
-        if len(failing):
-            chosen = self.robustness(x0[torch.from_numpy(failing)])
-            refuted[failing] = chosen < -TOLERANCE
-            self._witness(result, x0[failing[int(np.argmin(chosen))]], float(chosen.min()))
-        index = least.argmax(1)
-        hopeful: Bools = least[np.arange(len(boxes)), index] >= -PROVED
-        return _Samples(np.any(refuted.reshape(POINTS, -1), axis=0), index, hopeful)
-
-    def _witness(self, result: ModeResult, state: torch.Tensor, rho: float) -> None:
-        if rho < -TOLERANCE and (result.witness is None or rho < result.witness.robustness):
-            result.witness = Witness(dict(zip(self._names, state.tolist(), strict=True)), rho)

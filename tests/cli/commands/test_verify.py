@@ -44,6 +44,15 @@ def test_the_document(run: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert sum(mode["probability"] for mode in result["modes"]) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
+def test_processes_give_the_same_result(run: str, capsys: pytest.CaptureFixture[str]) -> None:
+    found = []
+    for options in ([], ["--jobs", "2"], ["--jobs", "2", "--clock", "processor"]):
+        assert main(["verify", run, "--boxes", "40", "--budget", "1h", "--json", *options]) == 1
+        found.append(json.loads(capsys.readouterr().out)["result"]["modes"])
+    assert found[0] == found[1] == found[2]
+
+
 @pytest.mark.parametrize(("least", "code"), [("0", 0), ("1", 1)])
 def test_a_least_share_decides_the_exit_code(run: str, least: str, code: int) -> None:
     assert main(["verify", run, "--boxes", "3", "--fail-under", least]) == code

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.small_policies import policy, task_of
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.controller.policies.policy import BestOfKPolicy, ModelRollout, PlanNetwork
-from stlc.controller.problem.task import Task
 from stlc.controller.verification.boxes import Box, Unsupported, modes_of
 from stlc.controller.verification.forms import Forms
 from stlc.controller.verification.network import PlanBounds
@@ -22,31 +21,6 @@ from stlc.controller.verification.verify import Verification, Verifier
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.init import GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
-from stlc.dynamics.model.system import System
-from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
-
-ROOT = Path(__file__).parents[3]
-
-
-@cache
-def task_of(spec: str, system: str) -> Task:
-    files = ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml"
-    return Task.of(parse(read_source(files[0])), System.load(files[1]))
-
-
-@cache
-def policy() -> BestOfKPolicy:
-    """A small network with random weights, whose first proposal brakes hard and whose second does little."""
-    task = task_of("traffic", "car")
-    with torch.random.fork_rng(), torch.no_grad():
-        torch.manual_seed(5)
-        network = PlanNetwork(task, hidden=(24, 16), plans=2, varied=True).eval()
-        network.normalise(task.sample(500, seed=1))
-        last = network.body[-1]
-        last.weight *= 0.3
-        last.bias.view(2, -1)[0] -= 0.8
-    return BestOfKPolicy(task, network)
 
 
 @cache
