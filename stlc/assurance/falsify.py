@@ -47,7 +47,7 @@ CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""
 MOST_PAIRED = 40
 """Coordinates at most whose pairs are counted."""
-OPENING = 14
+OPENING = 12
 """Points of random pieces with which a search begins, after vertices and constant inputs."""
 BLIND = 3
 """Triples of a uniform point and two vertices with which a search begins if robustness is no guide."""

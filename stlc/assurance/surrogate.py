@@ -18,7 +18,7 @@ from stlc.assurance.strategies import HillClimbing, UniformSampling, VertexSampl
 
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)
 """Length scales that are compared, times the root of the number of coordinates."""
-NOISES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
+NOISES = (1e-3, 1e-2, 1e-1, 1.0)
 """Variances of the noise that are compared, times that of the robustness. Chattering is noise."""
 JITTER = 1e-6
 """Least variance of the noise, for the sake of the numerics."""
@@ -28,7 +28,7 @@ GROWN = 1.15
 """Growth of the number of points after which length scale and noise are chosen anew."""
 CANDIDATES = 200
 """Candidates of a proposal: one half neighbours of the best points, the other half random ones."""
-BOLDNESS = (0.0, 1.0, 3.0)
+BOLDNESS = (0.0, 1.0, 1.0, 3.0)
 """Standard deviations below the mean at which candidates are compared; one of these is drawn each time."""
 DIGITS = 6
 """Decimal digits of what is compared, so that rounding, which depends on the machine, decides nothing."""
