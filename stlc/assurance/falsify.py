@@ -191,7 +191,7 @@ class Portfolio:
             begin = (
                 _Opening(vertices, 2),
                 _Opening(constant, 2),
-                _Opening(vertices, 3),
+                _Opening(vertices, 5),
                 _Opening(constant, None),
             )
             self._first.extend((*begin, *drawn[:4], _Opening(climb, None), *drawn[4:]))
