@@ -49,6 +49,8 @@ MOST_PAIRED = 40
 """Coordinates at most whose pairs are counted."""
 OPENING = 12
 """Points of random pieces with which a search begins, after vertices and constant inputs."""
+SURROGATE_TURNS = 300
+"""Turns after the first points in which the surrogate has most of the points, and not later."""
 BLIND = 3
 """Triples of a uniform point and two vertices with which a search begins if robustness is no guide."""
 REJECTED = 1000
@@ -141,11 +143,12 @@ class _Opening:
 class Portfolio:
     """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
 
-    Two thirds of the later points are chosen by the surrogate, two ninths are random, and the rest goes to
-    the other strategies in turn. If the robustness takes few values, as that of conditions on
-    gears does, nothing can be learnt from it: then points are drawn at random. In a space most of whose
-    coordinates have no effect, `SensitiveClimbing` is the only strategy, and points are uniform while the
-    robustness hardly ever changes.
+    Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are random, and
+    the rest goes to the other strategies in turn. Of the points after these a third is random, a third goes
+    to the strategy that has found the least robust point, and a third to all in turn. If the robustness takes
+    few values, as that of conditions on gears does, nothing can be learnt from it: then points are drawn at
+    random. In a space most of whose coordinates have no effect, `SensitiveClimbing` is the only strategy, and
+    points are uniform while the robustness hardly ever changes.
     """
 
     def __init__(
@@ -172,6 +175,7 @@ class Portfolio:
         self._surrogate = SurrogateSearch(space, generator)
         self._first: deque[_Opening] = deque()
         self._others: list[Strategy] = []
+        self._late: list[Strategy] = []
         self._guided = not random and not space.sparse and graded and space.dim > 0
         self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
         self._samplers: list[Strategy] = [vertices, uniform]
@@ -186,6 +190,7 @@ class Portfolio:
                 self._others.append(CovarianceAdaptation(space, generator))
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
+            self._late = [*self._others, self._surrogate]
             constant = ConstantVertices(space, generator)
             drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
             begin = (
@@ -230,9 +235,15 @@ class Portfolio:
         if not self._guided or self.flat:
             return _rotated(self._blind)
         self._turn += 1
-        if self._turn % 3:
-            return self._surrogate
-        return _rotated(self._others if self._turn % 9 == 0 else self._samplers)
+        if self._turn <= SURROGATE_TURNS:
+            if self._turn % 3:
+                return self._surrogate
+            return _rotated(self._others if self._turn % 9 == 0 else self._samplers)
+        if self._turn % 3 == 0:
+            return _rotated(self._samplers)
+        if self._turn % 3 == 1:
+            return min(self._late, key=lambda each: each.best)
+        return _rotated(self._late)
 
     def observe(self, point: Point, value: float) -> None:
         """Report the guidance value at a point that no strategy proposed."""

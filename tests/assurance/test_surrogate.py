@@ -97,3 +97,19 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
     assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
     assert names[23:].count("surrogate") == pytest.approx(2 / 3 * len(names[23:]), abs=1.5)
     assert {"hill climbing", "periodic"} <= set(names)
+
+
+def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("stlc.assurance.falsify.SURROGATE_TURNS", 0)
+    block = SignalBlock("throttle", tuple(range(8)))
+    portfolio = Portfolio(SearchSpace(8, (block,)), np.random.default_rng(0), lambda _: None)
+    names = []
+    for index in range(90):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        progress = 0.01 * index if names[-1] == "hill climbing" else 0.0
+        portfolio.tell(proposal, 1.0 + index % 7 - progress)
+    late = names[-60:]
+    drawn = sum(late.count(each) for each in ("coarse", "coarse vertices", "vertices"))
+    assert drawn == pytest.approx(20, abs=3)  # more, as some strategies have nothing to propose
+    assert late.count("hill climbing") > late.count("surrogate") > 3
