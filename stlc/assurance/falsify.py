@@ -28,7 +28,6 @@ from stlc.assurance.strategies import (
     CoarseVertices,
     ConstantVertices,
     CovarianceAdaptation,
-    DiscreteSampling,
     GradientVertices,
     HillClimbing,
     PeriodicInputs,
@@ -36,10 +35,11 @@ from stlc.assurance.strategies import (
     UniformSampling,
     VertexSampling,
 )
+from stlc.assurance.surrogate import SurrogateSearch
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
-FALSIFIER_VERSION = 2
+FALSIFIER_VERSION = 3
 """Version of the search; results of older versions are recomputed."""
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
@@ -47,8 +47,12 @@ CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""
 MOST_PAIRED = 40
 """Coordinates at most whose pairs are counted."""
-OPENING = 20
-"""Points of random pieces with which a search begins, after constant inputs."""
+OPENING = 12
+"""Points of random pieces with which a search begins, after vertices and constant inputs."""
+SURROGATE_TURNS = 300
+"""Turns after the first points in which the surrogate has most of the points, and not later."""
+BLIND = 3
+"""Triples of a uniform point and two vertices with which a search begins if robustness is no guide."""
 REJECTED = 1000
 """Successive points without an admissible initial state after which a search ends."""
 DIGITS = (0, 1, 2, 3)
@@ -128,14 +132,23 @@ class Proposal:
     point: Point
 
 
+@dataclass(frozen=True, slots=True)
+class _Opening:
+    """Points with which a search begins: those of one strategy, as many as given; None: all that it has."""
+
+    strategy: Strategy
+    count: int | None = 1
+
+
 class Portfolio:
     """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
 
-    Every third point is random, every third one goes to the strategy that has found the least robust point,
-    and the rest to all in turn. If the robustness takes few values, as that of conditions on gears does,
-    nothing can be learnt from it: then points are drawn at random. In a space most of whose coordinates have
-    no effect, `SensitiveClimbing` is the only strategy, and points are uniform while the robustness hardly
-    ever changes.
+    Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are random, and
+    the rest goes to the other strategies in turn. Of the points after these a third is random, a third goes
+    to the strategy that has found the least robust point, and a third to all in turn. If the robustness takes
+    few values, as that of conditions on gears does, nothing can be learnt from it: then points are drawn at
+    random. In a space most of whose coordinates have no effect, `SensitiveClimbing` is the only strategy, and
+    points are uniform while the robustness hardly ever changes.
     """
 
     def __init__(
@@ -158,29 +171,37 @@ class Portfolio:
             graded: whether the robustness varies with the signals. If it takes only a few values, points are
                 drawn at random.
         """
-        self._uniform = UniformSampling(space, generator)
-        self._discrete = DiscreteSampling(space, generator)
-        self._first: list[Strategy] = []
-        self._samplers: list[Strategy] = []
-        self._turns: list[Strategy] = []
-        self._random, self._graded, self._sparse = random, graded, space.sparse
-        if not random and space.sparse:
-            self._turns = [SensitiveClimbing(space, generator)]
-        elif not random and graded and space.dim:
-            vertices, uniform = VertexSampling(space, generator), self._uniform
-            self._samplers = [vertices, uniform]
+        uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
+        self._surrogate = SurrogateSearch(space, generator)
+        self._first: deque[_Opening] = deque()
+        self._others: list[Strategy] = []
+        self._late: list[Strategy] = []
+        self._guided = not random and not space.sparse and graded and space.dim > 0
+        self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
+        self._samplers: list[Strategy] = [vertices, uniform]
+        self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
+        if self._guided:
             if any(len(block.values) > PIECES for block in space.blocks):
                 coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
                 self._samplers = [*coarse, vertices]
             climb = GradientVertices(space, generator, gradient)
-            drawn = [self._samplers[index % len(self._samplers)] for index in range(OPENING)]
-            constant = ConstantVertices(space, generator)
-            self._first = [vertices, vertices, constant, vertices, *drawn[:SAMPLES], climb, *drawn[SAMPLES:]]
-            self._turns = [climb, HillClimbing(space, generator)]
+            self._others = [climb, HillClimbing(space, generator)]
             if CovarianceAdaptation.available(space):
-                self._turns.append(CovarianceAdaptation(space, generator))
+                self._others.append(CovarianceAdaptation(space, generator))
             if space.blocks:
-                self._turns.append(PeriodicInputs(space, generator))
+                self._others.append(PeriodicInputs(space, generator))
+            self._late = [*self._others, self._surrogate]
+            constant = ConstantVertices(space, generator)
+            drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
+            begin = (
+                _Opening(vertices, 2),
+                _Opening(constant, 2),
+                _Opening(vertices, 5),
+                _Opening(constant, None),
+            )
+            self._first.extend((*begin, *drawn[:4], _Opening(climb, None), *drawn[4:]))
+        elif not random and not graded:
+            self._first.extend([_Opening(uniform), _Opening(vertices, 2)] * BLIND)
         self._turn = 0
         self._values: deque[float] = deque(maxlen=FLAT_VALUES)
 
@@ -193,12 +214,14 @@ class Portfolio:
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
         while self._first:
-            strategy = self._first[0]
-            point = strategy.propose()
-            if point is None or not isinstance(strategy, (ConstantVertices, GradientVertices)):
-                self._first.pop(0)
-            if point is not None:
-                return Proposal(strategy, point)
+            opening = self._first.popleft()
+            point = opening.strategy.propose()
+            if point is None:
+                continue
+            if opening.count is None or opening.count > 1:
+                left = None if opening.count is None else opening.count - 1
+                self._first.appendleft(_Opening(opening.strategy, left))
+            return Proposal(opening.strategy, point)
         while True:
             strategy = self._chosen()
             point = strategy.propose()
@@ -207,34 +230,45 @@ class Portfolio:
 
     def _chosen(self) -> Strategy:
         """The strategy whose turn it is, after the first points."""
-        if not self._turns:
-            return self._uniform if self._random or self._graded else self._discrete
-        if self._sparse:
-            return self._uniform if self.flat else self._turns[0]
-        if self.flat:
-            return self._discrete
+        if self._sensitive is not None:
+            return self._blind[0] if self.flat else self._sensitive
+        if not self._guided or self.flat:
+            return _rotated(self._blind)
         self._turn += 1
-        kind = self._turn % 3
-        if kind == 0:
-            self._samplers = [*self._samplers[1:], self._samplers[0]]
-            return self._samplers[0]
-        if kind == 1:
-            return min(self._turns, key=lambda each: each.best)
-        self._turns = [*self._turns[1:], self._turns[0]]
-        return self._turns[0]
+        if self._turn <= SURROGATE_TURNS:
+            if self._turn % 3:
+                return self._surrogate
+            return _rotated(self._others if self._turn % 9 == 0 else self._samplers)
+        if self._turn % 3 == 0:
+            return _rotated(self._samplers)
+        if self._turn % 3 == 1:
+            return min(self._late, key=lambda each: each.best)
+        return _rotated(self._late)
 
     def observe(self, point: Point, value: float) -> None:
         """Report the guidance value at a point that no strategy proposed."""
-        for each in self._turns:
+        for each in self._learning():
             each.observe(point, value)
 
     def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others."""
         self._values.append(value)
         proposal.strategy.tell(proposal.point, value)
-        for other in self._turns:
+        for other in self._learning():
             if other is not proposal.strategy:
                 other.observe(proposal.point, value)
+
+    def _learning(self) -> Sequence[Strategy]:
+        """Strategies that learn from the points of others."""
+        if self._sensitive is not None:
+            return (self._sensitive,)
+        return (*self._others, self._surrogate) if self._guided else ()
+
+
+def _rotated(strategies: list[Strategy]) -> Strategy:
+    """Return the first strategy of a list, which becomes the last one."""
+    strategies.append(strategies.pop(0))
+    return strategies[-1]
 
 
 class ViolationSearch:

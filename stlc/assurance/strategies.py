@@ -29,8 +29,8 @@ SHORTEST, LONGEST = 0.01, 0.5
 """Half periods of periodic inputs, as shares of the duration."""
 SWEPT = 12
 """Half periods that are tried before the best is refined."""
-ENDS, FEW_ENDS = 2.0 / 3.0, 0.2
-"""Share of values at the ends of their ranges: of vertices, and where robustness is no guide."""
+ENDS = 2.0 / 3.0
+"""Share of the values of vertices at the ends of their ranges."""
 PIECES = 5
 """Maximum number of pieces of coarse inputs."""
 
@@ -99,15 +99,6 @@ class UniformSampling(Strategy):
 
     def propose(self) -> Point:
         return self.generator.random(self.space.dim)
-
-
-class DiscreteSampling(Strategy):
-    """Uniform values, some of them at the ends of their ranges; for requirements that give no guidance."""
-
-    name = "discrete"
-
-    def propose(self) -> Point:
-        return _values(self.space, self.generator, np.arange(self.space.dim), FEW_ENDS)
 
 
 class VertexSampling(Strategy):

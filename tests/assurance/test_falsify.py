@@ -143,7 +143,7 @@ def test_a_violation_that_half_the_step_does_not_have_is_spurious():
     assert (simulator.graded(0), simulator.graded(1)) == (True, False)
     discrete = falsify(simulator, 1, budget=SearchBudget(60), seed=0, shrinks=False)
     assert discrete.found is not None
-    assert set(discrete.strategies) == {"discrete"}
+    assert set(discrete.strategies) <= {"uniform", "vertices"}  # nothing can be learnt
 
 
 def test_guidance_has_the_sign_of_the_margin_and_scales_the_larger_predicate():

@@ -1,0 +1,115 @@
+"""Gaussian process of the robustness, and the search that it guides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stlc.assurance.falsify import Portfolio
+from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
+from stlc.assurance.strategies import Strategy, UniformSampling
+from stlc.assurance.surrogate import CANDIDATES, RobustnessProcess, SurrogateSearch
+
+DIM = 6
+TARGET = np.linspace(0.15, 0.85, DIM)
+
+
+def bowl(point: Point) -> float:
+    return float(((point - TARGET) ** 2).sum())
+
+
+def least(strategy: Strategy, count: int) -> float:
+    values = []
+    for _ in range(count):
+        point = strategy.propose()
+        assert point is not None
+        assert ((point >= 0.0) & (point <= 1.0)).all()
+        values.append(bowl(point))
+        strategy.tell(point, values[-1])
+    return min(values)
+
+
+def test_a_process_predicts_a_smooth_function_and_is_unsure_far_away():
+    generator, process = np.random.default_rng(0), RobustnessProcess()
+    points = 0.5 * generator.random((60, 2))
+    process.fit(points, np.sin(6.0 * points[:, 0]) + points[:, 1])
+    near = 0.05 + 0.4 * generator.random((30, 2))
+    means, deviations = process.predict(near)
+    assert means == pytest.approx(np.sin(6.0 * near[:, 0]) + near[:, 1], abs=0.05)
+    assert process.predict(np.ones((1, 2)))[1][0] > 5.0 * deviations.max()
+
+
+def test_chattering_is_noise():
+    generator, process = np.random.default_rng(1), RobustnessProcess()
+    points, values = generator.random((150, 2)), generator.standard_normal(150)
+    process.fit(points, values)
+    means, _ = process.predict(points)
+    assert means.std() < 0.5 * values.std()
+
+
+def test_the_search_needs_fewer_simulations_than_sampling():
+    found = [least(SurrogateSearch(SearchSpace(DIM), np.random.default_rng(seed)), 40) for seed in range(3)]
+    drawn = [least(UniformSampling(SearchSpace(DIM), np.random.default_rng(seed)), 400) for seed in range(3)]
+    assert np.mean(found) < 0.7 * np.mean(drawn)
+
+
+def test_no_point_is_simulated_twice_and_infinite_values_do_no_harm():
+    strategy = SurrogateSearch(SearchSpace(1), np.random.default_rng(2))
+    for end in (0.0, 1.0):
+        strategy.observe(np.array([end]), -1.0)
+    strategy.observe(np.array([0.3]), np.inf)
+    known = {0.0, 1.0, 0.3}
+    for _ in range(12):
+        point = strategy.propose()
+        assert float(point[0]) not in known
+        known.add(float(point[0]))
+        strategy.tell(point, 1.0)
+
+
+def test_rounding_of_the_machine_decides_nothing():
+    # The same values but for rounding errors give the same points.
+    proposed = []
+    for error in (0.0, 1e-13):
+        strategy = SurrogateSearch(SearchSpace(DIM), np.random.default_rng(3))
+        for _ in range(12):
+            point = strategy.propose()
+            strategy.tell(point, bowl(point) * (1.0 + error))
+        proposed.append(strategy.propose())
+    assert np.array_equal(*proposed)
+    assert CANDIDATES > DIM
+
+
+def test_a_search_begins_with_vertices_and_opposite_constants():
+    blocks = tuple(
+        SignalBlock(name, tuple(range(at, at + 8))) for name, at in (("throttle", 0), ("brake", 8))
+    )
+    portfolio = Portfolio(SearchSpace(16, blocks), np.random.default_rng(0), lambda _: None)
+    names, points = [], []
+    for index in range(60):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        points.append(proposal.point)
+        portfolio.tell(proposal, float(index % 7))
+    assert (
+        names[:11]
+        == ["vertices"] * 2 + ["constant vertices"] * 2 + ["vertices"] * 5 + ["constant vertices"] * 2
+    )
+    assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
+    assert names[23:].count("surrogate") == pytest.approx(2 / 3 * len(names[23:]), abs=1.5)
+    assert {"hill climbing", "periodic"} <= set(names)
+
+
+def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("stlc.assurance.falsify.SURROGATE_TURNS", 0)
+    block = SignalBlock("throttle", tuple(range(8)))
+    portfolio = Portfolio(SearchSpace(8, (block,)), np.random.default_rng(0), lambda _: None)
+    names = []
+    for index in range(90):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        progress = 0.01 * index if names[-1] == "hill climbing" else 0.0
+        portfolio.tell(proposal, 1.0 + index % 7 - progress)
+    late = names[-60:]
+    drawn = sum(late.count(each) for each in ("coarse", "coarse vertices", "vertices"))
+    assert drawn == pytest.approx(20, abs=3)  # more, as some strategies have nothing to propose
+    assert late.count("hill climbing") > late.count("surrogate") > 3
