@@ -54,7 +54,9 @@ starts. For a policy: its plan and the verdict on it.
 DEPLOYED = """\
 Closed loop, by the protocol of the paper: size and replanning of the system, plan accuracy (share of the
 followed plans that satisfy the specification) / safety (share of agents whose whole drive was safe), means
-over the worlds with half of their 95 % intervals (Student's t, none for one world).
+over the worlds with half of their 95 % intervals (Student's t, none for one world). In traffic, drives
+contain events that no plan foresees, such as a car that turns into another road, so that few are safe
+throughout; docs/worlds.md judges them by rules for drives.
 """
 DRIVES_COMMAND = "`python -m benchmarks paper --parts drives` fills the cells that are missing."
 

@@ -248,30 +248,51 @@ def _told(result: Result) -> str:
 
 
 def rows_of(results: Sequence[Result]) -> list[Row]:
-    """Rows of the stored results, in the order of the benchmarks; incomplete ones are left out."""
-    kept = {_place_of(each): each for each in results}
+    """Rows of the stored results, in the order of the benchmarks; incomplete ones are left out.
+
+    Searches of the same size are compared, the largest of which both are stored, and as many fresh drives of
+    both trainings. With `--falsify`, the newest version counts.
+    """
     rows = []
     for benchmark in ORDER:
         for guard in GUARDS:
-            first = [(benchmark, guard, "guided", what) for what in ("random", "falsify", "fresh")]
-            if not all(each in kept for each in first):
+            own = [each for each in results if _is_of(each, benchmark, guard)]
+            searches = {_size(each): each for each in own if each["key"]["seed"] != FRESH}
+            sizes = [count for count, random in searches if random and (count, False) in searches]
+            fresh = [each for each in own if each["key"]["seed"] == FRESH]
+            before = max(
+                (each for each in fresh if each["key"]["trained"] == "guided"), key=_drives_of, default=None
+            )
+            if not sizes or before is None:
                 continue
-            random, searched, before = (kept[each] for each in first)
-            after = kept.get((benchmark, guard, AFTER, "fresh"))
+            random, searched = searches[max(sizes), True], searches[max(sizes), False]
+            after = [
+                each
+                for each in fresh
+                if each["key"]["trained"] != "guided" and each["drives"] == before["drives"]
+            ]
+            newest = max(after, key=lambda each: str(each["key"]["trained"]), default=None)
             key = searched["key"]
             rows.append(
                 Row(
                     *(benchmark, guard, key["simulations"], key["agents"], key["steps"]),
                     *(random["least"], searched["least"], random["failing"], searched["failing"]),
                     *(searched["drives"], before["drives"], before["failing"]),
-                    after=None if after is None else after["failing"],
+                    after=None if newest is None else newest["failing"],
                 )
             )
     return rows
 
 
-def _place_of(result: Result) -> tuple[str, str, str, str]:
-    """Benchmark, guard, training and kind of a stored result."""
+def _is_of(result: Result, benchmark: str, guard: str) -> bool:
     key = result["key"]
-    what = "fresh" if key["seed"] == FRESH else "random" if key["random"] else "falsify"
-    return key["benchmark"], key["guard"], key["trained"], what
+    return bool(key["benchmark"] == benchmark and key["guard"] == guard)
+
+
+def _size(result: Result) -> tuple[int, bool]:
+    """Number of simulations of a search, and whether they were drawn."""
+    return int(result["key"]["simulations"]), bool(result["key"]["random"])
+
+
+def _drives_of(result: Result) -> int:
+    return int(result["drives"])

@@ -34,6 +34,20 @@ def test_a_row_needs_both_searches_and_fresh_drives() -> None:
     assert row.after == 2
 
 
+def test_searches_of_one_size_are_compared() -> None:
+    results = [_result("random"), _result("falsify", failing=7), _result("fresh", failing=4)]
+    larger = _result("random", failing=50)
+    larger["key"] = {**results[0]["key"], "simulations": 100}  # type: ignore[dict-item]
+    (row,) = rows_of([*results, larger])
+    assert (row.simulations, row.failing_random, row.failing_falsify) == (3, 1, 7)
+    other = {**larger, "key": {**larger["key"], "random": False}}  # type: ignore[dict-item]
+    (row,) = rows_of([*results, larger, other])
+    assert (row.simulations, row.failing_falsify) == (100, 50)
+    more = {**_result("fresh", failing=9), "drives": 600}
+    (row,) = rows_of([*results, more, _result("fresh", AFTER, failing=2)])
+    assert (row.fresh, row.before, row.after) == (600, 9, None)
+
+
 def test_the_second_training_differs_by_the_option_alone(tmp_path: Path) -> None:
     before, after = _cells("traffic", 3, Length(60.0, clock="processor"), retrain=True, held_out=50)
     place = Place(ResultStore("any", tmp_path), tmp_path)

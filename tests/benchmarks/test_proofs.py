@@ -36,7 +36,7 @@ def test_a_policy_is_verified_once(tmp_path: Path, capsys: pytest.CaptureFixture
     assert len(rows) == 7
     assert sum(row["states"] for row in rows) == 20
     assert all(row["violations"] == 0 for row in rows)
-    assert "| policy | initial states |" in page.read_text(encoding="utf-8")
+    assert "| policy | network | initial states |" in page.read_text(encoding="utf-8")
 
 
 NNET = """\
