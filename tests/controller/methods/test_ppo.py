@@ -117,7 +117,9 @@ def test_a_broken_step_changes_nothing(car_task: Task) -> None:
     assert ppo.diagnose()[0].diagnostics[0].code == "R401"
 
 
-@pytest.mark.parametrize("reward", ["task", "robustness", "accuracy"])
+@pytest.mark.parametrize(
+    "reward", ["task", *(pytest.param(each, marks=pytest.mark.slow) for each in ("robustness", "accuracy"))]
+)
 def test_it_goes_on_bit_for_bit(
     reward: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

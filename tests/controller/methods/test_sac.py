@@ -89,7 +89,7 @@ def test_a_step_is_an_episode_and_leaves_other_random_numbers_alone(car_task: Ta
     assert states[2] == random.getstate()
 
 
-@pytest.mark.parametrize("reward", ["task", "accuracy"])
+@pytest.mark.parametrize("reward", ["task", pytest.param("accuracy", marks=pytest.mark.slow)])
 def test_it_goes_on_bit_for_bit(
     reward: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
