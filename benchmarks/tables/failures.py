@@ -44,7 +44,8 @@ least robustness over all requirements, and failing drives, of the same number o
 that was trained without falsification. A simulation is a drive of one agent, in traffic a world of 20 cars.
 `fresh`: share of failing drives among fresh ones, with all agents of a world, for that policy and for one
 that was trained with `--falsify` in the same time; intervals of 95 % (Wilson) take drives as independent.
-Benchmarks and entries that are missing were not measured yet.
+Benchmarks and entries that are missing were not measured yet; searches with fewer than 2,000 drives, and
+trainings beside them, are from an earlier version, with one search for all requirements.
 """
 
 
@@ -250,8 +251,8 @@ def _told(result: Result) -> str:
 def rows_of(results: Sequence[Result]) -> list[Row]:
     """Rows of the stored results, in the order of the benchmarks; incomplete ones are left out.
 
-    Searches of the same size are compared, the largest of which both are stored, and as many fresh drives of
-    both trainings. With `--falsify`, the newest version counts.
+    A row compares the largest two searches of equal size, and equal numbers of fresh drives of both
+    trainings. Of several versions of `train --falsify` the newest counts.
     """
     rows = []
     for benchmark in ORDER:

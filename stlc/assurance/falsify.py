@@ -260,9 +260,7 @@ class Portfolio:
 
     def _learning(self) -> Sequence[Strategy]:
         """Strategies that learn from the points of others."""
-        if self._sensitive is not None:
-            return (self._sensitive,)
-        return (*self._others, self._surrogate) if self._guided else ()
+        return self._late if self._sensitive is None else (self._sensitive,)
 
 
 def _rotated(strategies: list[Strategy]) -> Strategy:
