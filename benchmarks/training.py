@@ -5,8 +5,10 @@ Several runs can proceed in parallel.
 
 from __future__ import annotations
 
+import math
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -29,10 +31,13 @@ from stlc.controller.training.config import (
 )
 from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import StlcError
+from stlc.registry import METHODS
 from stlc.rundir import RunDir, every_run
 from stlc.view.held_out import load_held_out
 
 CURVE_POINTS = 80
+ROUNDING = 0.01
+"""Seconds by which the planned time of a run may be less than that of its cell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +305,7 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
     jobs = []
     for cell in wanted.values():
         run = place.newest_run(cell.key)
-        if run is not None and run.status == "finished":
+        if run is not None and is_complete(run, cell):
             yield cell, place.store.put(cell.key, collect(run)), ""
         else:
             jobs.append(_job(cell, place, run))
@@ -308,7 +313,7 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
     for back in workers.run(jobs, lambda job: say(f"training {job.name}")):
         cell = wanted[back.job.name]
         run = place.newest_run(cell.key)
-        if back.code not in (0, 1) or run is None or run.status != "finished":
+        if back.code not in (0, 1) or run is None or not is_complete(run, cell):
             yield cell, None, f"exit code {back.code}\n{back.why}".strip()
         else:
             yield cell, place.store.put(cell.key, collect(run, cores=back.cores)), ""
@@ -317,11 +322,12 @@ def _fill(cells: Sequence[Cell], place: Place) -> Iterator[tuple[Cell, Result | 
 def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
     """Return the job of a training run: the arguments of `stlc train`, and input files for another machine.
 
-    If the interrupted run `run` is given, the job resumes it.
+    If the interrupted run `run` is given, the job resumes it. Otherwise it extends a shorter run if it can.
     """
     runs = place.runs_of(cell.key)
+    run = run or _shorter(cell, place)
     if run is not None:
-        arguments: tuple[str, ...] = ("--resume", str(run.path), "--no-pictures")
+        arguments: tuple[str, ...] = ("--resume", str(run.path), "--no-pictures", *_extension(cell, run))
     else:
         overrides = [word for key, value in cell.overrides.items() for word in ("--set", f"{key}={value}")]
         own = [word for key, value in cell.options.items() for word in _option(key, value)]
@@ -335,6 +341,46 @@ def _job(cell: Cell, place: Place, run: RunDir | None) -> Job:
         return Job(cell.name, arguments)
     read = input_files(spec_path(cell.benchmark), overrides=cell.overrides)
     return Job(cell.name, arguments, read if run is None else (run.path,), runs)
+
+
+def is_complete(run: RunDir, cell: Cell) -> bool:
+    """True if a run has finished and was planned with all the time of the cell, so is not to be extended."""
+    return run.status == "finished" and not _extension(cell, run)
+
+
+def _extension(cell: Cell, run: RunDir) -> tuple[str, ...]:
+    """Options of `stlc train --resume` if a run was planned with less time than the cell has; else empty."""
+    planned = float(run.record().get("seconds_allowed") or math.inf)
+    if cell.length.seconds is None or planned >= cell.length.seconds - ROUNDING:
+        return ()
+    return ("--budget", f"{cell.length.seconds - _spent(run):.3f}s")
+
+
+def _spent(run: RunDir) -> float:
+    """Training time of a run in seconds, on its clock."""
+    return float(run.read_json("ckpt/last.json")["seconds"])
+
+
+def _shorter(cell: Cell, place: Place) -> RunDir | None:
+    """Copy of the longest finished run that differs from the cell in its length only; None if there is none.
+
+    Only the runs of methods whose steps do not depend on the length are copied.
+    """
+    if not METHODS.get(cell.method).extendable or cell.length.seconds is None or place.cluster is not None:
+        return None
+    cells = [Cell.of(result) for result in place.valid()]
+    cells = [each for each in cells if each.length.seconds and each.length.seconds < cell.length.seconds]
+    same = [each for each in cells if replace(cell, length=each.length).key == each.key]
+    for each in sorted(same, key=lambda each: -(each.length.seconds or 0.0)):
+        run = place.newest_run(each.key)
+        if run is not None and is_complete(run, each) and _spent(run) < cell.length.seconds:
+            target = place.runs_of(cell.key) / run.path.parent.name / run.path.name
+            beside = target.with_name(f".{target.name}")
+            shutil.rmtree(beside, ignore_errors=True)
+            shutil.copytree(run.path, beside)
+            beside.rename(target)
+            return RunDir(target)
+    return None
 
 
 def _option(key: str, value: str) -> tuple[str, ...]:

@@ -27,19 +27,26 @@ from benchmarks.training import (
     Length,
     Place,
     _fill,
+    _job,
+    _shorter,
+    _spent,
     filled,
     grouped,
+    is_complete,
     outdated,
     pack,
     remaining,
     unpack,
 )
+from stlc.cli.framework.app import main
 from stlc.controller.evaluation.held_out import wilson
+from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT_SEED
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import Watch, train
 from stlc.controller.training.run import Run
+from stlc.registry import METHODS
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]
@@ -148,6 +155,58 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
     row = paper.row_of(group, {})
     assert row.outdated == ("method",)
     assert paper.SHOWN["inputs"](row) == "outdated: method"  # type: ignore[operator]
+
+
+def test_a_longer_training_extends_a_shorter_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(METHODS.get("gradient")), "extendable", True)
+    place = Place(ResultStore("ablation", tmp_path), tmp_path / "runs")
+    short = quick(length=Length(0.3, clock="processor"))
+    run = trained(short, place)
+    assert filled([short], place).trained == 1
+    long = replace(short, length=Length(round(_spent(run.dir) + 0.5, 3), clock="processor"))
+    assert _shorter(replace(long, length=Length(_spent(run.dir), clock="processor")), place) is None
+    sent: list[Job] = []
+
+    def train_here(_executor: object, jobs: list[Job], _begun: object) -> list[JobResult]:
+        sent.extend(jobs)
+        return [JobResult(job, main(["train", *job.arguments]), None, "", 1) for job in jobs]
+
+    monkeypatch.setattr("stlc.controller.parallel.jobs.LocalExecutor.run", train_here)
+    (result,) = filled([long], place).results
+    assert sent[0].arguments[0] == "--resume"
+    (longer,) = every_run(place.runs_of(long.key))
+    assert longer.name == run.dir.name
+    assert [row["step"] for row in longer.rows()][: len(run.dir.rows())] == [
+        row["step"] for row in run.dir.rows()
+    ]
+    assert result["steps"] > run.dir.record()["steps"]
+    assert result["seconds"] > _spent(run.dir)
+    assert place.store.find(short.key) is not None
+    no_process(monkeypatch)
+    assert filled([long], place).kept == 1
+    other = replace(long, seed=1)
+    assert _shorter(other, place) is None
+
+
+def test_a_copied_run_is_not_taken_for_the_longer_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process may end between the copy and the training."""
+    monkeypatch.setattr(type(METHODS.get("gradient")), "extendable", True)
+    place = Place(ResultStore("ablation", tmp_path), tmp_path / "runs")
+    short = quick(length=Length(0.3, clock="processor"))
+    trained(short, place)
+    filled([short], place)
+    long = replace(short, length=Length(60.0, clock="processor"))
+    assert _shorter(long, place) is not None
+    copy = place.newest_run(long.key)
+    assert copy is not None
+    assert copy.status == "finished"
+    assert is_complete(copy, short)
+    assert not is_complete(copy, long)
+    assert _job(long, place, copy).arguments[-2] == "--budget"
+    monkeypatch.undo()
+    assert _shorter(replace(long, length=Length(61.0, clock="processor")), place) is None
 
 
 @pytest.mark.slow

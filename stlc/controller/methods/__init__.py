@@ -47,9 +47,12 @@ class Method(ABC):
         learns: class of the learner; None if the method plans without training, or if the subclass defines
             the function `learner` itself.
         falsifies: whether the method can train on states of failing closed-loop drives (`--falsify`).
+        extendable: whether no step depends on the planned number of steps. Then a longer training begins like
+            a shorter one, and can continue it.
     """
 
     falsifies: ClassVar[bool] = False
+    extendable: ClassVar[bool] = False
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
     learns: ClassVar[type[Learner] | None] = None
 

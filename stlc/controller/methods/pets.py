@@ -242,6 +242,7 @@ class Pets(Method):
 
     options = PetsConfig
     learns = PetsLearner
+    extendable = True
 
     def resolve(self, task: Task, config: TrainConfig) -> PetsConfig:
         """Determine the options.

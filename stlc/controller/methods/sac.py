@@ -34,6 +34,7 @@ class Sac(Method):
     """Soft actor-critic; one step of the training is one episode in every environment."""
 
     options = SacConfig
+    extendable = True
 
     def resolve(self, task: Task, config: TrainConfig) -> SacConfig:
         """Determine the options; `--batch` is the number of transitions of a gradient step."""
