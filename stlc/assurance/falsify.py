@@ -31,6 +31,7 @@ from stlc.assurance.strategies import (
     GradientVertices,
     HillClimbing,
     PeriodicInputs,
+    Perturbation,
     Strategy,
     UniformSampling,
     VertexSampling,
@@ -39,7 +40,7 @@ from stlc.assurance.surrogate import SurrogateSearch
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
-FALSIFIER_VERSION = 3
+FALSIFIER_VERSION = 4
 """Version of the search; results of older versions are recomputed."""
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
@@ -49,6 +50,8 @@ MOST_PAIRED = 40
 """Coordinates at most whose pairs are counted."""
 OPENING = 12
 """Points of random pieces with which a search begins, after vertices and constant inputs."""
+PERTURBATIONS = 4
+"""Small perturbations of the best vertex, before these points."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
 BLIND = 3
@@ -144,11 +147,12 @@ class Portfolio:
     """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
 
     Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are random, and
-    the rest goes to the other strategies in turn. Of the points after these a third is random, a third goes
-    to the strategy that has found the least robust point, and a third to all in turn. If the robustness takes
-    few values, as that of conditions on gears does, nothing can be learnt from it: then points are drawn at
-    random. In a space most of whose coordinates have no effect, `SensitiveClimbing` is the only strategy, and
-    points are uniform while the robustness hardly ever changes.
+    the rest goes to the other strategies in turn. In a small space, all of whose vertices come first, two
+    thirds are those of CMA-ES, and the surrogate and random points have a ninth each. Of the points after
+    these a third is random, a third goes to the strategy that has found the least robust point, and a third
+    to all in turn. If the robustness takes few values, as that of conditions on gears does, nothing can be
+    learnt from it: then points are drawn at random. In a space most of whose coordinates have no effect,
+    `SensitiveClimbing` is the only strategy, and points are uniform while the robustness hardly ever changes.
     """
 
     def __init__(
@@ -173,33 +177,41 @@ class Portfolio:
         """
         uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
         self._surrogate = SurrogateSearch(space, generator)
+        self._leading: Strategy = self._surrogate
         self._first: deque[_Opening] = deque()
         self._others: list[Strategy] = []
         self._late: list[Strategy] = []
         self._guided = not random and not space.sparse and graded and space.dim > 0
         self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
         self._samplers: list[Strategy] = [vertices, uniform]
+        self._drawn: list[Strategy] = []
         self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
         if self._guided:
             if any(len(block.values) > PIECES for block in space.blocks):
                 coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
                 self._samplers = [*coarse, vertices]
+            self._drawn = [*self._samplers]
             climb = GradientVertices(space, generator, gradient)
-            self._others = [climb, HillClimbing(space, generator)]
-            if CovarianceAdaptation.available(space):
-                self._others.append(CovarianceAdaptation(space, generator))
+            perturbation = Perturbation(space, generator)
+            self._others = [climb, HillClimbing(space, generator), perturbation]
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
             self._late = [*self._others, self._surrogate]
+            if CovarianceAdaptation.available(space):
+                adaptation = CovarianceAdaptation(space, generator)
+                self._late.append(adaptation)
+                if space.small:
+                    self._leading, self._drawn = adaptation, [self._surrogate, uniform]
+                else:
+                    self._others.append(adaptation)
             constant = ConstantVertices(space, generator)
-            drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
-            begin = (
-                _Opening(vertices, 2),
-                _Opening(constant, 2),
-                _Opening(vertices, 5),
-                _Opening(constant, None),
-            )
-            self._first.extend((*begin, *drawn[:4], _Opening(climb, None), *drawn[4:]))
+            if space.small:
+                self._first.extend((_Opening(vertices, 2), _Opening(constant, None), _Opening(climb, None)))
+            else:
+                drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
+                self._first.extend((_Opening(vertices, 2), _Opening(constant, 2), _Opening(vertices, 5)))
+                self._first.extend((_Opening(constant, None), _Opening(perturbation, PERTURBATIONS)))
+                self._first.extend((*drawn[:4], _Opening(climb, None), *drawn[4:]))
         elif not random and not graded:
             self._first.extend([_Opening(uniform), _Opening(vertices, 2)] * BLIND)
         self._turn = 0
@@ -237,8 +249,8 @@ class Portfolio:
         self._turn += 1
         if self._turn <= SURROGATE_TURNS:
             if self._turn % 3:
-                return self._surrogate
-            return _rotated(self._others if self._turn % 9 == 0 else self._samplers)
+                return self._leading
+            return _rotated(self._others if self._turn % 9 == 0 else self._drawn)
         if self._turn % 3 == 0:
             return _rotated(self._samplers)
         if self._turn % 3 == 1:

@@ -61,6 +61,11 @@ class SearchSpace:
         """Coordinates that move together while inputs are constant: a group per input or other number."""
         return (*(block.values for block in self.blocks), *((each,) for each in self.rest))
 
+    @property
+    def small(self) -> bool:
+        """True if all vertices of the cube are simulated at the beginning of a search."""
+        return bool(2**self.dim <= MOST_CORNERS)
+
     def visible(self, share: float) -> PartOfSpace:
         """The part of the space in which inputs are varied up to a share of their duration, 0 to 1."""
         kept: list[int] = []
@@ -118,7 +123,7 @@ class SearchSpace:
 
     def corners(self) -> Iterator[Point]:
         """All vertices of the cube, those with most switches of inputs first; none if there are too many."""
-        if 2**self.dim > MOST_CORNERS or not self.blocks:
+        if not self.small or not self.blocks:
             return
         corners = np.array(list(product((1.0, 0.0), repeat=self.dim)))
         switches = np.zeros(len(corners))

@@ -23,8 +23,12 @@ PATIENCE = 60
 """Steps without progress after which a climb starts anew."""
 NARROW, WIDE = 0.01, 0.5
 """Least and greatest step width of a climb, in the unit cube."""
-CMA_WIDTH, CMA_LENGTH, CMA_DIMENSIONS = 0.3, 400, 200
-"""First step width of CMA-ES, evaluations after which it restarts, and coordinates up to which it is used."""
+CMA_WIDTH, CMA_NARROW = 0.3, 0.1
+"""First step width of CMA-ES, in general and in a small space, whose vertices have all been simulated."""
+CMA_LENGTH, CMA_DIMENSIONS = 400, 200
+"""Evaluations after which CMA-ES restarts, and coordinates up to which it is used."""
+PERTURBED = (0.02, 0.05)
+"""Least and greatest width of a perturbation of all values."""
 SHORTEST, LONGEST = 0.01, 0.5
 """Half periods of periodic inputs, as shares of the duration."""
 SWEPT = 12
@@ -224,6 +228,36 @@ class HillClimbing(Strategy):
                 yield list(block.values[first : last + 1])
 
 
+class Perturbation(Strategy):
+    """The best point so far with a small change of all values, mirrored at the ends of their ranges.
+
+    Where robustness varies more between close points than between distant ones, as in a closed loop that
+    chatters, the surroundings of a good vertex hold violations that the vertex itself misses.
+    """
+
+    name = "perturbation"
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._start = _Start()
+
+    def propose(self) -> Point | None:
+        if self._start.point is None:
+            return None
+        low, high = map(math.log, PERTURBED)
+        width = math.exp(self.generator.uniform(low, high))
+        moved = self._start.point + width * self.generator.standard_normal(self.space.dim)
+        mirrored: Point = 1.0 - np.abs(1.0 - np.abs(moved) % 2.0)
+        return mirrored
+
+    def tell(self, point: Point, value: float) -> None:
+        super().tell(point, value)
+        self._start.add(point, value)
+
+    def observe(self, point: Point, value: float) -> None:
+        self._start.add(point, value)
+
+
 def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
     """Coordinates of the neighbours in `values` that share the value at `index`."""
     first = last = index
@@ -392,7 +426,8 @@ class CovarianceAdaptation(Strategy):
         }
         start = self.generator.random(self.space.dim) if self._start.point is None else self._start.point
         self._start = _Start()
-        return cma.CMAEvolutionStrategy(start, CMA_WIDTH, options)
+        width = CMA_NARROW if self.space.small else CMA_WIDTH
+        return cma.CMAEvolutionStrategy(start, width, options)
 
 
 def quantiles_of(times: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from stlc.assurance.strategies import (
     GradientVertices,
     HillClimbing,
     PeriodicInputs,
+    Perturbation,
     VertexSampling,
     quantiles_of,
 )
@@ -127,6 +128,18 @@ def test_a_climb_without_progress_starts_anew():
         strategy.tell(strategy.propose(), 1.0)
     assert len(set(strategy.propose())) <= 5  # a coarse input, far from the point of before
     assert not (strategy.propose() == 0.5).any()
+
+
+def test_perturbations_stay_close_to_the_best_point_and_inside():
+    strategy = Perturbation(TWO, np.random.default_rng(0))
+    assert strategy.propose() is None
+    strategy.observe(np.full(TWO.dim, 0.5), 1.0)
+    best = np.array([0.0, 1.0, 0.0, 1.0, 0.3, 0.0, 1.0])
+    strategy.observe(best, 0.5)
+    points = np.array([strategy.propose() for _ in range(200)])
+    assert ((points >= 0.0) & (points <= 1.0)).all()
+    assert (points[:, [0, 1, 2, 3, 5, 6]] != best[[0, 1, 2, 3, 5, 6]]).all()  # mirrored, not cut off
+    assert 0.01 < np.abs(points - best).mean() < 0.05
 
 
 def test_gradients_lead_to_vertices_while_that_makes_progress():

@@ -85,7 +85,7 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
     )
     portfolio = Portfolio(SearchSpace(16, blocks), np.random.default_rng(0), lambda _: None)
     names, points = [], []
-    for index in range(60):
+    for index in range(80):
         proposal = portfolio.next()
         names.append(proposal.strategy.name)
         points.append(proposal.point)
@@ -94,9 +94,28 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
         names[:11]
         == ["vertices"] * 2 + ["constant vertices"] * 2 + ["vertices"] * 5 + ["constant vertices"] * 2
     )
+    assert names[11:15] == ["perturbation"] * 4
     assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
-    assert names[23:].count("surrogate") == pytest.approx(2 / 3 * len(names[23:]), abs=1.5)
+    assert names[27:].count("surrogate") == pytest.approx(2 / 3 * len(names[27:]), abs=1.5)
     assert {"hill climbing", "periodic"} <= set(names)
+
+
+def test_in_a_small_space_all_vertices_come_first_and_then_a_narrow_search_from_the_best():
+    pytest.importorskip("cma")
+    space = SearchSpace(3, (SignalBlock("reference", (0, 1, 2)),))
+    portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
+    names, points = [], []
+    for _ in range(82):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        points.append(proposal.point)
+        portfolio.tell(proposal, float(np.abs(proposal.point - (0.05, 0.05, 0.95)).sum()))
+    assert names[:10] == ["vertices"] * 2 + ["constant vertices"] * 8
+    assert len({tuple(point) for point in points[2:10]}) == 8
+    later = [names[10:].count(each) for each in ("cma-es", "surrogate", "uniform")]
+    assert later == pytest.approx([48, 8, 8], abs=2)
+    near = [point for name, point in zip(names, points, strict=True) if name == "cma-es"]
+    assert np.abs(np.array(near[:20]) - (0.0, 0.0, 1.0)).mean() < 0.2
 
 
 def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.MonkeyPatch):
