@@ -96,7 +96,7 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
     )
     assert names[11:15] == ["perturbation"] * 4
     assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
-    assert names[27:].count("surrogate") == pytest.approx(2 / 3 * len(names[27:]), abs=1.5)
+    assert names[27:].count("surrogate") == pytest.approx(2 / 3 * len(names[27:]), abs=3)
     assert {"hill climbing", "periodic"} <= set(names)
 
 
