@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.assurance.drive_simulator import DriveSimulator
-from stlc.assurance.falsify import Portfolio, Proposal
+from stlc.assurance.portfolio import Portfolio, Proposal
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.batched import Setting

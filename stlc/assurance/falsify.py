@@ -7,7 +7,7 @@ finds none is no proof; its result says which part of the space was searched.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -18,44 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.guidance import SAMPLES, scales_of
+from stlc.assurance.portfolio import Portfolio, Proposal
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.sensitive import SensitiveClimbing
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus, Simulations, Simulator
-from stlc.assurance.strategies import (
-    PIECES,
-    CoarseSampling,
-    CoarseVertices,
-    ConstantVertices,
-    CovarianceAdaptation,
-    GradientVertices,
-    HillClimbing,
-    PeriodicInputs,
-    Perturbation,
-    Strategy,
-    UniformSampling,
-    VertexSampling,
-)
-from stlc.assurance.surrogate import SurrogateSearch
+from stlc.assurance.strategies import GradientVertices
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
 FALSIFIER_VERSION = 4
 """Version of the search; results of older versions are recomputed."""
-FLAT, FLAT_VALUES = 0.9, 20
-"""Share of equal values, and number of last values, at which robustness counts as flat."""
 CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""
 MOST_PAIRED = 40
 """Coordinates at most whose pairs are counted."""
-OPENING = 12
-"""Points of random pieces with which a search begins, after vertices and constant inputs."""
-PERTURBATIONS = 4
-"""Small perturbations of the best vertex, before these points."""
-SURROGATE_TURNS = 300
-"""Turns after the first points in which the surrogate has most of the points, and not later."""
-BLIND = 3
-"""Triples of a uniform point and two vertices with which a search begins if robustness is no guide."""
 REJECTED = 1000
 """Successive points without an admissible initial state after which a search ends."""
 DIGITS = (0, 1, 2, 3)
@@ -125,160 +101,6 @@ class Falsification:
     rejected: int
     seconds: float
     strategies: dict[str, int]
-
-
-@dataclass(frozen=True, slots=True)
-class Proposal:
-    """Point to simulate, and the strategy that proposes it."""
-
-    strategy: Strategy
-    point: Point
-
-
-@dataclass(frozen=True, slots=True)
-class _Opening:
-    """Points with which a search begins: those of one strategy, as many as given; None: all that it has."""
-
-    strategy: Strategy
-    count: int | None = 1
-
-
-class Portfolio:
-    """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
-
-    Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are random, and
-    the rest goes to the other strategies in turn. In a small space, all of whose vertices come first, two
-    thirds are those of CMA-ES, and the surrogate and random points have a ninth each. Of the points after
-    these a third is random, a third goes to the strategy that has found the least robust point, and a third
-    to all in turn. If the robustness takes few values, as that of conditions on gears does, nothing can be
-    learnt from it: then points are drawn at random. In a space most of whose coordinates have no effect,
-    `SensitiveClimbing` is the only strategy, and points are uniform while the robustness hardly ever changes.
-    """
-
-    def __init__(
-        self,
-        space: SearchSpace,
-        generator: np.random.Generator,
-        gradient: Callable[[Point], Point | None],
-        *,
-        random: bool = False,
-        graded: bool = True,
-    ) -> None:
-        """Take turns between all strategies, or draw random points if `random`.
-
-        Args:
-            space: the search space.
-            generator: source of all random numbers.
-            gradient: function that returns the gradient of the robustness at a point, or None.
-            random: whether all points are uniform in the unit cube, so that the simulated values have the
-                declared distribution.
-            graded: whether the robustness varies with the signals. If it takes only a few values, points are
-                drawn at random.
-        """
-        uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
-        self._surrogate = SurrogateSearch(space, generator)
-        self._leading: Strategy = self._surrogate
-        self._first: deque[_Opening] = deque()
-        self._others: list[Strategy] = []
-        self._late: list[Strategy] = []
-        self._guided = not random and not space.sparse and graded and space.dim > 0
-        self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
-        self._samplers: list[Strategy] = [vertices, uniform]
-        self._drawn: list[Strategy] = []
-        self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
-        if self._guided:
-            if any(len(block.values) > PIECES for block in space.blocks):
-                coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
-                self._samplers = [*coarse, vertices]
-            self._drawn = [*self._samplers]
-            climb = GradientVertices(space, generator, gradient)
-            perturbation = Perturbation(space, generator)
-            self._others = [climb, HillClimbing(space, generator), perturbation]
-            if space.blocks:
-                self._others.append(PeriodicInputs(space, generator))
-            self._late = [*self._others, self._surrogate]
-            if CovarianceAdaptation.available(space):
-                adaptation = CovarianceAdaptation(space, generator)
-                self._late.append(adaptation)
-                if space.small:
-                    self._leading, self._drawn = adaptation, [self._surrogate, uniform]
-                else:
-                    self._others.append(adaptation)
-            constant = ConstantVertices(space, generator)
-            if space.small:
-                self._first.extend((_Opening(vertices, 2), _Opening(constant, None), _Opening(climb, None)))
-            else:
-                drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
-                self._first.extend((_Opening(vertices, 2), _Opening(constant, 2), _Opening(vertices, 5)))
-                self._first.extend((_Opening(constant, None), _Opening(perturbation, PERTURBATIONS)))
-                self._first.extend((*drawn[:4], _Opening(climb, None), *drawn[4:]))
-        elif not random and not graded:
-            self._first.extend([_Opening(uniform), _Opening(vertices, 2)] * BLIND)
-        self._turn = 0
-        self._values: deque[float] = deque(maxlen=FLAT_VALUES)
-
-    @property
-    def flat(self) -> bool:
-        """True if nearly all of the last values are the same."""
-        count = len(self._values)
-        return count > 1 and Counter(self._values).most_common(1)[0][1] >= FLAT * count
-
-    def next(self) -> Proposal:
-        """Return the next point and the strategy that proposes it."""
-        while self._first:
-            opening = self._first.popleft()
-            point = opening.strategy.propose()
-            if point is None:
-                continue
-            if opening.count is None or opening.count > 1:
-                left = None if opening.count is None else opening.count - 1
-                self._first.appendleft(_Opening(opening.strategy, left))
-            return Proposal(opening.strategy, point)
-        while True:
-            strategy = self._chosen()
-            point = strategy.propose()
-            if point is not None:
-                return Proposal(strategy, point)
-
-    def _chosen(self) -> Strategy:
-        """The strategy whose turn it is, after the first points."""
-        if self._sensitive is not None:
-            return self._blind[0] if self.flat else self._sensitive
-        if not self._guided or self.flat:
-            return _rotated(self._blind)
-        self._turn += 1
-        if self._turn <= SURROGATE_TURNS:
-            if self._turn % 3:
-                return self._leading
-            return _rotated(self._others if self._turn % 9 == 0 else self._drawn)
-        if self._turn % 3 == 0:
-            return _rotated(self._samplers)
-        if self._turn % 3 == 1:
-            return min(self._late, key=lambda each: each.best)
-        return _rotated(self._late)
-
-    def observe(self, point: Point, value: float) -> None:
-        """Report the guidance value at a point that no strategy proposed."""
-        for each in self._learning():
-            each.observe(point, value)
-
-    def tell(self, proposal: Proposal, value: float) -> None:
-        """Report the guidance value at a point to its strategy, and to those that learn from others."""
-        self._values.append(value)
-        proposal.strategy.tell(proposal.point, value)
-        for other in self._learning():
-            if other is not proposal.strategy:
-                other.observe(proposal.point, value)
-
-    def _learning(self) -> Sequence[Strategy]:
-        """Strategies that learn from the points of others."""
-        return self._late if self._sensitive is None else (self._sensitive,)
-
-
-def _rotated(strategies: list[Strategy]) -> Strategy:
-    """Return the first strategy of a list, which becomes the last one."""
-    strategies.append(strategies.pop(0))
-    return strategies[-1]
 
 
 class ViolationSearch:

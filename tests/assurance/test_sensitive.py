@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stlc.assurance.falsify import Portfolio
+from stlc.assurance.portfolio import Portfolio
 from stlc.assurance.search_space import SearchSpace
 from stlc.assurance.sensitive import SensitiveClimbing
 

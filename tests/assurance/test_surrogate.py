@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stlc.assurance.falsify import Portfolio
+from stlc.assurance.portfolio import Portfolio
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.strategies import Strategy, UniformSampling
 from stlc.assurance.surrogate import CANDIDATES, RobustnessProcess, SurrogateSearch
@@ -119,7 +119,7 @@ def test_in_a_small_space_all_vertices_come_first_and_then_a_narrow_search_from_
 
 
 def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("stlc.assurance.falsify.SURROGATE_TURNS", 0)
+    monkeypatch.setattr("stlc.assurance.portfolio.SURROGATE_TURNS", 0)
     block = SignalBlock("throttle", tuple(range(8)))
     portfolio = Portfolio(SearchSpace(8, (block,)), np.random.default_rng(0), lambda _: None)
     names = []
