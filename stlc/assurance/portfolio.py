@@ -92,7 +92,7 @@ class Portfolio:
         uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
         self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
         self._samplers: list[Strategy] = [vertices, uniform]
-        if self._guided and any(len(block.values) > PIECES for block in space.blocks):
+        if self._guided and any(len(block.values) > max(PIECES) for block in space.blocks):
             coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
             self._samplers = [*coarse, vertices]
         self._leading: Strategy = self._surrogate

@@ -35,8 +35,8 @@ SWEPT = 12
 """Half periods that are tried before the best is refined."""
 ENDS = 2.0 / 3.0
 """Share of the values of vertices at the ends of their ranges."""
-PIECES = 5
-"""Maximum number of pieces of coarse inputs."""
+PIECES = (1, 2, 3, 5)
+"""Maximum numbers of pieces of coarse inputs; one of them is drawn for each point."""
 
 
 class Strategy(ABC):
@@ -121,7 +121,8 @@ class CoarseSampling(Strategy):
     ends = 0.0
 
     def propose(self) -> Point:
-        labels = self.space.held(self.generator, PIECES)
+        most = PIECES[int(self.generator.integers(len(PIECES)))]
+        labels = self.space.held(self.generator, most)
         return _values(self.space, self.generator, labels, self.ends)
 
 
