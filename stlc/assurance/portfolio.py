@@ -30,6 +30,8 @@ FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
 OPENING = 12
 """Points of random pieces with which a search begins, after vertices and constant inputs."""
+SMALL_OPENING = 4
+"""The same in a small space, all of whose vertices come first."""
 PERTURBATIONS = 4
 """Small perturbations of the best vertex, before these points."""
 SURROGATE_TURNS = 300
@@ -58,8 +60,8 @@ class Portfolio:
     """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
 
     Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are random, and
-    the rest goes to the other strategies in turn. In a small space, all of whose vertices come first, two
-    thirds are those of CMA-ES, and the surrogate and random points have a ninth each. Of the points after
+    the rest goes to the other strategies in turn. In a small space, all of whose vertices come first, four
+    ninths are those of CMA-ES, a third is chosen by the surrogate, and a ninth is random. Of the points after
     these a third is random, a third goes to the strategy that has found the least robust point, and a third
     to all in turn. If the robustness takes few values, as that of conditions on gears does, nothing can be
     learnt from it: then points are drawn at random. In a space most of whose coordinates have no effect,
@@ -95,7 +97,7 @@ class Portfolio:
         if self._guided and any(len(block.values) > max(PIECES) for block in space.blocks):
             coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
             self._samplers = [*coarse, vertices]
-        self._leading: Strategy = self._surrogate
+        self._leading: list[Strategy] = [self._surrogate]
         self._drawn = [*self._samplers]
         self._others: list[Strategy] = []
         self._late: list[Strategy] = []
@@ -110,7 +112,7 @@ class Portfolio:
                 adaptation = CovarianceAdaptation(space, generator)
                 self._late.append(adaptation)
                 if space.small:
-                    self._leading, self._drawn = adaptation, [self._surrogate, uniform]
+                    self._leading, self._drawn = [adaptation, self._surrogate], [adaptation, uniform]
                 else:
                     self._others.append(adaptation)
             constant = ConstantVertices(space, generator)
@@ -130,7 +132,8 @@ class Portfolio:
     ) -> Sequence[_Opening]:
         """Points with which a guided search begins."""
         if space.small:
-            return _Opening(vertices, 2), _Opening(constant, None), _Opening(climb, None)
+            drawn = _Opening(self._samplers[-1], SMALL_OPENING)
+            return _Opening(vertices, 2), _Opening(constant, None), drawn, _Opening(climb, None)
         drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
         return (
             *(_Opening(vertices, 2), _Opening(constant, 2), _Opening(vertices, 5), _Opening(constant, None)),
@@ -169,7 +172,7 @@ class Portfolio:
         self._turn += 1
         if self._turn <= SURROGATE_TURNS:
             if self._turn % 3:
-                return self._leading
+                return _rotated(self._leading)
             return _rotated(self._others if self._turn % 9 == 0 else self._drawn)
         if self._turn % 3 == 0:
             return _rotated(self._samplers)
