@@ -60,6 +60,7 @@ def stirred(actor: ActorNetwork) -> ActorNetwork:
 
 
 ACTORS: dict[str, Callable[[Task], ActorNetwork]] = {"ppo": ppo_actor, "sac": sac_actor, "mbpo": mbpo_actor}
+SOME = ("ppo", *(pytest.param(method, marks=pytest.mark.slow) for method in ("sac", "mbpo")))
 
 
 def run_of(files: tuple[Path, Path], folder: Path, method: str) -> Run:
@@ -101,7 +102,7 @@ def test_the_c_controller_of_an_actor_decides_as_the_guard(
     torch.testing.assert_close(got[:, 4 + rules :].view_as(wanted.plan), wanted.plan, rtol=0.0, atol=1e-3)
 
 
-@pytest.mark.parametrize("method", ACTORS)
+@pytest.mark.parametrize("method", SOME)
 def test_the_runtime_decides_as_the_guard(method: str, tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     run = benchmark("traffic", "car", tmp_path, method)
@@ -138,7 +139,7 @@ def test_the_torch_modules_decide_as_the_policy(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ACTORS)
+@pytest.mark.parametrize("method", SOME)
 def test_the_torch_program_of_an_actor(method: str, tmp_path: Path) -> None:
     run = benchmark("traffic", "car", tmp_path, method)
     done = export(run, "torch", tmp_path / "out")

@@ -64,7 +64,10 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: b
 
 @compiled
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
-@pytest.mark.parametrize(("spec", "system"), [("traffic", "car"), ("manipulation", "panda")])
+@pytest.mark.parametrize(
+    ("spec", "system"),
+    [("traffic", "car"), pytest.param("manipulation", "panda", marks=pytest.mark.slow)],
+)
 def test_the_header_may_be_included_from_cpp(spec: str, system: str, tmp_path: Path) -> None:
     run = run_of(spec, system, tmp_path)
     folder = export(run, "c", tmp_path / "out").folder

@@ -336,6 +336,7 @@ def test_margins_may_be_the_standard_output(there: RunDir, capsys: pytest.Captur
     assert "of 8 drives obeyed every rule" in captured.err
 
 
+@pytest.mark.slow
 def test_the_disturbed_scenarios_of_every_system(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", there.name, *SMALL, "--scenario", "disturbed", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
