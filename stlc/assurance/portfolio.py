@@ -132,8 +132,8 @@ class Portfolio:
     ) -> Sequence[_Opening]:
         """Points with which a guided search begins."""
         if space.small:
-            drawn = _Opening(self._samplers[-1], SMALL_OPENING)
-            return _Opening(vertices, 2), _Opening(constant, None), drawn, _Opening(climb, None)
+            uniform = _Opening(self._samplers[-1], SMALL_OPENING)
+            return _Opening(vertices, 2), _Opening(constant, None), uniform, _Opening(climb, None)
         drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
         return (
             *(_Opening(vertices, 2), _Opening(constant, 2), _Opening(vertices, 5), _Opening(constant, None)),
