@@ -166,7 +166,22 @@ class _Start:
         return self._best[index][2]
 
 
-class HillClimbing(Strategy):
+class LocalSearch(Strategy):
+    """Search that starts from the best of the points so far, whichever strategy has found it."""
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._start = _Start()
+
+    def tell(self, point: Point, value: float) -> None:
+        super().tell(point, value)
+        self._start.add(point, value)
+
+    def observe(self, point: Point, value: float) -> None:
+        self._start.add(point, value)
+
+
+class HillClimbing(LocalSearch):
     """Steps from one of the best points so far: in single values, or in pieces and runs of successive values.
 
     After `PATIENCE` steps without progress it starts anew from the best of `STARTS` later points.
@@ -188,14 +203,10 @@ class HillClimbing(Strategy):
         return self._neighbour(self._start.one_of_the_best(self.generator))
 
     def tell(self, point: Point, value: float) -> None:
-        super().tell(point, value)
         self._failed = 0 if value < self._start.value else self._failed + 1
-        self._start.add(point, value)
+        super().tell(point, value)
         if self._failed > PATIENCE:
             self._restart()
-
-    def observe(self, point: Point, value: float) -> None:
-        self._start.add(point, value)
 
     def _neighbour(self, point: Point) -> Point:
         """Copy of a point with a few coordinates, or with a run of successive values of an input, changed."""
@@ -229,7 +240,7 @@ class HillClimbing(Strategy):
                 yield list(block.values[first : last + 1])
 
 
-class Perturbation(Strategy):
+class Perturbation(LocalSearch):
     """The best point so far with a small change of all values, mirrored at the ends of their ranges.
 
     Where robustness varies more between close points than between distant ones, as in a closed loop that
@@ -237,10 +248,6 @@ class Perturbation(Strategy):
     """
 
     name = "perturbation"
-
-    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
-        super().__init__(space, generator)
-        self._start = _Start()
 
     def propose(self) -> Point | None:
         if self._start.point is None:
@@ -250,13 +257,6 @@ class Perturbation(Strategy):
         moved = self._start.point + width * self.generator.standard_normal(self.space.dim)
         mirrored: Point = 1.0 - np.abs(1.0 - np.abs(moved) % 2.0)
         return mirrored
-
-    def tell(self, point: Point, value: float) -> None:
-        super().tell(point, value)
-        self._start.add(point, value)
-
-    def observe(self, point: Point, value: float) -> None:
-        self._start.add(point, value)
 
 
 def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
@@ -269,7 +269,7 @@ def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
     return list(values[first : last + 1])
 
 
-class GradientVertices(Strategy):
+class GradientVertices(LocalSearch):
     """Vertices of the cube to which the gradient at the best point so far leads, while that makes progress.
 
     They minimise the linearised robustness over the whole cube, as the steps of Frank and Wolfe (1956) do.
@@ -282,7 +282,7 @@ class GradientVertices(Strategy):
     ) -> None:
         """Search with a function that returns the gradient of the robustness at a point, or None."""
         super().__init__(space, generator)
-        self._gradient, self._start = gradient, _Start()
+        self._gradient = gradient
         self._last: Point | None = None
 
     def propose(self) -> Point | None:
@@ -294,13 +294,6 @@ class GradientVertices(Strategy):
             return None
         target = np.where(slope < 0.0, 1.0, np.where(slope > 0.0, 0.0, start))
         return None if np.array_equal(target, start) else target
-
-    def tell(self, point: Point, value: float) -> None:
-        super().tell(point, value)
-        self._start.add(point, value)
-
-    def observe(self, point: Point, value: float) -> None:
-        self._start.add(point, value)
 
 
 class PeriodicInputs(Strategy):
@@ -371,7 +364,7 @@ def _van_der_corput(index: int) -> float:
     return int(f"{index:b}"[::-1], 2) / (1 << index.bit_length())
 
 
-class CovarianceAdaptation(Strategy):
+class CovarianceAdaptation(LocalSearch):
     """CMA-ES (Hansen and Ostermeier 2001) in the unit cube, by the package `cma`.
 
     It starts from the best point so far, and then from the best of later ones.
@@ -385,7 +378,6 @@ class CovarianceAdaptation(Strategy):
         self._asked: list[Point] = []
         self._open: list[Point] = []
         self._told: list[tuple[Point, float]] = []
-        self._start = _Start()
 
     @classmethod
     def available(cls, space: SearchSpace) -> bool:
@@ -404,16 +396,12 @@ class CovarianceAdaptation(Strategy):
 
     def tell(self, point: Point, value: float) -> None:
         super().tell(point, value)
-        self._start.add(point, value)
         if any(point is each for each in self._asked):
             self._told.append((point, value))
         if self._told and len(self._told) == len(self._asked):
             finite = [min(value, 1e9) for _, value in self._told]
             self._search.tell([each for each, _ in self._told], finite)
             self._asked, self._told = [], []
-
-    def observe(self, point: Point, value: float) -> None:
-        self._start.add(point, value)
 
     def _started(self) -> Any:
         with warnings.catch_warnings():
