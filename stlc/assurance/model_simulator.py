@@ -16,6 +16,7 @@ from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir.support import columns as columns_read_by
 from stlc.controller.planning.planner import PlanResult
 from stlc.controller.planning.traces import trace_of
 from stlc.controller.problem.load import load_task
@@ -81,9 +82,9 @@ class ModelSimulator:
             found = self.points.coordinates_of(each.values)
             first = self._time_coordinates(each.times)
             if len(found) == len(each.values):
-                shares = [float(end / each.duration) for end in each.ends[: each.points]]
+                shares = tuple(float(end / each.duration) for end in each.ends[: each.points])
                 values = tuple(found[name] for name in each.values)
-                blocks.append(SignalBlock(each.name, values, first, () if first else tuple(shares)))
+                blocks.append(SignalBlock(each.name, values, first, () if first else shares, each.lead))
         return SearchSpace(self.points.dim, tuple(blocks))
 
     def _time_coordinates(self, names: Sequence[str]) -> tuple[int, ...]:
@@ -113,11 +114,12 @@ class ModelSimulator:
 
     def seen(self, requirement: int) -> float:
         """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
-        inputs = self.task.system.decl.inputs
+        inputs, rule = self.task.system.decl.inputs, self.task.rules[requirement]
         if not inputs:
             return 1.0
+        reads = columns_read_by(rule.formula) & {each.name for each in inputs}  # also at the last sample
         longest = max(float(each.duration) for each in inputs)
-        return min(self.task.rules[requirement].reach * self.task.system.dt / longest, 1.0)
+        return min((rule.reach + bool(reads)) * self.task.system.dt / longest, 1.0)
 
     def graded(self, requirement: int) -> bool:
         """True if the robustness varies with real signals, rather than with whole numbers."""

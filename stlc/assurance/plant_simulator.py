@@ -26,11 +26,7 @@ from stlc.plants.plant import Plant, PlantFinding, PlantRun
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.dynamics.declaration.inputs import InputDecl
     from stlc.trace import Trace
-
-_AHEAD = {"hold": 0, "linear": 1, "pchip": 2}
-"""Pieces by which a value of an input signal affects the signal before its own time, by interpolation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +162,7 @@ class PlantSimulator:
                 shares = tuple(float(end / signal.duration) for end in signal.ends[: signal.points])
                 values = tuple(place[name] for name in signal.values)
                 times = tuple(place[name] for name in signal.times)
-                blocks.append(SignalBlock(signal.name, values, times, () if times else shares))
+                blocks.append(SignalBlock(signal.name, values, times, () if times else shares, signal.lead))
         return SearchSpace(len(place), tuple(blocks))
 
     @cached_property
@@ -181,16 +177,14 @@ class PlantSimulator:
     def seen(self, requirement: int) -> float:
         """Share of the duration, at most 1, after which values of inputs no longer affect a requirement.
 
-        An input may affect outputs at the same time, so the last sample that the requirement reads counts. An
-        interpolated signal depends on values that lie ahead.
+        An input may affect outputs at the same time, so the last sample that the requirement reads counts.
         """
         decl = self.plant.decl
         compiled = self.monitor.compiled
         read_by = (compiled.requirements[requirement], *compiled.assumptions)
         if not decl.free or any(_reads_everything(rule) for rule in read_by):
             return 1.0
-        read = (max(rule.reach for rule in read_by) + 1) * float(decl.dt) / float(decl.duration)
-        return min(read + max(_ahead(signal) for signal in decl.free), 1.0)
+        return min((max(rule.reach for rule in read_by) + 1) * float(decl.dt) / float(decl.duration), 1.0)
 
     def graded(self, requirement: int) -> bool:  # noqa: ARG002
         """True: the outputs of a plant are real numbers."""
@@ -262,8 +256,3 @@ def _reads_everything(rule: CompiledRequirement) -> bool:
     """True if a requirement reads a simulation to its end, whatever its length."""
     ahead = (node for node in nodes(rule.formula) if isinstance(node, ir.Windowed) and not node.back)
     return rule.windowed or rule.uses_end or any(node.window.hi is None for node in ahead)
-
-
-def _ahead(signal: InputDecl) -> float:
-    """Share of the duration by which a value of an input signal affects the signal before its own time."""
-    return _AHEAD[signal.interpolate] / signal.pieces

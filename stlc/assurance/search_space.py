@@ -27,13 +27,21 @@ class SignalBlock:
         name: name of the input signal.
         values: coordinates of its values, in the order of time, (pieces,).
         times: coordinates of its free switching times, in the order of time; empty if they are fixed.
-        fractions: start of each piece as a share of the signal's duration if the times are fixed, (pieces,).
+        fractions: times of the values as shares of the signal's duration if the times are fixed, (pieces,).
+        lead: number of pieces by which a value acts before its time, where the signal is interpolated.
     """
 
     name: str
     values: tuple[int, ...]
     times: tuple[int, ...] = ()
     fractions: tuple[float, ...] = ()
+    lead: int = 0
+
+    def acting_before(self, share: float) -> int:
+        """Number of the values, at least one, that act before a share of the duration, 0 to 1."""
+        if self.times or not self.fractions:
+            return len(self.values)
+        return min(max(sum(each < share for each in self.fractions), 1) + self.lead, len(self.values))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,16 +80,9 @@ class SearchSpace:
         blocks = []
         dropped = set()
         for block in self.blocks:
-            count = (
-                sum(1 for each in block.fractions if each < share) if block.fractions else len(block.values)
-            )
-            count = max(count, 1)
-            dropped |= set(block.values[count:]) if not block.times else set()
-            blocks.append(
-                block
-                if block.times
-                else replace(block, values=block.values[:count], fractions=block.fractions[:count])
-            )
+            count = block.acting_before(share)
+            dropped |= set(block.values[count:])
+            blocks.append(replace(block, values=block.values[:count], fractions=block.fractions[:count]))
         kept = [each for each in range(self.dim) if each not in dropped]
         index = {old: new for new, old in enumerate(kept)}
         moved = tuple(

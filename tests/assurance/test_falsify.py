@@ -88,6 +88,27 @@ def test_inputs_after_the_last_sample_that_matters_are_not_searched():
     assert (found.found.point[2:10] == 0.5).all() or (found.found.point[3:] == 0.5).all()
 
 
+@pytest.mark.parametrize(("interpolate", "kept"), [("hold", 2), ("linear", 3), ("pchip", 4)])
+def test_exactly_the_values_that_a_requirement_sees_are_searched(interpolate, kept):
+    """Always up to 2 s, with values every second: a line from 1 s to 2 s leads to the value at 2 s."""
+    keys = {"inputs.f.interpolate": interpolate, "inputs.f.pieces": "10"}
+    simulator = ModelSimulator.load("oscillator.stl", None, keys)
+    early = simulator.requirements.index("early")
+    part = simulator.space.visible(simulator.seen(early))
+    (block,) = part.space.blocks
+    assert len(block.values) == kept
+    rising = np.linspace(0.6, 0.9, simulator.space.dim) * np.ones((simulator.space.dim, 1))
+    first = simulator.simulate(rising, Focus(early)).margins
+    changed = simulator.simulate(rising + 0.01 * np.eye(simulator.space.dim), Focus(early)).margins != first
+    assert set(np.flatnonzero(changed)) == set(part.coordinates)
+
+
+def test_an_input_that_a_requirement_reads_counts_at_the_last_sample():
+    Path("read.stl").write_text(SPEC.replace("x < 0.9", "x + 0.01 * f < 0.9"))
+    simulator = ModelSimulator.load("read.stl", None, {})
+    assert len(simulator.space.visible(simulator.seen(2)).space.blocks[0].values) == 3
+
+
 def test_a_search_without_success_reports_what_it_did():
     simulator = ModelSimulator.load("oscillator.stl", None, {})
     found = falsify(simulator, 1, budget=SearchBudget(12), seed=0)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -53,6 +55,14 @@ def test_inputs_beyond_the_horizon_of_a_requirement_are_not_searched():
     assert [block.values for block in part.space.blocks] == [(0, 1), (2, 3)]
     assert part.whole(np.arange(5.0)).tolist() == [0.0, 1.0, 0.5, 2.0, 3.0, 0.5, 4.0]
     assert TWO.visible(1.0).space == TWO
+
+
+@pytest.mark.parametrize(("lead", "acting"), [(0, [1, 1, 2, 4]), (1, [2, 2, 3, 5]), (2, [3, 3, 4, 5])])
+def test_interpolated_values_act_before_their_time(lead, acting):
+    """A line to the value at 3/4 begins at 1/2, and a cubic polynomial depends on one value more."""
+    block = SignalBlock("throttle", tuple(range(5)), fractions=(0.0, 0.25, 0.5, 0.75, 1.0), lead=lead)
+    assert [block.acting_before(share) for share in (0.0, 0.25, 0.5, 1.0)] == acting
+    assert replace(block, times=(5, 6, 7)).acting_before(0.25) == 5
 
 
 @given(st.integers(0, 1000))

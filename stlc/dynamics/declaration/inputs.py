@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 Interpolate: TypeAlias = Literal["hold", "linear", "pchip"]
 MAX_PIECES = 500
+_LEADS = {"hold": 0, "linear": 1, "pchip": 2}
 SLACK = 1e-9
 """Share of the duration by which a sample may precede a switching time that it is meant to coincide with."""
 
@@ -72,6 +73,11 @@ class InputDecl:
     def points(self) -> int:
         """Number of values."""
         return self.pieces if self.interpolate == "hold" else self.pieces + 1
+
+    @property
+    def lead(self) -> int:
+        """Number of pieces by which a value acts before its own time, by interpolation."""
+        return _LEADS[self.interpolate]
 
     @property
     def moves(self) -> bool:
