@@ -24,7 +24,7 @@ from stlc.assurance.strategies import (
     UniformSampling,
     VertexSampling,
 )
-from stlc.assurance.surrogate import SurrogateSearch
+from stlc.assurance.surrogate import SurrogateSearch, TrustRegionSearch
 
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
@@ -59,13 +59,14 @@ class _Opening:
 class Portfolio:
     """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
 
-    Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are random, and
-    the rest goes to the other strategies in turn. In a small space, all of whose vertices come first, four
-    ninths are those of CMA-ES, a third is chosen by the surrogate, and a ninth is random. Of the points after
-    these a third is random, a third goes to the strategy that has found the least robust point, and a third
-    to all in turn. If the robustness takes few values, as that of conditions on gears does, nothing can be
-    learnt from it: then points are drawn at random. In a space most of whose coordinates have no effect,
-    `SensitiveClimbing` is the only strategy, and points are uniform while the robustness hardly ever changes.
+    Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogates of the whole space and of a
+    trust region, two ninths are random, and the rest goes to the other strategies in turn. In a small space,
+    all of whose vertices come first, four ninths are those of CMA-ES, a third is chosen by the surrogate, and
+    a ninth is random. Of the points after these a third is random, a third goes to the strategy that has
+    found the least robust point, and a third to all in turn. If the robustness takes few values, as that of
+    conditions on gears does, nothing can be learnt from it: then points are drawn at random. In a space most
+    of whose coordinates have no effect, `SensitiveClimbing` is the only strategy, and points are uniform
+    while the robustness hardly ever changes.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class Portfolio:
             graded: whether the robustness varies with the signals. If it takes only a few values, points are
                 drawn at random.
         """
-        self._surrogate = SurrogateSearch(space, generator)
+        surrogate = SurrogateSearch(space, generator)
         self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
         self._guided = not random and not space.sparse and graded and space.dim > 0
         uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
@@ -97,7 +98,7 @@ class Portfolio:
         if self._guided and any(len(block.values) > max(PIECES) for block in space.blocks):
             coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
             self._samplers = [*coarse, vertices]
-        self._leading: list[Strategy] = [self._surrogate]
+        self._leading: list[Strategy] = [surrogate]
         self._drawn = [*self._samplers]
         self._others: list[Strategy] = []
         self._late: list[Strategy] = []
@@ -107,12 +108,14 @@ class Portfolio:
             self._others = [climb, HillClimbing(space, generator), perturbation]
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
-            self._late = [*self._others, self._surrogate]
+            if not space.small:
+                self._leading.append(TrustRegionSearch(space, generator))
+            self._late = [*self._others, *self._leading]
             if CovarianceAdaptation.available(space):
                 adaptation = CovarianceAdaptation(space, generator)
                 self._late.append(adaptation)
                 if space.small:
-                    self._leading, self._drawn = [adaptation, self._surrogate], [adaptation, uniform]
+                    self._leading, self._drawn = [adaptation, surrogate], [adaptation, uniform]
                 else:
                     self._others.append(adaptation)
             constant = ConstantVertices(space, generator)

@@ -1,13 +1,15 @@
 """Search by a surrogate: a Gaussian process of the robustness chooses which of many candidates is simulated.
 
 A simulation tells more than whether its point is better than the best one. A Gaussian process (Rasmussen and
-Williams 2006), fitted to all points so far, predicts the robustness of candidates with an uncertainty. The
-candidate with the least lower confidence bound (Srinivas and others 2010) is simulated.
+Williams 2006), fitted to all points so far or to those near a good one, predicts the robustness of candidates
+with an uncertainty. The candidate with the least lower confidence bound (Srinivas and others 2010) is
+simulated.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -30,6 +32,12 @@ CANDIDATES = 200
 """Candidates of a proposal: one half neighbours of the best points, the other half random ones."""
 BOLDNESS = (0.0, 1.0, 1.0, 3.0)
 """Standard deviations below the mean at which candidates are compared; one of these is drawn each time."""
+NEAREST = 60
+"""Points at most to which the process of a trust region is fitted."""
+FIRST_WIDTH, LEAST_WIDTH, MOST_WIDTH = 0.2, 0.02, 0.5
+"""Standard deviations of the changes in a trust region: at first, and their bounds."""
+WIDENED, NARROWED, FAILURES = 1.5, 0.7, 8
+"""Factors of the width after progress, and after this number of proposals without any."""
 DIGITS = 6
 """Decimal digits of what is compared, so that rounding, which depends on the machine, decides nothing."""
 
@@ -122,20 +130,36 @@ class SurrogateSearch(HillClimbing):
     def propose(self) -> Point:
         if self._start.point is None:
             return self._coarse[0].propose()
-        values = np.array(self._values)
-        kept = np.argsort(values, kind="stable")[:FITTED]
-        self._process.fit(np.array(self._points)[kept], _normal_scores(values[kept]))
-        candidates = self._candidates()
-        means, deviations = self._process.predict(np.array(candidates))
-        bounds = means - self.generator.choice(BOLDNESS) * deviations
-        return candidates[int(np.argmin(np.round(bounds, DIGITS)))]
+        kept = np.argsort(np.array(self._values), kind="stable")[:FITTED]
+        return self._least(self._process, kept, self._candidates(), BOLDNESS)
+
+    def _least(
+        self,
+        process: RobustnessProcess,
+        rows: NDArray[np.int64],
+        candidates: Sequence[Point],
+        boldness: Sequence[float],
+    ) -> Point:
+        """The candidate that a process, fitted to some of the points, expects to be the least robust.
+
+        Args:
+            process: the process, which is fitted.
+            rows: indices of these points.
+            candidates: the candidates; those that were simulated count only if there are no others.
+            boldness: standard deviations below the mean, one of which is drawn.
+        """
+        new = [each for each in candidates if each.tobytes() not in self._known] or candidates
+        process.fit(np.array(self._points)[rows], _normal_scores(np.array(self._values)[rows]))
+        means, deviations = process.predict(np.array(new))
+        bounds = means - self.generator.choice(boldness) * deviations
+        return new[int(np.argmin(np.round(bounds, DIGITS)))]
 
     def _candidates(self) -> list[Point]:
-        """New points; if there are none, as in a small space of whole numbers, known ones."""
+        """Neighbours of the best points, and random ones."""
         generator, near = self.generator, CANDIDATES // 2
         found = [self._neighbour(self._start.one_of_the_best(generator)) for _ in range(near)]
         found += [self._samplers[index % len(self._samplers)].propose() for index in range(CANDIDATES - near)]
-        return [each for each in found if each.tobytes() not in self._known] or found
+        return found
 
     def tell(self, point: Point, value: float) -> None:
         self.best = min(self.best, value)
@@ -146,3 +170,46 @@ class SurrogateSearch(HillClimbing):
         self._points.append(point)
         self._values.append(value)
         self._known.add(point.tobytes())
+
+
+class TrustRegionSearch(SurrogateSearch):
+    """The same around one of the best points: a process of the points near it, and candidates close to it.
+
+    A process of the whole space is too smooth where robustness changes fast. The candidates' distance grows
+    with progress and shrinks without, as in the trust regions of Eriksson and others (2019).
+    """
+
+    name = "trust region"
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._width, self._least_before, self._failures = FIRST_WIDTH, math.inf, 0
+
+    def propose(self) -> Point:
+        if self._start.point is None:
+            return self._coarse[0].propose()
+        self._adapt()
+        centre = self._start.one_of_the_best(self.generator)
+        distances = _distances(centre[None], np.array(self._points))[0]
+        near = np.argsort(np.round(distances, DIGITS), kind="stable")[:NEAREST]
+        candidates = [self._moved(centre) for _ in range(CANDIDATES)]
+        return self._least(RobustnessProcess(), near, candidates, (0.0, 1.0))
+
+    def _adapt(self) -> None:
+        """Widen the region if there was progress since the last proposal, and narrow it if there is none."""
+        if self._start.value < self._least_before:
+            self._width, self._failures = min(WIDENED * self._width, MOST_WIDTH), 0
+            self._least_before = self._start.value
+            return
+        self._failures += 1
+        if self._failures >= FAILURES:
+            self._width, self._failures = max(NARROWED * self._width, LEAST_WIDTH), 0
+
+    def _moved(self, centre: Point) -> Point:
+        """Copy of a point with about two to half of its coordinates changed."""
+        generator, dim = self.generator, self.space.dim
+        changed = generator.random(dim) < max(2.0 / dim, 0.5 * generator.random())
+        changed[generator.integers(dim)] = True
+        steps = np.where(changed, self._width * generator.standard_normal(dim), 0.0)
+        moved: Point = np.clip(centre + steps, 0.0, 1.0)
+        return moved

@@ -8,7 +8,7 @@ import pytest
 from stlc.assurance.portfolio import Portfolio
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.strategies import Strategy, UniformSampling
-from stlc.assurance.surrogate import CANDIDATES, RobustnessProcess, SurrogateSearch
+from stlc.assurance.surrogate import CANDIDATES, RobustnessProcess, SurrogateSearch, TrustRegionSearch
 
 DIM = 6
 TARGET = np.linspace(0.15, 0.85, DIM)
@@ -79,6 +79,41 @@ def test_rounding_of_the_machine_decides_nothing():
     assert CANDIDATES > DIM
 
 
+def test_a_trust_region_narrows_without_progress_and_widens_with_it():
+    strategy = TrustRegionSearch(SearchSpace(DIM), np.random.default_rng(1))
+    centre = np.full(DIM, 0.5)
+    strategy.tell(centre, 0.0)
+    farther = np.random.default_rng(2).random((20, DIM))
+    for point in farther:
+        strategy.observe(point, 1.0)
+
+    def distance():
+        found = [np.abs(strategy.propose() - centre).max() for _ in range(16)]
+        return float(np.median(found))
+
+    first, last = distance(), [distance() for _ in range(8)][-1]
+    assert last < 0.5 * first
+    strategy.observe(centre, -1.0)
+    assert distance() > last
+
+
+def test_a_trust_region_ends_in_a_narrow_valley_that_is_noise_for_the_whole_space():
+    def rugged(point):
+        apart = np.abs(point - 0.37)
+        return float(apart.sum() + 0.3 * np.cos(40.0 * point).sum())
+
+    least = {}
+    for kind in (TrustRegionSearch, SurrogateSearch):
+        strategy = kind(SearchSpace(DIM), np.random.default_rng(0))
+        for point in np.random.default_rng(5).random((30, DIM)):
+            strategy.observe(point, rugged(point))
+        for _ in range(70):
+            point = strategy.propose()
+            strategy.tell(point, rugged(point))
+        least[kind] = strategy.best
+    assert least[TrustRegionSearch] < least[SurrogateSearch]
+
+
 def test_a_search_begins_with_vertices_and_opposite_constants():
     blocks = tuple(
         SignalBlock(name, tuple(range(at, at + 8))) for name, at in (("throttle", 0), ("brake", 8))
@@ -96,7 +131,8 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
     )
     assert names[11:15] == ["perturbation"] * 4
     assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
-    assert names[27:].count("surrogate") == pytest.approx(2 / 3 * len(names[27:]), abs=3)
+    for surrogate in ("surrogate", "trust region"):
+        assert names[27:].count(surrogate) == pytest.approx(1 / 3 * len(names[27:]), abs=2)
     assert {"hill climbing", "periodic"} <= set(names)
 
 
@@ -127,9 +163,9 @@ def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.M
     for index in range(90):
         proposal = portfolio.next()
         names.append(proposal.strategy.name)
-        progress = 0.01 * index if names[-1] == "hill climbing" else 0.0
+        progress = 5.0 if names[-1] == "hill climbing" else 0.0
         portfolio.tell(proposal, 1.0 + index % 7 - progress)
     late = names[-60:]
     drawn = sum(late.count(each) for each in ("coarse", "coarse vertices", "vertices"))
     assert drawn == pytest.approx(20, abs=3)  # more, as some strategies have nothing to propose
-    assert late.count("hill climbing") > late.count("surrogate") > 3
+    assert late.count("hill climbing") > 20 > late.count("surrogate") >= 3
