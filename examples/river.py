@@ -43,6 +43,7 @@ from stlc.controller.streams import Streams
 
 OBSTACLES = 100
 PROPOSED = 64  # starts drawn for a ship, of which the first admissible one is taken
+ATTEMPTS = 20  # times that they are drawn at most
 SPACING = 7.5  # of SafeRiver
 BEHIND = 1.0  # m that a ship of TrackRiver must be ahead of an obstacle
 NEAREST, FARTHEST = 15.0, 25.0  # from one obstacle of TrackRiver to the next
@@ -75,18 +76,19 @@ class River(ABC):
     def reset(self) -> torch.Tensor:
         """Draw a new river and its ships, all at x = 0."""
         self.streams = Streams.of(self.generator, self.agents)
-        proposed = self._calmed(self.streams.states(self.system, PROPOSED))
-        self.first = proposed[0, self._allowed(proposed[0])]
+        for _ in range(ATTEMPTS):
+            proposed = self._proposed()
+            self.first = proposed[0, self._allowed(proposed[0])]
+            if len(self.first):
+                break
         self.chain = self._chain()
         self.next = torch.zeros(self.agents, dtype=torch.int64)
-        return self._begun(torch.stack([self._start(own) for own in proposed]))
+        return self._begun(self._starts(proposed, torch.arange(self.agents)))
 
     def redraw(self, rows: torch.Tensor) -> torch.Tensor:
         """Redraw the starts of ships `rows` (k,) on the same river; return all states, (agents, n)."""
-        proposed = self._calmed(self.streams.states(self.system, PROPOSED))[rows]
-        return self._begun(
-            self.state.index_copy(0, rows, torch.stack([self._start(own) for own in proposed]))
-        )
+        starts = self._starts(self._proposed()[rows], rows)
+        return self._begun(self.state.index_copy(0, rows, starts))
 
     def advance(self, x: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Advance every ship by one model step; (agents, n), (agents, m) -> (agents, n)."""
@@ -173,13 +175,30 @@ class River(ABC):
         self.begin, self.state, self.hit = x[:, self.at["x"]], x, self._touching(x)
         return x
 
-    def _start(self, proposed: torch.Tensor) -> torch.Tensor:
-        """The first admissible one of the proposed starts (k, n) on this river."""
+    def _proposed(self) -> torch.Tensor:
+        """Starts drawn for every ship, (agents, PROPOSED, n)."""
+        return self._calmed(self.streams.states(self.system, PROPOSED))
+
+    def _starts(self, proposed: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        """Admissible starts of the ships `rows` (k,) on this river, (k, n).
+
+        Each is the first admissible one of the starts (k, PROPOSED, n), or of starts drawn anew: in front of
+        a near and large obstacle only one of seven starts fits.
+        """
+        found = [self._start(own) for own in proposed]
+        for _ in range(ATTEMPTS):
+            starts = [each for each in found if each is not None]
+            if len(starts) == len(found):
+                return torch.stack(starts)
+            again = self._proposed()[rows]
+            found = [self._start(own) if old is None else old for old, own in zip(found, again, strict=True)]
+        raise ValueError("no start of a ship fits in front of the first obstacle of the river")
+
+    def _start(self, proposed: torch.Tensor) -> torch.Tensor | None:
+        """The first admissible one of the proposed starts (k, n) on this river; None if there is none."""
         placed = self._facing(proposed, torch.zeros(len(proposed), dtype=torch.int64))
         allowed = placed[self._allowed(placed)]
-        if not len(allowed):
-            raise ValueError("no start of a ship fits in front of the first obstacle of the river")
-        return allowed[0]
+        return allowed[0] if len(allowed) else None
 
     def _allowed(self, states: torch.Tensor) -> torch.Tensor:
         return self.system.initial.holds(states)

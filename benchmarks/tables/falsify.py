@@ -79,8 +79,9 @@ FINER = {
     "f16": (),
 }
 """Inputs of instance 1, which the tool chooses."""
-COARSE = ("AT6a", "AT6b", "AT6c", "AT6abc")
-"""Requirements for which the inputs of instance 2 are chosen in instance 1, too."""
+THIRTEENTHS = ("inputs.throttle.pieces", "13"), ("inputs.brake.pieces", "13")
+OWN = {**dict.fromkeys(("AT6a", "AT6b", "AT6c", "AT6abc"), ()), **dict.fromkeys(("CC5", "CCx"), THIRTEENTHS)}
+"""Inputs of instance 1 for single requirements: those of the file for AT6, and 13 constant pieces."""
 PRESCRIBED = {"fuel_control_power": (("inputs.throttle.range", "[61.201, 81.2]"),)}
 """Inputs of instance 2 where they are not those of the file.
 
@@ -131,10 +132,10 @@ LONGER = {"CC4": 1500}
 """Requirements whose searches have more simulations, as in the competition."""
 CASES = tuple(
     Case(
-        *(spec, name, instance, () if name in COARSE else changes.get(spec, ())),
+        *(spec, name, instance, own.get(name, changes.get(spec, ()))),
         LONGER.get(name, SIMULATIONS),
     )
-    for instance, changes in ((2, PRESCRIBED), (1, FINER))
+    for instance, changes, own in ((2, PRESCRIBED, {}), (1, FINER, OWN))
     for spec, names in REQUIREMENTS.items()
     if (spec in changes or instance == 2) and (spec in POINTS) <= (instance == 1)
     for name in names

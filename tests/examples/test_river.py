@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,20 @@ def move(world: Any, x: torch.Tensor) -> dict[str, np.ndarray]:
     """One step straight on."""
     after = world.advance(x, torch.zeros(len(x), 2, dtype=torch.float64))
     return dict(zip(world.system.names, after.T.numpy(), strict=True))
+
+
+@pytest.mark.parametrize("file", ["ship_safe", "ship_track"])
+def test_starts_are_drawn_until_one_fits_for_every_ship(file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    world, _ = river(file)
+    module = sys.modules[type(world).__module__]
+    monkeypatch.setattr(module, "PROPOSED", 2)
+    monkeypatch.setattr(module, "ATTEMPTS", 200)
+    for _ in range(10):
+        assert world.system.initial.holds(world.reset()).all()
+        assert world.system.initial.holds(world.redraw(torch.tensor([3, 7]))).all()
+    monkeypatch.setattr(module, "PROPOSED", 0)
+    with pytest.raises(ValueError, match="no start of a ship fits"):
+        world.redraw(torch.tensor([3, 7]))
 
 
 # -------------------------------------------------------------------------- ship-safe
