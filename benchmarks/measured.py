@@ -80,6 +80,7 @@ def measured(
                 if isinstance(error, UsageError):
                     raise
                 failed.append({"name": cell.name, "why": reason(error)})
+                say(f"{cell.name}  broke off: {reason(error)}")
                 continue
             new += 1
             if summary := told(kept):

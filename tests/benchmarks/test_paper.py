@@ -127,7 +127,7 @@ def test_a_missing_package_is_no_result(tmp_path: Path) -> None:
     assert store.all() == {}
 
 
-def test_a_damaged_run_costs_its_own_cell_only(tmp_path: Path) -> None:
+def test_a_damaged_run_costs_its_own_cell_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def damaged(cell: PlanCell) -> dict[str, Any]:
         if cell.seconds == 0.003:
             raise RunError(Diagnostic("R101", "the run is damaged"))
@@ -136,6 +136,7 @@ def test_a_damaged_run_costs_its_own_cell_only(tmp_path: Path) -> None:
     cells = [tiny(), tiny(seconds=0.003), tiny(seconds=0.004)]
     found = planned(cells, ResultStore("plans", tmp_path), measuring=damaged)
     assert (found.new, found.failed) == (2, ({"name": cells[1].name, "why": "the run is damaged"},))
+    assert f"{cells[1].name}  broke off: the run is damaged" in capsys.readouterr().err
 
 
 def test_a_long_cell_is_measured_where_time_helps(tmp_path: Path) -> None:
