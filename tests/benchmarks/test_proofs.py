@@ -24,7 +24,7 @@ def test_a_policy_is_verified_once(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["train", spec, "--method", "guided", "--runs", str(tmp_path), *small.split()]) == 0
     run = str(next(tmp_path.glob("*/0001-*")))
     page = tmp_path / "page.md"
-    line = ["verify", run, "--budget", "0.001s", "--states", "20", "--points", "5", "--out", str(tmp_path)]
+    line = ["verify", run, "--budget", "0.001s", "--states", "8", "--points", "5", "--out", str(tmp_path)]
     capsys.readouterr()
     documents = []
     for _ in range(2):
@@ -34,7 +34,7 @@ def test_a_policy_is_verified_once(tmp_path: Path, capsys: pytest.CaptureFixture
     rows = documents[0]["result"]["rows"]
     assert rows == documents[1]["result"]["rows"]
     assert len(rows) == 7
-    assert sum(row["states"] for row in rows) == 20
+    assert sum(row["states"] for row in rows) == 8
     assert all(row["violations"] == 0 for row in rows)
     assert "| policy | network | initial states |" in page.read_text(encoding="utf-8")
 
