@@ -44,8 +44,7 @@ least robustness over all requirements, and failing drives, of the same number o
 that was trained without falsification. A simulation is a drive of one agent, in traffic a world of 20 cars.
 `fresh`: share of failing drives among fresh ones, with all agents of a world, for that policy and for one
 that was trained with `--falsify` in the same time; intervals of 95 % (Wilson) take drives as independent.
-Benchmarks and entries that are missing were not measured yet; searches with fewer than 2,000 drives, and
-trainings beside them, are from an earlier version, with one search for all requirements.
+Benchmarks and entries that are missing were not measured yet.
 """
 
 
