@@ -81,6 +81,8 @@ class River(ABC):
             self.first = proposed[0, self._allowed(proposed[0])]
             if len(self.first):
                 break
+        else:
+            raise ValueError("no start of the first ship is admissible")
         self.chain = self._chain()
         self.next = torch.zeros(self.agents, dtype=torch.int64)
         return self._begun(self._starts(proposed, torch.arange(self.agents)))
@@ -182,8 +184,8 @@ class River(ABC):
     def _starts(self, proposed: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         """Admissible starts of the ships `rows` (k,) on this river, (k, n).
 
-        Each is the first admissible one of the starts (k, PROPOSED, n), or of starts drawn anew: in front of
-        a near and large obstacle only one of seven starts fits.
+        Each is the first admissible one of the starts (k, PROPOSED, n), or of starts drawn anew: few starts
+        fit in front of a near and large obstacle.
         """
         found = [self._start(own) for own in proposed]
         for _ in range(ATTEMPTS):

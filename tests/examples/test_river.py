@@ -50,6 +50,14 @@ def test_starts_are_drawn_until_one_fits_for_every_ship(file: str, monkeypatch: 
     monkeypatch.setattr(module, "PROPOSED", 0)
     with pytest.raises(ValueError, match="no start of a ship fits"):
         world.redraw(torch.tensor([3, 7]))
+    with pytest.raises(ValueError, match="first ship"):
+        world.reset()
+
+
+@pytest.mark.parametrize("seed", [232, 819, 1121])
+def test_a_river_in_which_the_first_starts_of_a_ship_do_not_fit_begins(seed: int) -> None:
+    world, _ = river("ship_track", seed)
+    assert world.system.initial.holds(world.state).all()
 
 
 # -------------------------------------------------------------------------- ship-safe
