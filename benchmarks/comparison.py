@@ -11,13 +11,17 @@ from statistics import fmean
 
 from benchmarks.claims import OURS, Standing, Upset
 from benchmarks.drives import DriveRow, budget_text
+from benchmarks.options import Training
 from benchmarks.plannings import LONG, SECONDS, PlanRow
 from benchmarks.roster import Contender
 from benchmarks.store import BENCHMARKS
 from benchmarks.table import Columns, listed
 from benchmarks.training import Length
+from stlc.cli.framework.options import parse_seeds
 
 HOUR = 3600.0
+SEEDS = parse_seeds(Training().seeds)
+"""Seeds of the trainings of each method and length; a training of an hour has the first only."""
 PROGRAM = "python -m benchmarks paper"
 
 
@@ -32,6 +36,7 @@ class Learned:
         accuracy: plan accuracy, mean over seeds.
         interval: 95 % confidence interval of the accuracy.
         seconds: training time, mean over seeds.
+        seeds: seeds of the trainings.
         outdated: whether an input, such as the specification, has changed since the measurement.
         fewer: number of judged states as text, such as ` (of 80 states)`; "" if all were judged.
     """
@@ -42,8 +47,13 @@ class Learned:
     accuracy: float
     interval: tuple[float, float]
     seconds: float
+    seeds: tuple[int, ...] = SEEDS
     outdated: bool = False
     fewer: str = ""
+
+    def lacks(self, seeds: Iterable[int]) -> bool:
+        """True if one of `seeds` has not been trained with the present inputs."""
+        return self.outdated or not {*seeds} <= {*self.seeds}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,14 +107,11 @@ def accuracies(
         for seconds in (*budgets, *((HOUR,) if each.hour else ())):
             budget = Length(seconds, clock="processor").text
             own = {name: found.get((each.name, budget, name)) for name in BENCHMARKS}
-            missing = [name for name, cell in own.items() if cell is None or cell.outdated]
-            length = "--hour" if seconds == HOUR else f"--budget {seconds:g}s"
-            lines.append(
-                Line(
-                    *(each.name, budget, {name: _learned_text(cell) for name, cell in own.items()}),
-                    _command(each, missing, length),
-                )
-            )
+            hour = seconds == HOUR
+            seeds, length = (SEEDS[:1], "--hour") if hour else (SEEDS, f"--budget {seconds:g}s")
+            texts = {name: _learned_text(cell, seeds) for name, cell in own.items()}
+            missing = [name for name, cell in own.items() if cell is None or cell.lacks(seeds)]
+            lines.append(Line(each.name, budget, texts, _command(each, missing, length)))
     for each in planners:
         for limit in (None,) if each.evaluations else SECONDS:
             own_rows = {name: rows.get((each.name, limit, name)) for name in BENCHMARKS}
@@ -148,10 +155,14 @@ def _spared(
     return many.accuracy <= few.accuracy
 
 
-def _learned_text(cell: Learned | None) -> str:
+def _learned_text(cell: Learned | None, seeds: Sequence[int]) -> str:
+    """Text of an entry; it names the trained seeds if some of `seeds` are missing."""
     if cell is None:
         return ""
-    return f"{_interval(cell.accuracy, cell.interval)}{cell.fewer}{' (outdated)' if cell.outdated else ''}"
+    partly = not {*seeds} <= {*cell.seeds}
+    own = f" (seed{'s' * (len(cell.seeds) > 1)} {', '.join(map(str, cell.seeds))})" if partly else ""
+    old = " (outdated)" if cell.outdated else ""
+    return f"{_interval(cell.accuracy, cell.interval)}{cell.fewer}{own}{old}"
 
 
 def _planned_text(row: PlanRow | None) -> str:

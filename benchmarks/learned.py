@@ -184,6 +184,7 @@ def learned(results: Sequence[Result]) -> list[Learned]:
     return [
         Learned(
             *(row.benchmark, row.method, row.length, row.accuracy, row.interval, row.seconds),
+            seeds=row.seeds,
             outdated=bool(row.outdated),
             fewer=fewer_text(row.judged, row.held_out),
         )

@@ -19,7 +19,7 @@ from benchmarks.drives import Drive, driven
 from benchmarks.options import Comparing
 from benchmarks.plannings import PlanCell, PlanRow, ceilings, improves, measure, planned
 from benchmarks.roster import Contender, learners, planners, roster
-from benchmarks.store import ResultStore
+from benchmarks.store import BENCHMARKS, ResultStore
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place, _job, pack
 from stlc.controller.parallel.jobs import Job
@@ -260,6 +260,27 @@ def test_an_empty_cell_names_the_command_that_fills_it() -> None:
     assert ten.cells["traffic"] == "0.980 [0.980, 0.980]"
     assert "--only reach_n_avoid,ship_safe," in ten.command
     assert ten.command.endswith("--plan-time 10ms --parts plans")
+
+
+def test_a_cell_of_fewer_seeds_names_them_and_the_command_for_the_rest() -> None:
+    budget = "60 s of processor time"
+    whole = [Learned(name, "guided", budget, 0.9, (0.8, 1.0), 60.0) for name in BENCHMARKS]
+    (line,) = accuracies(learners()[:1], [], whole, [], (60.0,))
+    assert (line.cells["traffic"], line.command) == ("0.900 [0.800, 1.000]", "")
+    partly = [replace(whole[0], seeds=(0, 2)), *whole[1:]]
+    (line,) = accuracies(learners()[:1], [], partly, [], (60.0,))
+    assert line.cells["traffic"] == "0.900 [0.800, 1.000] (seeds 0, 2)"
+    assert line.command == "python -m benchmarks paper --methods guided --only traffic --budget 60s"
+
+
+def test_a_training_of_an_hour_needs_one_seed() -> None:
+    (sac,) = (each for each in learners() if each.hour)
+    whole = [
+        Learned(name, sac.name, "3600 s of processor time", 0.9, (0.8, 1.0), 3600.0, seeds=(0,))
+        for name in BENCHMARKS
+    ]
+    (line,) = accuracies([sac], [], whole, [], ())
+    assert (line.cells["traffic"], line.command) == ("0.900 [0.800, 1.000]", "")
 
 
 # ---------------------------------------------------------------------- figures, closed loop, the command
