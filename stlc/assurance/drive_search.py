@@ -21,12 +21,12 @@ from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, SimulationStep, Watch
 from stlc.controller.training.failures import SearchRound
 from stlc.controller.training.run import Run
-from stlc.native import Stop
+from stlc.native import Stop, never
 
 DRIVE_SEARCH_VERSION = 2
 """Version of the search; results of older versions are recomputed."""
-ROUND = 16
-"""Simulations side by side in a round of a training."""
+ROUND, ROWS = 16, 64
+"""Simulations, and agents of all simulations, side by side at most in a round of a training."""
 PATIENCE = 100
 """Simulations without progress after which a requirement has only its turns."""
 EARLIER = 3
@@ -74,6 +74,7 @@ def search_drives(
     random: bool = False,
     starts: NDArray[np.float64] | None = None,
     seen: Seen = lambda _recording, _margins: None,
+    over: Stop = never,
     watch: Watch | None = None,
 ) -> SearchedDrives:
     """Search for drives that violate any requirement, in `count` simulations.
@@ -91,13 +92,14 @@ def search_drives(
         random: whether points are drawn from the declared distribution only, as a baseline.
         starts: points that are simulated first, (k, dim).
         seen: function that receives the recorded drives of each batch.
+        over: function that is called after each batch; the search ends once it returns True.
         watch: function that is called at every step of the simulations.
     """
     space, generator = simulator.space, np.random.default_rng(seed)
     points, margins = list[Point](), list[NDArray[np.float64]]()
     searches: _Searches | None = None
     first = [] if starts is None else [each for each in starts if each.shape == (space.dim,)][:count]
-    while len(points) < count:
+    while len(points) < count and not (points and over()):
         size = min(simulator.batch, count - len(points))
         asked = [_Asked(each) for each in first[len(points) : len(points) + size]]
         while len(asked) < size:
@@ -184,7 +186,7 @@ class _StoppedError(Exception):
 
 
 def round_of(
-    run: Run, decisions: int, seed: int, starts: NDArray[np.float64], stop: Stop
+    run: Run, simulations: int, seed: int, starts: NDArray[np.float64], over: Stop, stop: Stop
 ) -> SearchRound | None:
     """Search for failing drives of a policy in training, and collect the states where it planned wrongly.
 
@@ -192,9 +194,10 @@ def round_of(
 
     Args:
         run: run with the present policy.
-        decisions: number of decisions of all drives, about.
+        simulations: number of simulations at most.
         seed: seed of the search.
-        starts: points that are simulated first, (p, dim).
+        starts: points that are simulated first, (p, dim); half of the first batch at most.
+        over: function that is called after each batch; no other batch follows once it returns True.
         stop: function that is called at every step; the search ends once it returns True.
 
     Returns:
@@ -202,8 +205,8 @@ def round_of(
     """
     test = run.task.system.decl.test
     setting = Setting((0,), test.agents, test.steps, test.replan)
-    count = max(round(decisions * test.replan / (test.agents * test.steps)), 2)
-    simulator = DriveSimulator(run, "none", setting, batch=min(ROUND, max(count // 2, 1)))
+    batch = min(max(ROWS // test.agents, 2), ROUND)
+    simulator = DriveSimulator(run, "none", setting, batch=batch)
     kept: list[NDArray[np.float64]] = []
 
     def seen(recording: DeploymentRecording, margins: NDArray[np.float64]) -> None:
@@ -215,8 +218,9 @@ def round_of(
 
     try:
         found = search_drives(
-            simulator, count, seed=seed, starts=starts[: count // 2], seen=seen, watch=watch
-        )
+            simulator, simulations, seed=seed, starts=starts[: (batch + 1) // 2], seen=seen, over=over,
+            watch=watch,
+        )  # fmt: skip
     except _StoppedError:
         return None
     states = torch.from_numpy(np.concatenate(kept))

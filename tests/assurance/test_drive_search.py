@@ -88,12 +88,27 @@ def test_numbers_without_a_coordinate_differ_between_points(simulator: DriveSimu
     assert simulator.space.sparse
 
 
+def test_a_search_that_ends_early_is_repeated_by_one_of_as_many_simulations(
+    simulator: DriveSimulator,
+) -> None:
+    asked: list[bool] = []
+    early = search_drives(simulator, 100, seed=5, over=lambda: bool(asked.append(True)) or len(asked) == 2)
+    assert len(early.points) == 2 * simulator.batch
+    again = search_drives(simulator, len(early.points), seed=5)
+    assert np.array_equal(again.points, early.points)
+    assert np.array_equal(again.values, early.values)
+    least = search_drives(simulator, 100, seed=5, over=lambda: True)
+    assert len(least.points) == simulator.batch
+
+
 def test_a_round_returns_states_of_the_system(simulator: DriveSimulator) -> None:
-    found = round_of(simulator.run, 120, 3, np.zeros((0, 0)), never)
+    found = round_of(simulator.run, 2, 3, np.zeros((0, 0)), never, never)
     assert found is not None
     assert found.states.shape[1] == len(simulator.run.task.system.names)
     assert 0 <= found.failing <= found.drives
-    assert round_of(simulator.run, 120, 3, np.zeros((0, 0)), lambda: True) is None
+    assert len(found.points) == 2
+    assert found.drives == 2 * simulator.run.task.system.decl.test.agents
+    assert round_of(simulator.run, 2, 3, np.zeros((0, 0)), never, lambda: True) is None
 
 
 def test_states_of_wrong_decisions_and_some_before_them() -> None:

@@ -13,7 +13,7 @@ import os
 import re
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
@@ -130,7 +130,17 @@ class Planned:
     steps: int
 
 
-_TEXT = re.compile(r"[1-9]\d{0,17}(,[1-9]\d{0,17}@(0|[1-9]\d{0,17}))*")
+@dataclass(frozen=True, slots=True)
+class PlannedDrives:
+    """Entry of a schedule: a round of falsification after step `step` makes `simulations` simulations."""
+
+    step: int
+    simulations: int
+
+
+_DRIVES = "drives="
+_NUMBER = r"(0|[1-9]\d{0,17})"
+_TEXT = re.compile(rf"[1-9]\d{{0,17}}(,({_DRIVES}{_NUMBER}|[1-9]\d{{0,17}})@{_NUMBER})*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +152,12 @@ class StepSchedule:
     Attributes:
         plannings: entries in order. The first is at step 0. If two entries are at the same step, the later
             one applies.
+        drives: rounds of falsification in order (`--falsify`), one for each moment at which a round was due;
+            0 simulations if there was no time for one.
     """
 
     plannings: tuple[Planned, ...]
+    drives: tuple[PlannedDrives, ...] = ()
 
     @classmethod
     def of(cls, steps: int) -> StepSchedule:
@@ -156,7 +169,8 @@ class StepSchedule:
         """Parse the text of a schedule.
 
         `1200` is a fixed number of steps. With `10000,1240@10,900@455` the planned total is 10000 at first,
-        1240 after step 10, and 900 after step 455.
+        1240 after step 10, and 900 after step 455. `drives=6@400` is a round of falsification with 6
+        simulations after step 400.
 
         Raises:
             ValueError: the text is not a schedule, its steps are not in order, or a total is less than the
@@ -165,22 +179,37 @@ class StepSchedule:
         if not _TEXT.fullmatch(text):
             raise ValueError("it is neither a number of steps nor a schedule")
         first, *later = text.split(",")
-        pairs = (part.split("@") for part in later)
-        plannings = (Planned(0, int(first)), *(Planned(int(step), int(steps)) for steps, step in pairs))
+        entries = [part.removeprefix(_DRIVES).split("@") for part in later]
+        rounds = [part.startswith(_DRIVES) for part in later]
+        plannings, drives = [Planned(0, int(first))], list[PlannedDrives]()
+        for is_round, (count, step) in zip(rounds, entries, strict=True):
+            if is_round:
+                drives.append(PlannedDrives(int(step), int(count)))
+            else:
+                plannings.append(Planned(int(step), int(count)))
         for before, after in pairwise(plannings):
             if after.step < before.step or after.step > before.steps:
                 raise ValueError(f"step {after.step} is not between {before.step} and {before.steps}")
             if after.steps < after.step:
                 raise ValueError(f"at step {after.step} there cannot be {after.steps} in all")
-        return cls(plannings)
+        for earlier, later_one in pairwise(drives):
+            if later_one.step < earlier.step:
+                raise ValueError(f"the drives at step {later_one.step} follow those at step {earlier.step}")
+        return cls(tuple(plannings), tuple(drives))
 
     def __str__(self) -> str:
         first, *later = self.plannings
-        return ",".join((str(first.steps), *(f"{each.steps}@{each.step}" for each in later)))
+        entries = [(each.step, f"{each.steps}@{each.step}") for each in later]
+        entries += [(each.step, f"{_DRIVES}{each.simulations}@{each.step}") for each in self.drives]
+        return ",".join((str(first.steps), *(text for _, text in sorted(entries, key=lambda one: one[0]))))
 
     def with_steps(self, step: int, steps: int) -> StepSchedule:
         """This schedule with a further entry: after `step`, the total number of steps is `steps`."""
-        return StepSchedule((*self.plannings, Planned(step, steps)))
+        return replace(self, plannings=(*self.plannings, Planned(step, steps)))
+
+    def with_drives(self, step: int, simulations: int) -> StepSchedule:
+        """This schedule with a further round of falsification after `step`."""
+        return replace(self, drives=(*self.drives, PlannedDrives(step, simulations)))
 
     @property
     def steps(self) -> int:

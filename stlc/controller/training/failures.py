@@ -25,14 +25,16 @@ if TYPE_CHECKING:
     from stlc.controller.training.run import Run
     from stlc.native import Stop
 
-FAILURES_VERSION = 2
+FAILURES_VERSION = 3
 """Version of the rounds and of the use of their states; results of older versions are recomputed."""
 MOMENTS = (0.25, 0.4, 0.55, 0.7, 0.82)
 """Shares of the planned steps after which a round is due."""
+SHARE = 0.2
+"""Share of the training time that rounds may take; a round ends with the first batch of drives beyond it."""
 WORK = 0.06
-"""Decisions of the drives of a round, per training state of the steps since the round before."""
+"""Decisions of the drives of a round at most, per training state of the steps since the round before."""
 LEAST_WORK, MOST_WORK = 500, 100_000
-"""Bounds of the number of decisions of a round."""
+"""Bounds of this number of decisions."""
 KEPT = 8192
 """States kept at most; the oldest are dropped."""
 POINTS = 8
@@ -47,7 +49,7 @@ class SearchRound:
 
     Attributes:
         states: states at which the policy planned wrongly in drives, (k, n) float64.
-        points: points of the least robust simulations, (p, dim).
+        points: points of all simulations, the least robust first, (simulations, dim).
         drives: number of drives.
         failing: number of drives that violated a requirement.
     """
@@ -62,11 +64,20 @@ class FailureSearch(Protocol):
     """Search for failing drives of a policy; `stlc.assurance` supplies it, which is above the training."""
 
     def __call__(
-        self, run: Run, decisions: int, seed: int, starts: NDArray[np.float64], stop: Stop
+        self, run: Run, simulations: int, seed: int, starts: NDArray[np.float64], over: Stop, stop: Stop
     ) -> SearchRound | None:
-        """Search with about `decisions` decisions of the policy; None if `stop` ended the search.
+        """Search with `simulations` simulations of the policy; None if `stop` ended the search.
 
-        `starts`: points of earlier rounds, which are simulated first, (p, dim).
+        The simulations come in batches, which do not depend on their number, so that a search that ended
+        early is repeated by one of as many simulations.
+
+        Args:
+            run: run with the present policy.
+            simulations: number of simulations at most.
+            seed: seed of the search.
+            starts: points of earlier rounds, which are simulated first, (p, dim).
+            over: function that is called after each batch; no other batch follows once it returns True.
+            stop: function that is called at every step; the search ends at once, without a result.
         """
 
 
@@ -77,6 +88,7 @@ class FailureBank:
     Attributes:
         states: kept states, the newest last, (k, n).
         points: points of the least robust simulations of the last round, (p, dim).
+        moment: number of moments at which a round was due that have passed.
         rounds: number of rounds made.
         last: step of the last round.
         drives: number of drives of all rounds.
@@ -87,6 +99,7 @@ class FailureBank:
 
     states: Tensor
     points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    moment: int = 0
     rounds: int = 0
     last: int = 0
     drives: int = 0
@@ -96,36 +109,49 @@ class FailureBank:
 
     def due(self, step: int, steps: int) -> bool:
         """True if a round is due after `step` of `steps` steps."""
-        return self.rounds < len(MOMENTS) and step >= MOMENTS[self.rounds] * steps
+        return self.moment < len(MOMENTS) and step >= MOMENTS[self.moment] * steps
+
+    def simulations(self, run: Run, step: int, states: int) -> int:
+        """Number of simulations of a round after `step` steps, of `states` training states each.
+
+        A time limit may end the round before.
+        """
+        test = run.task.system.decl.test
+        decisions = min(max(WORK * (step - self.last) * states, LEAST_WORK), MOST_WORK)
+        return max(round(decisions * test.replan / (test.agents * test.steps)), 2)
 
     def search(
-        self, search: FailureSearch, run: Run, step: int, states: int, generator: torch.Generator,
-        stop: Stop = never,
-    ) -> bool:  # fmt: skip
-        """Make a round; return False, without any effect, if `stop` ended it early.
+        self, search: FailureSearch, run: Run, step: int, simulations: int, generator: torch.Generator,
+        over: Stop = never, stop: Stop = never,
+    ) -> int | None:  # fmt: skip
+        """Make a round and return its number of simulations; None, without any effect, if `stop` ended it.
 
         Args:
             search: search for failing drives.
             run: run with the present policy.
             step: number of completed steps.
-            states: training states of a step.
+            simulations: number of simulations at most; 0: the moment passes without a round.
             generator: source of the seed of the round.
-            stop: function that is called repeatedly; the round ends once it returns True.
+            over: function that is called after each batch of simulations; the round ends once it returns
+                True.
+            stop: function that is called repeatedly; the round is given up once it returns True.
         """
+        if not simulations:
+            self.moment += 1
+            return 0
         before = generator.get_state()
         seed = int(torch.randint(2**31, (), generator=generator))
-        work = int(min(max(WORK * (step - self.last) * states, LEAST_WORK), MOST_WORK))
-        found = search(run, work, seed, self.points, stop)
+        found = search(run, simulations, seed, self.points, over, stop)
         if found is None:
             generator.set_state(before)
-            return False
+            return None
         fresh = found.states.to(self.states)
         self.states = torch.cat((self.states, fresh))[-KEPT:]
         self.points = found.points[:POINTS]
-        self.rounds, self.last = self.rounds + 1, step
+        self.moment, self.rounds, self.last = self.moment + 1, self.rounds + 1, step
         self.drives, self.failing = self.drives + found.drives, self.failing + found.failing
         self.latest = found.failing / max(found.drives, 1)
-        return True
+        return len(found.points)
 
     def mixed(self, fresh: Tensor, generator: torch.Generator) -> Tensor:
         """The states `fresh`, (batch, n), of which kept states replace the last ones."""
@@ -158,7 +184,7 @@ class FailureBank:
 
     def tensors(self) -> dict[str, Tensor]:
         """Tensors from which the rounds continue exactly."""
-        counts = (self.rounds, self.last, self.drives, self.failing, self.repairing)
+        counts = (self.moment, self.rounds, self.last, self.drives, self.failing, self.repairing)
         return {
             "states": self.states,
             "points": torch.from_numpy(self.points.copy()),
@@ -170,5 +196,6 @@ class FailureBank:
         """Restore the state from `tensors`, which the method of this name returned."""
         self.states = tensors["states"].to(self.states.device)
         self.points = tensors["points"].numpy()
-        self.rounds, self.last, self.drives, self.failing, self.repairing = tensors["counts"].tolist()
+        counts = tensors["counts"].tolist()
+        self.moment, self.rounds, self.last, self.drives, self.failing, self.repairing = counts
         self.latest = float(tensors["latest"])

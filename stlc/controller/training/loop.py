@@ -20,6 +20,7 @@ from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, Tim
 from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
 from stlc.controller.training.diagnose import check_mirror, refuted
+from stlc.controller.training.failures import SHARE
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.run import Run, RunWriter, load_config, spec_hash, system_hash, task_of_run
 from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError, usage
@@ -312,6 +313,7 @@ class _Session:
         self.barren = not learner.ranks.any(learner.solved)
         self.refuted: bool | None = None
         self.exhausted = False
+        self.started, self.falsified = self.now(), 0.0  # clock; seconds of rounds of falsification
 
     def finish(self) -> TrainingOutcome:
         """Train to the end, evaluate, and write the status of the run.
@@ -422,11 +424,25 @@ class _Session:
         learner, bank = self.learner, self.learner.failures
         if bank is None or self.failures is None or not bank.due(learner.step, learner.steps):
             return True
-        began, config = self.now(), learner.config
+        began, step = self.now(), learner.step
         run = Run(self.writer.folder, learner.task, learner.policy)
-        states = config.batch + config.hard
-        if not bank.search(self.failures, run, learner.step, states, learner.generator, self.watch.stop):
+        if bank.moment < len(self.schedule.drives):  # a recorded schedule is followed
+            count, allowed = self.schedule.drives[bank.moment].simulations, math.inf
+        else:
+            allowed = SHARE * (began - self.started) - self.falsified if self.time.allowed else math.inf
+            states = learner.config.batch + learner.config.hard
+            count = bank.simulations(run, step, states) if allowed > 0.0 else 0
+        made = bank.search(
+            *(self.failures, run, step, count, learner.generator),
+            over=lambda: self.now() - began >= allowed,
+            stop=self.watch.stop,
+        )
+        if made is None:
             return False
+        if bank.moment > len(self.schedule.drives):
+            self.schedule = self.schedule.with_drives(step, made)
+            self._note_schedule()
+        self.falsified += self.now() - began
         self.pace.searched_drives(self.now() - began)
         self.writer.note({"falsification": bank.summary()})
         return True

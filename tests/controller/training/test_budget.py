@@ -151,13 +151,29 @@ def test_a_schedule_is_read_as_it_is_written(steps: list[tuple[int, int]], first
     for more, rest in steps:
         last = schedule.plannings[-1]
         step = min(last.step + more, last.steps)
-        schedule = schedule.with_steps(step, max(step + rest, 1))
+        schedule = schedule.with_steps(step, max(step + rest, 1)).with_drives(step, rest)
     assert StepSchedule.parse(str(schedule)) == schedule
     assert schedule.at(0) == [each.steps for each in schedule.plannings if each.step == 0][-1]
     assert schedule.at(10**9) == schedule.steps
 
 
-@pytest.mark.parametrize("text", ["", "0", "-3", "12.5", "10@3", "10,5", "10,5@11", "10,20@5,30@4", "9,3@5"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "0",
+        "-3",
+        "12.5",
+        "10@3",
+        "10,5",
+        "10,5@11",
+        "10,20@5,30@4",
+        "9,3@5",
+        "drives=3@2",
+        "10,drives=3",
+        "9,drives=1@5,drives=2@4",
+    ],
+)
 def test_what_is_no_schedule_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"step|schedule"):
         StepSchedule.parse(text)

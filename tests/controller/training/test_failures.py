@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,17 @@ import pytest
 import torch
 
 from stlc.controller.problem.task import Task
+from stlc.controller.training import loop
+from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import TrainConfig, resolve_config
-from stlc.controller.training.failures import MIXED, MOMENTS, POINTS, FailureBank, SearchRound
+from stlc.controller.training.failures import MIXED, MOMENTS, POINTS, SHARE, FailureBank, SearchRound
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
 from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import UsageError
-from stlc.native import Stop, never
+from stlc.native import Stop
 from stlc.registry import METHODS
 from stlc.rundir import RunDir
 
@@ -25,20 +28,21 @@ STEPS = 110
 
 
 class Found:
-    """Search that finds 30 initial states a round, and notes how it was called."""
+    """Search that finds 10 initial states a simulation, and notes how it was called."""
 
-    def __init__(self) -> None:
-        self.calls: list[tuple[int, int, int]] = []
+    def __init__(self, batch: int = 10**6) -> None:
+        self.batch, self.calls = batch, list[tuple[int, int, int]]()
 
     def __call__(
-        self, run: Run, decisions: int, seed: int, starts: np.ndarray, stop: Stop
+        self, run: Run, simulations: int, seed: int, starts: np.ndarray, over: Stop, stop: Stop
     ) -> SearchRound | None:
         if stop():
             return None
-        self.calls.append((decisions, seed, len(starts)))
+        self.calls.append((simulations, seed, len(starts)))
         generator = torch.Generator().manual_seed(seed)
-        states = run.task.sample(30, generator=generator, dtype=torch.float64)
-        return SearchRound(states, np.random.default_rng(seed).random((20, 3)), 40, 10)
+        made = min(self.batch, simulations) if over() else simulations
+        states = run.task.sample(10 * made, generator=generator, dtype=torch.float64)
+        return SearchRound(states, np.random.default_rng(seed).random((made, 3)), 20 * made, 5 * made)
 
 
 def _folder(task: Task, root: Path, config: TrainConfig) -> RunDir:
@@ -64,7 +68,7 @@ def test_rounds_are_due_at_shares_of_the_planned_steps() -> None:
     bank = FailureBank(torch.empty(0, 1))
     assert not bank.due(99, 1000)
     assert bank.due(int(MOMENTS[0] * 1000), 1000)
-    bank.rounds = len(MOMENTS)
+    bank.moment = len(MOMENTS)
     assert not bank.due(1000, 1000)
 
 
@@ -73,21 +77,36 @@ def test_a_round_that_is_stopped_has_no_effect(car_task: Task) -> None:
     generator = torch.Generator().manual_seed(4)
     before = generator.get_state()
     run: Run = Run(None, car_task, None)  # type: ignore[arg-type]
-    assert not bank.search(Found(), run, 100, 512, generator, lambda: True)
+    assert bank.search(Found(), run, 100, 3, generator, stop=lambda: True) is None
     assert torch.equal(generator.get_state(), before)
-    assert bank.search(Found(), run, 100, 512, generator, never)
-    assert (bank.rounds, bank.last, len(bank.states), bank.latest) == (1, 100, 30, 0.25)
+    assert bank.search(Found(), run, 90, 0, generator) == 0
+    assert torch.equal(generator.get_state(), before)
+    assert (bank.moment, bank.rounds, bank.last) == (1, 0, 0)
+    assert bank.search(Found(), run, 100, 3, generator) == 3
+    assert (bank.moment, bank.rounds, bank.last, len(bank.states), bank.latest) == (2, 1, 100, 30, 0.25)
     again = FailureBank(torch.empty(0, len(car_task.system.names)))
     again.restore(bank.tensors())
-    assert again.summary() == bank.summary()
+    assert (again.summary(), again.moment) == (bank.summary(), 2)
     assert np.array_equal(again.points, bank.points)
+
+
+def test_a_round_grows_with_the_steps_since_the_one_before(car_task: Task) -> None:
+    bank = FailureBank(torch.empty(0, 1))
+    run: Run = Run(None, car_task, None)  # type: ignore[arg-type]
+    test = car_task.system.decl.test
+    least = bank.simulations(run, 1, 1)
+    assert least == max(round(500 * test.replan / (test.agents * test.steps)), 2)
+    many = bank.simulations(run, 1000, 640)
+    assert many == pytest.approx(0.06 * 1000 * 640 * test.replan / (test.agents * test.steps), abs=1.0)
+    bank.last = 500
+    assert bank.simulations(run, 1000, 640) == pytest.approx(many / 2, abs=1.0)
 
 
 def test_a_resumed_run_with_rounds_equals_an_uninterrupted_one(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=50, method="guided", steps=STEPS, seed=3, batch=32, drives=0, falsify=True)
     search = Found()
     whole = train(car_task, config, _folder(car_task, tmp_path / "a", config), failures=search)
-    assert [starts for _, _, starts in search.calls] == [0, POINTS]
+    assert [starts for _, _, starts in search.calls] == [0, min(POINTS, search.calls[0][0])]
     count: list[bool] = []
     first = _folder(car_task, tmp_path / "b", config)
     watch = Watch(stop=lambda: bool(count.append(True)) or len(count) > 75)
@@ -97,10 +116,57 @@ def test_a_resumed_run_with_rounds_equals_an_uninterrupted_one(car_task: Task, t
     assert left.keys() == right.keys()
     for name, value in left.items():
         assert torch.equal(value, right[name]), name
-    assert len(left["failures.states"]) == 60
+    made = sum(simulations for simulations, _, _ in search.calls)
+    assert len(left["failures.states"]) == 10 * made
     assert first.record()["falsification"] == {
-        **{"rounds": 2, "drives": 80, "failing": 20, "last_share": 0.25, "states": 60}
+        **{"rounds": 2, "drives": 20 * made, "failing": 5 * made, "last_share": 0.25, "states": 10 * made}
     }
+    assert first.record()["schedule"] == whole.run.dir.record()["schedule"]
+    rounds = StepSchedule.parse(first.record()["schedule"]).drives
+    assert [each.simulations for each in rounds] == [simulations for simulations, _, _ in search.calls]
+
+
+class Clock:
+    """Clock that advances whenever it is read."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def __call__(self) -> float:
+        self.time += 0.1
+        return self.time
+
+
+def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+
+    class Slow(Found):
+        def __call__(self, *given: object) -> SearchRound | None:
+            clock.time += 10.0
+            return super().__call__(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(loop, "clock_of", lambda _name: clock)
+    config = TrainConfig(
+        **{"held_out": 50, "method": "guided", "budget": 40.0, "seed": 3, "batch": 32, "drives": 0},
+        falsify=True,
+    )
+    search = Slow(batch=1)
+    first = train(car_task, config, _folder(car_task, tmp_path / "a", config), failures=search).run.dir
+    schedule = StepSchedule.parse(first.record()["schedule"])
+    rounds = [each.simulations for each in schedule.drives]
+    assert 0 in rounds
+    assert 1 <= len([each for each in rounds if each]) == len(search.calls) < len(MOMENTS)
+    assert clock.time * SHARE + 10.0 >= 10.0 * len(search.calls)
+    told = replace(config, budget=None, steps=schedule)
+    again = Found()
+    second = train(car_task, told, _folder(car_task, tmp_path / "b", told), failures=again).run.dir
+    assert [simulations for simulations, _, _ in again.calls] == [each for each in rounds if each]
+    assert second.record()["schedule"] == first.record()["schedule"]
+    left, right = _saved(first), _saved(second)
+    for name, value in left.items():
+        assert torch.equal(value, right[name]), name
 
 
 def test_every_plan_from_kept_states_is_trained_to_be_safe(car_task: Task) -> None:
