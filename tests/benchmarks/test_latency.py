@@ -53,19 +53,19 @@ def test_guards_are_timed_and_the_page_is_written(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     spec = str(ROOT / "specs/traffic.stl")
-    small = ["--steps", "3", "--held-out", "20", "--drives", "0", "--set", "test.steps=40"]
+    small = ["--steps", "3", "--held-out", "20", "--drives", "0", "--set", "test.steps=20"]
     assert main(["train", spec, *small, "--no-pictures", "--name", "a"]) == 0
     capsys.readouterr()
     page = tmp_path / "page.md"
     page.write_text("# Page\n")
-    command = ["latency", "--samples", "8", "--seeds", "3", "--page", str(page), "--json"]
+    command = ["latency", "--samples", "4", "--seeds", "3", "--page", str(page), "--json"]
     assert measure(command) == 0
     document = json.loads(capsys.readouterr().out)
     assert misfits(document, document_schema()) == []
     rows = document["result"]["rows"]
     assert [row["guard"] for row in rows] == ["policy", *GUARDS]
     assert rows[0]["acting"] is None
-    assert all(row["every"]["samples"] == 4 for row in rows)
+    assert all(row["every"]["samples"] == 2 for row in rows)
     assert all(0 < row["every"]["median"] <= row["every"]["p99"] for row in rows)
     assert any(row["acting"] and row["acting"]["samples"] > 0 for row in rows)
     text = page.read_text()

@@ -45,17 +45,17 @@ def test_a_slower_function_takes_longer() -> None:
 
 
 def test_timings_and_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    found = timings([20], [2], seconds=0.0).rows
-    assert [timing.formula for timing in found[::2]] == [case.name for case in CASES]
-    assert all(timing.passes > 0 and timing.plain is not None for timing in found)
-    assert measure(["robustness", "--samples", "20", "--traces", "1", "--seconds", "0"]) == 0
+    command = ["robustness", "--samples", "20", "--traces", "1", "--seconds", "0"]
+    assert measure([*command, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, document_schema()) == []
+    rows = document["result"]["rows"]
+    assert [row["formula"] for row in rows[::2]] == [case.name for case in CASES]
+    assert all(row["passes"] > 0 and row["plain"] is not None for row in rows)
+    assert measure(command) == 0
     out = capsys.readouterr().out
     assert len(out.splitlines()) == 1 + 2 * len(CASES)
     assert "with gradient" in out
-    assert measure(["robustness", "--samples", "20", "--traces", "1", "--seconds", "0", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert misfits(document, document_schema()) == []
-    assert len(document["result"]["rows"]) == 2 * len(CASES)
 
 
 LIMITS = {"G[0,end] p": 25.0, "G[0,w] p": 45.0, "p U[0,w] q": 600.0}

@@ -231,7 +231,7 @@ def among_careful(bad: Driver, cars: tuple[int, ...] = SOME) -> Driver:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_careful_cars_obey_every_rule(monitor: Monitor, system: System, seed: int) -> None:
-    assert compare(monitor, filmed(system, careful, seed, 150), system) == [set()] * 20
+    assert compare(monitor, filmed(system, careful, seed, 100), system) == [set()] * 20
 
 
 @pytest.mark.parametrize(

@@ -44,10 +44,11 @@ def test_starts_are_drawn_until_one_fits_for_every_ship(file: str, monkeypatch: 
     world, _ = river(file)
     module = sys.modules[type(world).__module__]
     monkeypatch.setattr(module, "PROPOSED", 8)
-    monkeypatch.setattr(module, "ATTEMPTS", 50)
+    monkeypatch.setattr(module, "ATTEMPTS", 20)
     assert world.system.initial.holds(world.reset()).all()
     assert world.system.initial.holds(world.redraw(torch.tensor([3, 7]))).all()
     monkeypatch.setattr(module, "PROPOSED", 0)
+    monkeypatch.setattr(module, "ATTEMPTS", 2)
     with pytest.raises(ValueError, match="no start of a ship fits"):
         world.redraw(torch.tensor([3, 7]))
     with pytest.raises(ValueError, match="first ship"):

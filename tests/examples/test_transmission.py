@@ -76,7 +76,7 @@ def agree(file: dict[str, Any], stream: dict[str, Any]) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("seed", "seconds", "rate"),
     [
-        (1, 12.0, 20.0),
+        (1, 12.0, 10.0),
         pytest.param(1, 60.0, 100.0, marks=pytest.mark.slow),
         pytest.param(2, 60.0, 100.0, marks=pytest.mark.slow),
     ],
