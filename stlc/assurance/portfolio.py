@@ -36,8 +36,8 @@ PERTURBATIONS = 4
 """Small perturbations of the best vertex, before these points."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
-BLIND = 3
-"""Triples of a uniform point and two vertices with which a search begins if robustness is no guide."""
+BLIND, BLIND_TURNS = 4, 12
+"""Vertices with which a search begins if robustness is no guide, and turns of which one more is a vertex."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,8 @@ class Portfolio:
             constant = ConstantVertices(space, generator)
             self._first.extend(self._opening(space, constant, vertices, perturbation, climb))
         elif not random and not graded:
-            self._first.extend([_Opening(uniform), _Opening(vertices, 2)] * BLIND)
+            self._blind = [*[uniform] * (BLIND_TURNS - 1), vertices]
+            self._first.append(_Opening(vertices, BLIND))
         self._turn = 0
         self._values: deque[float] = deque(maxlen=FLAT_VALUES)
 

@@ -136,6 +136,17 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
     assert {"hill climbing", "periodic"} <= set(names)
 
 
+def test_where_robustness_is_no_guide_a_search_begins_with_vertices_and_goes_on_at_random():
+    space = SearchSpace(16, (SignalBlock("throttle", tuple(range(16))),))
+    portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None, graded=False)
+    names = []
+    for index in range(28):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        portfolio.tell(proposal, float(index % 7))
+    assert names == ["vertices"] * 4 + (["uniform"] * 11 + ["vertices"]) * 2
+
+
 def test_in_a_small_space_all_vertices_come_first_and_then_a_narrow_search_from_the_best():
     pytest.importorskip("cma")
     space = SearchSpace(3, (SignalBlock("reference", (0, 1, 2)),))
