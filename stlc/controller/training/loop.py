@@ -332,6 +332,7 @@ class _Session:
                     self._save()
                     self.writer.close("interrupted")
                     return self._unjudged(interrupted=True)
+                self.writer.note({"steps": learner.step})
             if not learner.ranks.first:
                 return self._unjudged(interrupted=False)
             return self.evaluation.of(learner.policy, learner.step)

@@ -271,6 +271,21 @@ def test_a_budget_that_was_interrupted_is_repeated_too(
 
 
 @pytest.mark.usefixtures("ticking")
+def test_a_budget_that_was_interrupted_near_its_end_tells_its_steps(car_task: Task, tmp_path: Path) -> None:
+    calls = itertools.count(1)
+    whole = _folder(car_task, tmp_path / "a", BUDGET)
+    train(car_task, BUDGET, whole, Watch(stop=lambda: next(calls) < 0))
+    last = next(calls) - 2
+    left = itertools.count(1)
+    folder = _folder(car_task, tmp_path / "b", BUDGET)
+    assert train(car_task, BUDGET, folder, Watch(stop=lambda: next(left) >= last)).interrupted
+    resume(folder)
+    assert folder.record()["steps"] == load_checkpoint(
+        folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder)
+    ).facts["step"]
+
+
+@pytest.mark.usefixtures("ticking")
 def test_a_run_that_goes_on_past_its_end_is_repeated_too(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=50, drives=0, steps=60, seed=3, batch=16, threads=1)
     folder = _folder(car_task, tmp_path / "a", config)
