@@ -280,9 +280,10 @@ def test_a_budget_that_was_interrupted_near_its_end_tells_its_steps(car_task: Ta
     folder = _folder(car_task, tmp_path / "b", BUDGET)
     assert train(car_task, BUDGET, folder, Watch(stop=lambda: next(left) >= last)).interrupted
     resume(folder)
-    assert folder.record()["steps"] == load_checkpoint(
-        folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder)
-    ).facts["step"]
+    assert (
+        folder.record()["steps"]
+        == load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder)).facts["step"]
+    )
 
 
 @pytest.mark.usefixtures("ticking")
