@@ -26,7 +26,7 @@ from stlc.native import Stop, never
 DRIVE_SEARCH_VERSION = 2
 """Version of the search; results of older versions are recomputed."""
 ROUND, ROWS = 16, 64
-"""Simulations, and agents of all simulations, side by side at most in a round of a training."""
+"""Simulations side by side at most in a round of a training, and their agents; two worlds in any case."""
 PATIENCE = 100
 """Simulations without progress after which a requirement has only its turns."""
 EARLIER = 3
@@ -77,17 +77,17 @@ def search_drives(
     over: Stop = never,
     watch: Watch | None = None,
 ) -> SearchedDrives:
-    """Search for drives that violate any requirement, in `count` simulations.
+    """Search for drives that violate any requirement, in at most `count` simulations.
 
-    The points of the first batch are uniform. Then every requirement has a search of its own, which sees all
-    simulations: half of the points are proposed for the requirement that is closest to a violation, or
-    violated most, while that makes progress, and the rest for all requirements in turn. For this comparison,
-    the robustness of each requirement is divided by its median size in the first batch, so that a requirement
-    in radians and one in metres count alike.
+    Apart from `starts`, the points of the first batch are uniform. Then every requirement has a search of its
+    own, which sees all simulations: half of the points are proposed for the requirement that is closest to a
+    violation, or violated most, while that makes progress, and the rest for all requirements in turn. For
+    this comparison, the robustness of each requirement is divided by its median size in the first batch, so
+    that a requirement in radians and one in metres count alike.
 
     Args:
         simulator: simulator of the policy in its world.
-        count: number of simulations.
+        count: number of simulations at most.
         seed: seed of the search; the same seed gives the same simulations.
         random: whether points are drawn from the declared distribution only, as a baseline.
         starts: points that are simulated first, (k, dim).
@@ -201,7 +201,7 @@ def round_of(
         stop: function that is called at every step; the search ends once it returns True.
 
     Returns:
-        The states and the worst points; None if `stop` ended the search.
+        The states, and all points, the least robust first; None if `stop` ended the search.
     """
     test = run.task.system.decl.test
     setting = Setting((0,), test.agents, test.steps, test.replan)
@@ -217,10 +217,10 @@ def round_of(
             raise _StoppedError
 
     try:
+        first = starts[: min(batch, simulations) // 2]
         found = search_drives(
-            simulator, simulations, seed=seed, starts=starts[: (batch + 1) // 2], seen=seen, over=over,
-            watch=watch,
-        )  # fmt: skip
+            simulator, simulations, seed=seed, starts=first, seen=seen, over=over, watch=watch
+        )
     except _StoppedError:
         return None
     states = torch.from_numpy(np.concatenate(kept))

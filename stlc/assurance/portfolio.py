@@ -37,7 +37,7 @@ PERTURBATIONS = 4
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
 BLIND, BLIND_TURNS = 4, 12
-"""Vertices with which a search begins if robustness is no guide, and turns of which one more is a vertex."""
+"""Vertices with which a search begins if robustness is no guide; then one point in so many is a vertex."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -346,7 +346,7 @@ def _commands(contents: RunContents) -> list[str]:
     for option in ("method", "plans", "lr", "batch", "threads"):
         if options.get(option) not in (None, "guided"):
             train += [f"--{option}", str(options[option])]
-    train += _set(record)
+    train += [*(["--falsify"] if options.get("falsify") else []), *_set(record)]
     commands = [shell(train), shell([*_simulate(contents), *_set(contents.simulation or {})])]
     if contents.trace is not None:
         check = ["stlc", "check", f"{contents.run.shown}/trace.npz"]

@@ -111,6 +111,29 @@ def test_a_round_returns_states_of_the_system(simulator: DriveSimulator) -> None
     assert round_of(simulator.run, 2, 3, np.zeros((0, 0)), never, lambda: True) is None
 
 
+def test_a_round_ends_after_a_batch_and_begins_with_few_points_of_others(simulator: DriveSimulator) -> None:
+    seen: list[np.ndarray] = []
+    drive = DriveSimulator.drive
+
+    def noted(self: DriveSimulator, points: np.ndarray, watch: object = None) -> DeploymentRecording:
+        seen.append(points)
+        return drive(self, points, watch)  # type: ignore[arg-type]
+
+    any_round = round_of(simulator.run, 2, 3, np.zeros((0, 0)), never, never)
+    assert any_round is not None
+    starts = np.full((8, any_round.points.shape[1]), 0.5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DriveSimulator, "drive", noted)
+        few = round_of(simulator.run, 3, 3, starts, never, never)
+        assert few is not None
+        assert len(few.points) == 3
+        assert (few.points == 0.5).all(1).sum() == 1
+        ended = round_of(simulator.run, 100, 3, starts, lambda: True, never)
+    assert ended is not None
+    assert len(ended.points) == len(seen[-1]) < 100
+    assert (ended.points == 0.5).all(1).sum() == min(len(seen[-1]) // 2, len(starts))
+
+
 def test_states_of_wrong_decisions_and_some_before_them() -> None:
     rho = np.ones((3, 40))
     rho[0, 20:] = -1.0  # a failing drive

@@ -76,6 +76,15 @@ def test_a_trained_run(trained):
     assert (trained.path / "system.yaml").read_text() in page.text
 
 
+def test_a_run_with_falsification_is_repeated_with_it(trained):
+    record = trained.record()
+    record["options"] = {**(record.get("options") or {}), "falsify": True}
+    record["schedule"] = "5900,simulations=6@1500"
+    trained.write_json("run.json", record)
+    text = page_of(trained).text
+    assert "--seed 0 --steps 5900,simulations=6@1500 --falsify" in text
+
+
 def test_units_of_robustness_are_those_of_the_specification(trained):
     assert read_contents(trained).units == {
         "no_collision": "m"

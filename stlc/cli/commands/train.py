@@ -233,7 +233,8 @@ def _steps(text: str) -> int | StepSchedule:
     """Parse the value of `--steps`: a number of steps, or a schedule that was recorded by another run.
 
     A run with a time budget adjusts its total number of steps as it proceeds, and records these totals as a
-    schedule. In `10000,1240@10` the total is 10000 at first, and 1240 after step 10.
+    schedule. In `10000,1240@10` the total is 10000 at first, and 1240 after step 10; `simulations=6@400` is a
+    round of falsification after step 400.
     """
     from stlc.controller.training.budget import StepSchedule
 

@@ -8,6 +8,7 @@ recorded `StepSchedule`, not on the clock.
 
 from __future__ import annotations
 
+import heapq
 import math
 import os
 import re
@@ -131,16 +132,16 @@ class Planned:
 
 
 @dataclass(frozen=True, slots=True)
-class PlannedDrives:
+class PlannedRound:
     """Entry of a schedule: a round of falsification after step `step` makes `simulations` simulations."""
 
     step: int
     simulations: int
 
 
-_DRIVES = "drives="
-_NUMBER = r"(0|[1-9]\d{0,17})"
-_TEXT = re.compile(rf"[1-9]\d{{0,17}}(,({_DRIVES}{_NUMBER}|[1-9]\d{{0,17}})@{_NUMBER})*")
+_ROUND = "simulations="
+_STEP = r"(0|[1-9]\d{0,17})"
+_TEXT = re.compile(rf"[1-9]\d{{0,17}}(,({_ROUND}(0|[1-9]\d{{0,6}})|[1-9]\d{{0,17}})@{_STEP})*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,12 +153,12 @@ class StepSchedule:
     Attributes:
         plannings: entries in order. The first is at step 0. If two entries are at the same step, the later
             one applies.
-        drives: rounds of falsification in order (`--falsify`), one for each moment at which a round was due;
+        rounds: rounds of falsification in order (`--falsify`), one for each moment at which a round was due;
             0 simulations if there was no time for one.
     """
 
     plannings: tuple[Planned, ...]
-    drives: tuple[PlannedDrives, ...] = ()
+    rounds: tuple[PlannedRound, ...] = ()
 
     @classmethod
     def of(cls, steps: int) -> StepSchedule:
@@ -169,8 +170,8 @@ class StepSchedule:
         """Parse the text of a schedule.
 
         `1200` is a fixed number of steps. With `10000,1240@10,900@455` the planned total is 10000 at first,
-        1240 after step 10, and 900 after step 455. `drives=6@400` is a round of falsification with 6
-        simulations after step 400.
+        1240 after step 10, and 900 after step 455. `simulations=6@400` is a round of falsification after step
+        400, with 6 simulations, each of all agents of a world.
 
         Raises:
             ValueError: the text is not a schedule, its steps are not in order, or a total is less than the
@@ -179,37 +180,37 @@ class StepSchedule:
         if not _TEXT.fullmatch(text):
             raise ValueError("it is neither a number of steps nor a schedule")
         first, *later = text.split(",")
-        entries = [part.removeprefix(_DRIVES).split("@") for part in later]
-        rounds = [part.startswith(_DRIVES) for part in later]
-        plannings, drives = [Planned(0, int(first))], list[PlannedDrives]()
-        for is_round, (count, step) in zip(rounds, entries, strict=True):
-            if is_round:
-                drives.append(PlannedDrives(int(step), int(count)))
+        plannings, rounds = [Planned(0, int(first))], list[PlannedRound]()
+        for part in later:
+            count, step = map(int, part.removeprefix(_ROUND).split("@"))
+            if part.startswith(_ROUND):
+                rounds.append(PlannedRound(step, count))
             else:
-                plannings.append(Planned(int(step), int(count)))
+                plannings.append(Planned(step, count))
         for before, after in pairwise(plannings):
             if after.step < before.step or after.step > before.steps:
                 raise ValueError(f"step {after.step} is not between {before.step} and {before.steps}")
             if after.steps < after.step:
                 raise ValueError(f"at step {after.step} there cannot be {after.steps} in all")
-        for earlier, later_one in pairwise(drives):
-            if later_one.step < earlier.step:
-                raise ValueError(f"the drives at step {later_one.step} follow those at step {earlier.step}")
-        return cls(tuple(plannings), tuple(drives))
+        steps = [0, *(each.step for each in rounds), plannings[-1].steps]
+        if any(after < before for before, after in pairwise(steps)) or len({*steps[1:-1]}) < len(rounds):
+            raise ValueError(f"the steps of its rounds do not rise up to {steps[-1]}")
+        return cls(tuple(plannings), tuple(rounds))
 
     def __str__(self) -> str:
         first, *later = self.plannings
-        entries = [(each.step, f"{each.steps}@{each.step}") for each in later]
-        entries += [(each.step, f"{_DRIVES}{each.simulations}@{each.step}") for each in self.drives]
-        return ",".join((str(first.steps), *(text for _, text in sorted(entries, key=lambda one: one[0]))))
+        plannings = ((each.step, f"{each.steps}@{each.step}") for each in later)
+        rounds = ((each.step, f"{_ROUND}{each.simulations}@{each.step}") for each in self.rounds)
+        merged = heapq.merge(plannings, rounds, key=lambda entry: entry[0])
+        return ",".join((str(first.steps), *(text for _, text in merged)))
 
     def with_steps(self, step: int, steps: int) -> StepSchedule:
         """This schedule with a further entry: after `step`, the total number of steps is `steps`."""
         return replace(self, plannings=(*self.plannings, Planned(step, steps)))
 
-    def with_drives(self, step: int, simulations: int) -> StepSchedule:
+    def with_round(self, step: int, simulations: int) -> StepSchedule:
         """This schedule with a further round of falsification after `step`."""
-        return replace(self, drives=(*self.drives, PlannedDrives(step, simulations)))
+        return replace(self, rounds=(*self.rounds, PlannedRound(step, simulations)))
 
     @property
     def steps(self) -> int:

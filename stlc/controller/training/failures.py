@@ -30,11 +30,11 @@ FAILURES_VERSION = 3
 MOMENTS = (0.25, 0.4, 0.55, 0.7, 0.82)
 """Shares of the planned steps after which a round is due."""
 SHARE = 0.2
-"""Share of the training time that rounds may take; a round ends with the first batch of drives beyond it."""
+"""Share of the time since the start that rounds may take; a round ends with the first batch beyond it."""
 WORK = 0.06
-"""Decisions of the drives of a round at most, per training state of the steps since the round before."""
+"""Decisions of the drives of a round, per training state of the steps since the round before it."""
 LEAST_WORK, MOST_WORK = 500, 100_000
-"""Bounds of this number of decisions."""
+"""Bounds of the number of decisions of a round."""
 KEPT = 8192
 """States kept at most; the oldest are dropped."""
 POINTS = 8
@@ -66,10 +66,10 @@ class FailureSearch(Protocol):
     def __call__(
         self, run: Run, simulations: int, seed: int, starts: NDArray[np.float64], over: Stop, stop: Stop
     ) -> SearchRound | None:
-        """Search with `simulations` simulations of the policy; None if `stop` ended the search.
+        """Search with at most `simulations` simulations of the policy.
 
-        The simulations come in batches, which do not depend on their number, so that a search that ended
-        early is repeated by one of as many simulations.
+        The size of a batch does not depend on `simulations`, so that a search that ended early is repeated
+        by one of as many simulations.
 
         Args:
             run: run with the present policy.
@@ -77,7 +77,10 @@ class FailureSearch(Protocol):
             seed: seed of the search.
             starts: points of earlier rounds, which are simulated first, (p, dim).
             over: function that is called after each batch; no other batch follows once it returns True.
-            stop: function that is called at every step; the search ends at once, without a result.
+            stop: function that is called at every step; once it returns True, the search ends at once.
+
+        Returns:
+            The states and points that were found; None if `stop` ended the search.
         """
 
 
@@ -88,7 +91,7 @@ class FailureBank:
     Attributes:
         states: kept states, the newest last, (k, n).
         points: points of the least robust simulations of the last round, (p, dim).
-        moment: number of moments at which a round was due that have passed.
+        moment: number of moments at which a round was due, with or without time for one.
         rounds: number of rounds made.
         last: step of the last round.
         drives: number of drives of all rounds.
@@ -114,7 +117,7 @@ class FailureBank:
     def simulations(self, run: Run, step: int, states: int) -> int:
         """Number of simulations of a round after `step` steps, of `states` training states each.
 
-        A time limit may end the round before.
+        A time limit may end the round earlier.
         """
         test = run.task.system.decl.test
         decisions = min(max(WORK * (step - self.last) * states, LEAST_WORK), MOST_WORK)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.methods import Learner, Method, Validation
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.failures import FailureSearch
+    from stlc.controller.training.failures import FailureBank, FailureSearch
     from stlc.rundir import RunDir
 
 DEFAULT_BUDGET = 60.0
@@ -127,12 +127,12 @@ def train(
     started = now()
     keep_freed_memory()
     resolved = replace(resolve_config(task, config), ranks=ranks.size)
-    _require_search(resolved, failures)
     watch = watch or Watch()
     declared = task.system.decl.train
     fixed = config.steps or (declared.steps if config.budget is None else None)
     budget = 0.0 if fixed is not None else config.budget or declared.budget or DEFAULT_BUDGET
     schedule = fixed if isinstance(fixed, StepSchedule) else StepSchedule.of(fixed or PROVISIONAL)
+    _require_search(resolved, failures, schedule)
     writer = RunWriter(folder, writes=ranks.first)
     writer.config(resolved)
     writer.note({"engine": asdict(resolved), "schedule": str(schedule), "seconds_allowed": budget or None})
@@ -200,6 +200,8 @@ def resume(
         before = float(facts.get("seconds", before))
         allowed = 0.0 if steps is not None else float(folder.record().get("seconds_allowed") or 0.0)
         planned = schedule.at(0) if saved is None else int(facts["steps"])
+        if saved is None and allowed:  # nothing was saved: the run begins again, and plans its steps anew
+            schedule = StepSchedule.of(planned)
         learner = method.learner(task, config, steps=planned, device=place, ranks=ranks)
         if learner is not None and saved is not None:
             learner.restore(saved.tensors, saved.facts)
@@ -223,7 +225,8 @@ def resume(
     writer.before(learner.next_validation)
     writer.note({"status": "running", "seconds_allowed": allowed or None})
     time_ = TimeBudget.of(now, started - before, allowed, late)
-    return _Session(writer, learner, watch, time_, schedule, failures).finish()
+    falsified = float(facts.get("falsified") or 0.0)
+    return _Session(writer, learner, watch, time_, schedule, failures, falsified).finish()
 
 
 def _without_steps(
@@ -255,8 +258,15 @@ def _require_as_many(before: int, now: int) -> None:
         )
 
 
-def _require_search(config: ResolvedConfig, failures: FailureSearch | None) -> None:
-    """Raise UsageError (U101) if a training with `--falsify` has no search for drives, or several ranks."""
+def _require_search(
+    config: ResolvedConfig, failures: FailureSearch | None, schedule: StepSchedule | None = None
+) -> None:
+    """Raise UsageError (U101) if a training with `--falsify` has no search for drives, or several ranks.
+
+    The same holds for a training without it that should follow a `schedule` with rounds of falsification.
+    """
+    if schedule is not None and schedule.rounds and not config.falsify:
+        raise usage("the schedule has rounds of falsification", "stlc train SPEC --falsify --steps SCHEDULE")
     if config.falsify and config.ranks > 1:
         raise usage("`--falsify` is for a training in one process", "stlc train SPEC --falsify")
     if config.falsify and failures is None:
@@ -294,10 +304,12 @@ class _Session:
         time: TimeBudget,
         schedule: StepSchedule,
         failures: FailureSearch | None = None,
+        falsified: float = 0.0,
     ) -> None:
         """Prepare to make the steps of `schedule`; with a budget, their number is adapted to the pace.
 
-        `failures`: search for failing drives, of a training with `--falsify`.
+        `failures`: search for failing drives, of a training with `--falsify`; `falsified`: seconds that its
+        rounds have taken before.
         """
         self.failures = failures
         self.writer = writer
@@ -313,7 +325,7 @@ class _Session:
         self.barren = not learner.ranks.any(learner.solved)
         self.refuted: bool | None = None
         self.exhausted = False
-        self.started, self.falsified = self.now(), 0.0  # clock; seconds of rounds of falsification
+        self.falsified = falsified
 
     def finish(self) -> TrainingOutcome:
         """Train to the end, evaluate, and write the status of the run.
@@ -422,15 +434,16 @@ class _Session:
 
     def _searched_drives(self) -> bool:
         """Make a round of falsification if one is due; return False if the user ends the training."""
-        learner, bank = self.learner, self.learner.failures
-        if bank is None or self.failures is None or not bank.due(learner.step, learner.steps):
+        learner, bank, recorded = self.learner, self.learner.failures, self.schedule.rounds
+        if bank is None or self.failures is None or not self._round_due(bank):
             return True
         began, step = self.now(), learner.step
         run = Run(self.writer.folder, learner.task, learner.policy)
-        if bank.moment < len(self.schedule.drives):  # a recorded schedule is followed
-            count, allowed = self.schedule.drives[bank.moment].simulations, math.inf
+        if bank.moment < len(recorded):
+            count, allowed = recorded[bank.moment].simulations, math.inf
         else:
-            allowed = SHARE * (began - self.started) - self.falsified if self.time.allowed else math.inf
+            limit = SHARE * self.time.spent - self.falsified
+            allowed = limit if self.time.allowed else math.inf
             states = learner.config.batch + learner.config.hard
             count = bank.simulations(run, step, states) if allowed > 0.0 else 0
         made = bank.search(
@@ -440,13 +453,20 @@ class _Session:
         )
         if made is None:
             return False
-        if bank.moment > len(self.schedule.drives):
-            self.schedule = self.schedule.with_drives(step, made)
+        if bank.moment > len(recorded):
+            self.schedule = self.schedule.with_round(step, made)
             self._note_schedule()
         self.falsified += self.now() - began
         self.pace.searched_drives(self.now() - began)
         self.writer.note({"falsification": bank.summary()})
         return True
+
+    def _round_due(self, bank: FailureBank) -> bool:
+        """True if a round of falsification is due; the recorded schedule decides as far as it goes."""
+        recorded, step = self.schedule.rounds, self.learner.step
+        if bank.moment < len(recorded):
+            return step >= recorded[bank.moment].step
+        return bank.due(step, self.learner.steps) and (not recorded or step > recorded[-1].step)
 
     def _wait_for_search(self) -> bool:
         """Wait for the concurrent search; return False if the user ends the training during the wait."""
@@ -489,6 +509,7 @@ class _Session:
             **self.learner.facts(),
             "schedule": str(self.schedule),
             "seconds": began - self.time.started,
+            "falsified": self.falsified,
         }
         self.writer.checkpoint(self.learner.tensors(), facts, step=self.learner.step)
         self.pace.saved(self.now() - began)

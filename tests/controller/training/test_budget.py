@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import shutil
 import subprocess
 import sys
 import time
@@ -151,7 +152,9 @@ def test_a_schedule_is_read_as_it_is_written(steps: list[tuple[int, int]], first
     for more, rest in steps:
         last = schedule.plannings[-1]
         step = min(last.step + more, last.steps)
-        schedule = schedule.with_steps(step, max(step + rest, 1)).with_drives(step, rest)
+        schedule = schedule.with_steps(step, max(step + rest, 1))
+        if not schedule.rounds or step > schedule.rounds[-1].step:
+            schedule = schedule.with_round(step, rest)
     assert StepSchedule.parse(str(schedule)) == schedule
     assert schedule.at(0) == [each.steps for each in schedule.plannings if each.step == 0][-1]
     assert schedule.at(10**9) == schedule.steps
@@ -169,9 +172,12 @@ def test_a_schedule_is_read_as_it_is_written(steps: list[tuple[int, int]], first
         "10,5@11",
         "10,20@5,30@4",
         "9,3@5",
-        "drives=3@2",
-        "10,drives=3",
-        "9,drives=1@5,drives=2@4",
+        "simulations=3@2",
+        "10,simulations=3",
+        "9,simulations=1@5,simulations=2@4",
+        "9,simulations=1@5,simulations=2@5",
+        "9,simulations=1@10",
+        "9,simulations=100000000@5",
     ],
 )
 def test_what_is_no_schedule_is_refused(text: str) -> None:
@@ -284,6 +290,22 @@ def test_a_budget_that_was_interrupted_near_its_end_tells_its_steps(car_task: Ta
         folder.record()["steps"]
         == load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder)).facts["step"]
     )
+
+
+@pytest.mark.usefixtures("ticking")
+def test_a_budget_that_was_killed_before_its_first_checkpoint_is_planned_anew(
+    car_task: Task, tmp_path: Path
+) -> None:
+    folder = _folder(car_task, tmp_path / "a", BUDGET)
+    steps = itertools.count(1)
+    assert train(car_task, BUDGET, folder, Watch(stop=lambda: next(steps) == 30)).interrupted
+    shutil.rmtree(folder.path / "ckpt")
+    assert "," in folder.record()["schedule"]
+    resume(folder)
+    told = replace(BUDGET, budget=None, steps=StepSchedule.parse(folder.record()["schedule"]))
+    again = _folder(car_task, tmp_path / "b", told)
+    train(car_task, told, again)
+    assert _same(folder, again)
 
 
 @pytest.mark.usefixtures("ticking")

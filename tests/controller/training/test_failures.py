@@ -122,7 +122,7 @@ def test_a_resumed_run_with_rounds_equals_an_uninterrupted_one(car_task: Task, t
         **{"rounds": 2, "drives": 20 * made, "failing": 5 * made, "last_share": 0.25, "states": 10 * made}
     }
     assert first.record()["schedule"] == whole.run.dir.record()["schedule"]
-    rounds = StepSchedule.parse(first.record()["schedule"]).drives
+    rounds = StepSchedule.parse(first.record()["schedule"]).rounds
     assert [each.simulations for each in rounds] == [simulations for simulations, _, _ in search.calls]
 
 
@@ -155,7 +155,7 @@ def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
     search = Slow(batch=1)
     first = train(car_task, config, _folder(car_task, tmp_path / "a", config), failures=search).run.dir
     schedule = StepSchedule.parse(first.record()["schedule"])
-    rounds = [each.simulations for each in schedule.drives]
+    rounds = [each.simulations for each in schedule.rounds]
     assert 0 in rounds
     assert 1 <= len([each for each in rounds if each]) == len(search.calls) < len(MOMENTS)
     assert clock.time * SHARE + 10.0 >= 10.0 * len(search.calls)
@@ -167,6 +167,42 @@ def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
     left, right = _saved(first), _saved(second)
     for name, value in left.items():
         assert torch.equal(value, right[name]), name
+
+
+def test_an_interruption_right_after_a_round_is_repeated_by_the_record(
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the validation that follows, with more moments between two validations; then more steps."""
+    monkeypatch.setattr(Trainer, "explore", lambda _self, stop: not stop())
+    config = TrainConfig(held_out=20, method="guided", steps=60, seed=3, batch=16, drives=0, falsify=True)
+    first = _folder(car_task, tmp_path / "a", config)
+    search, once = Found(), iter([True])
+    watch = Watch(stop=lambda: bool(search.calls) and next(once, False))
+    assert train(car_task, config, first, watch, failures=search).interrupted
+    resume(first, steps=80, failures=search)
+    schedule = StepSchedule.parse(first.record()["schedule"])
+    assert [each.step for each in schedule.rounds] == [50]
+    told = replace(config, steps=schedule)
+    second = _folder(car_task, tmp_path / "b", told)
+    train(car_task, told, second, failures=Found())
+    assert second.record()["schedule"] == first.record()["schedule"]
+    left, right = _saved(first), _saved(second)
+    for name, value in left.items():
+        assert torch.equal(value, right[name]), name
+
+
+def test_the_rounds_of_a_schedule_are_made_at_its_steps(car_task: Task, tmp_path: Path) -> None:
+    schedule = StepSchedule.parse("60,simulations=7@50")
+    config = TrainConfig(
+        **{"held_out": 20, "method": "guided", "steps": schedule, "seed": 3, "batch": 16, "drives": 0},
+        falsify=True,
+    )
+    search = Found()
+    train(car_task, config, _folder(car_task, tmp_path / "a", config), failures=search)
+    assert [simulations for simulations, _, _ in search.calls] == [7]
+    plain = replace(config, falsify=False)
+    with pytest.raises(UsageError, match="rounds of falsification"):
+        train(car_task, plain, _folder(car_task, tmp_path / "b", plain))
 
 
 def test_every_plan_from_kept_states_is_trained_to_be_safe(car_task: Task) -> None:
