@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from time import process_time
 from typing import Annotated, Any
 
@@ -46,6 +47,10 @@ that was trained without falsification. A simulation is a drive of one agent, in
 that was trained with `--falsify` in the same time; intervals of 95 % (Wilson) take drives as independent.
 Benchmarks and entries that are missing were not measured yet.
 """
+SEEDS_TEXT = """\
+Failing fresh drives of policies that were trained with several seeds, without guard: mean over the seeds, and
+each of them. Seeds differ by more than the intervals above, which are those of one policy.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +67,7 @@ class Drives:
         steps: steps of each drive at most; None: as the system file says.
         seed: seed of the search.
         trained: `guided`, or `AFTER`.
+        training_seed: seed of the training.
     """
 
     folder: RunDir
@@ -73,13 +79,15 @@ class Drives:
     steps: int | None
     seed: int
     trained: str
+    training_seed: int = 0
 
     @property
     def name(self) -> str:
         """Name under which the result is stored, such as `traffic-none-falsify-100`."""
         what = "fresh" if self.seed == FRESH else "random" if self.random else "falsify"
         own = self.trained.replace(":", "-")
-        return "-".join([self.benchmark, own, self.guard, what, str(self.simulations)])
+        other = [f"seed{self.training_seed}"] if self.training_seed else []
+        return "-".join([self.benchmark, own, self.guard, what, str(self.simulations), *other])
 
     @property
     def setting(self) -> Setting:
@@ -93,6 +101,7 @@ class Drives:
         run = Run.open(self.folder.path)
         values = dict(key_of(run, NOMINAL, self.guard, replace(self.setting, seeds=())).values)
         own = {"benchmark": self.benchmark, "trained": self.trained, "random": self.random, "seed": self.seed}
+        own |= {"training_seed": self.training_seed} if self.training_seed else {}
         version = None if self.random else DRIVE_SEARCH_VERSION
         sizes = {"simulations": self.simulations, "search_version": version}
         return Key(self.name, {**values, **own, **sizes})
@@ -170,8 +179,39 @@ COLUMNS: Columns[Row] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class SeedRow:
+    """Share of failing drives of policies that differ by the seed of the training, without guard.
+
+    Attributes:
+        benchmark: name of the specification.
+        seeds: seeds of the trainings.
+        before: share of failing fresh drives for each seed, without falsification in the training.
+        after: the same with it.
+    """
+
+    benchmark: str
+    seeds: tuple[int, ...]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+
+
+def _mean(shares: Sequence[float]) -> str:
+    each = ", ".join(f"{100 * share:.2f}" for share in shares)
+    return f"{100 * fmean(shares):.2f} % ({each})"
+
+
+SEED_COLUMNS: Columns[SeedRow] = {
+    "benchmark": "{benchmark}",
+    "seeds": lambda row: ", ".join(map(str, row.seeds)),
+    "without": lambda row: _mean(row.before),
+    "`--falsify`": lambda row: _mean(row.after),
+}
+
+
 @command(
     "python -m benchmarks failures",
+    "python -m benchmarks failures --seeds 0..2 --others 5000",
     "python -m benchmarks failures --only traffic --simulations 200 --fresh 2000",
 )
 def failures(
@@ -180,6 +220,9 @@ def failures(
         int, typer.Option("--simulations", metavar="N", min=1, help="Of each search.")
     ] = 2000,
     fresh: Annotated[int, typer.Option("--fresh", metavar="N", min=1, help="Fresh drives, about.")] = 20_000,
+    others: Annotated[
+        int, typer.Option("--others", metavar="N", min=1, help="Fresh drives with further seeds, about.")
+    ] = 5000,
     drive_steps: Annotated[
         int | None, typer.Option("--drive-steps", metavar="N", min=1, help="Of each drive, at most.")
     ] = None,
@@ -191,24 +234,36 @@ def failures(
 ) -> None:
     """Search for failing drives of the benchmarks' policies, at random and by falsification.
 
-    The policies are trained for 60 s of processor time, without and with `--falsify`. Trainings and drives
-    are stored when they end, and not repeated while specification, system and method are the same.
+    The policies are trained for 60 s of processor time, without and with `--falsify`. With further seeds
+    (`--seeds`) they are trained again, and drive without guard, to tell the effect of `--falsify` from that
+    of the seed. Trainings and drives are stored when they end, and not repeated while specification, system
+    and method are the same.
     """
     store, place = ResultStore("failures", training.out), training.place("failure_trainings")
-    ((seed, length), *_) = training.seeds_and_lengths((60.0,))
+    (seed, length), *more = training.seeds_and_lengths((60.0,))
     failed: list[dict[str, str]] = []
     new = 0
     with one_thread():
         for benchmark in sorted(chosen(only, ORDER, "benchmark"), key=ORDER.index):
-            cells = _cells(benchmark, seed, length, retrain=retrain, held_out=training.held_out)
-            done = filled(cells, place)
-            drives = _drives(cells, place, simulations, fresh, drive_steps)
+            made = _cells(benchmark, seed, length, retrain=retrain, held_out=training.held_out)
+            further = [
+                cell
+                for each, time in more
+                for cell in _cells(benchmark, each, time, retrain=retrain, held_out=training.held_out)
+            ]
+            done = filled([*made, *further], place)
+            drives = [
+                *_drives(made, place, simulations, fresh, drive_steps),
+                *_drives_of_others(further, place, others, drive_steps),
+            ]
             found = measured(drives, store, lambda each: each.measure(), doing="driving", told=_told)
             failed += [*done.failed, *found.failed]
             new += found.new
 
     def section() -> list[str]:
-        return [TEXT, *table().markdown(), "", *provenance(store.all().values(), "searches")]
+        results = [*store.all().values()]
+        of_seeds = listed("failures of seeds", seed_rows_of(results), SEED_COLUMNS).markdown()
+        return [TEXT, *table().markdown(), "", SEEDS_TEXT, *of_seeds, "", *provenance(results, "searches")]
 
     def table() -> Table[Any, Row]:
         return listed("failures", rows_of([*store.all().values()]), COLUMNS)
@@ -228,19 +283,35 @@ def _drives(
     """The simulations of a benchmark whose trainings are finished."""
     for guard in GUARDS:
         for cell in cells:
-            folder = place.newest_run(cell.key)
-            if folder is None or folder.status != "finished":
+            own = _fresh(cell, place, guard, fresh, steps)
+            if own is None:
                 continue
-            agents = Run.open(folder.path).task.system.decl.test.agents
-            own = Drives(
-                *(folder, cell.benchmark, guard, True, -(-fresh // agents), agents, steps, FRESH),
-                trained=cell.contender,
-            )
             if not cell.options:
-                alone = agents if cell.benchmark in COUPLED else 1
+                alone = own.agents if cell.benchmark in COUPLED else 1
                 search = replace(own, simulations=simulations, agents=alone, seed=SEARCHED)
                 yield from (search, replace(search, random=False))
             yield own
+
+
+def _drives_of_others(cells: Sequence[Cell], place: Place, fresh: int, steps: int | None) -> Iterator[Drives]:
+    """The fresh drives of trainings with further seeds, without guard."""
+    for cell in cells:
+        own = _fresh(cell, place, "none", fresh, steps)
+        if own is not None:
+            yield own
+
+
+def _fresh(cell: Cell, place: Place, guard: Mode, fresh: int, steps: int | None) -> Drives | None:
+    """About `fresh` drives of the policy of a training; None if it is not finished."""
+    folder = place.newest_run(cell.key)
+    if folder is None or folder.status != "finished":
+        return None
+    agents = Run.open(folder.path).task.system.decl.test.agents
+    return Drives(
+        *(folder, cell.benchmark, guard, True, -(-fresh // agents), agents, steps, FRESH),
+        trained=cell.contender,
+        training_seed=cell.seed,
+    )
 
 
 def _told(result: Result) -> str:
@@ -256,7 +327,7 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
     rows = []
     for benchmark in ORDER:
         for guard in GUARDS:
-            own = [each for each in results if _is_of(each, benchmark, guard)]
+            own = [each for each in results if _is_of(each, benchmark, guard) and not _seed_of(each)]
             searches = {_size(each): each for each in own if each["key"]["seed"] != FRESH}
             sizes = [count for count, random in searches if random and (count, False) in searches]
             fresh = [each for each in own if each["key"]["seed"] == FRESH]
@@ -266,11 +337,7 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
             if not sizes or before is None:
                 continue
             random, searched = searches[max(sizes), True], searches[max(sizes), False]
-            after = [
-                each
-                for each in fresh
-                if each["key"]["trained"] != "guided" and each["drives"] == before["drives"]
-            ]
+            after = [each for each in fresh if _falsified(each) and each["drives"] == before["drives"]]
             newest = max(after, key=lambda each: str(each["key"]["trained"]), default=None)
             key = searched["key"]
             rows.append(
@@ -282,6 +349,40 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
                 )
             )
     return rows
+
+
+def seed_rows_of(results: Sequence[Result]) -> list[SeedRow]:
+    """Rows of the benchmarks that were trained with several seeds, both without and with `--falsify`.
+
+    Of several results of a seed the one with most drives counts, of several versions of `train --falsify` the
+    newest.
+    """
+    rows = []
+    for benchmark in ORDER:
+        fresh = [each for each in results if _is_of(each, benchmark, "none") and each["key"]["seed"] == FRESH]
+        fresh.sort(key=_drives_of)
+        newest = max((str(each["key"]["trained"]) for each in fresh if _falsified(each)), default="")
+        shares = [
+            {
+                _seed_of(each): each["failing"] / each["drives"]
+                for each in fresh
+                if each["key"]["trained"] == one
+            }
+            for one in ("guided", newest)
+        ]
+        seeds = tuple(sorted({*shares[0]} & {*shares[1]}))
+        if len(seeds) > 1:
+            rows.append(SeedRow(benchmark, seeds, *(tuple(own[seed] for seed in seeds) for own in shares)))
+    return rows
+
+
+def _falsified(result: Result) -> bool:
+    return bool(result["key"]["trained"] != "guided")
+
+
+def _seed_of(result: Result) -> int:
+    """Seed of the training."""
+    return int(result["key"].get("training_seed", 0))
 
 
 def _is_of(result: Result, benchmark: str, guard: str) -> bool:

@@ -11,7 +11,16 @@ from helpers.documents import misfits
 from benchmarks.__main__ import main as measure
 from benchmarks.options import Training
 from benchmarks.store import ResultStore
-from benchmarks.tables.failures import AFTER, FALSIFYING, FRESH, ORDER, _cells, rows_of
+from benchmarks.tables.failures import (
+    AFTER,
+    FALSIFYING,
+    FRESH,
+    ORDER,
+    SeedRow,
+    _cells,
+    rows_of,
+    seed_rows_of,
+)
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Length, Place, _job
 from stlc.cli.framework.app import main
@@ -32,6 +41,22 @@ def test_a_row_needs_both_searches_and_fresh_drives() -> None:
     assert (row.failing_random, row.failing_falsify, row.before, row.after) == (1, 7, 4, None)
     (row,) = rows_of([*results, _result("fresh", AFTER, failing=2)])
     assert row.after == 2
+
+
+def test_seeds_that_were_trained_both_ways_are_compared() -> None:
+    def of_seed(seed: int, trained: str, failing: int, drives: int = 60) -> dict[str, object]:
+        result = _result("fresh", trained, failing)
+        own = {"training_seed": seed} if seed else {}
+        return {**result, "drives": drives, "key": {**result["key"], **own}}  # type: ignore[dict-item]
+
+    results = [of_seed(0, "guided", 3), of_seed(0, AFTER, 6), of_seed(1, "guided", 9)]
+    assert seed_rows_of(results) == []
+    results += [of_seed(1, AFTER, 12), of_seed(1, AFTER, 1, 6), of_seed(2, "guided", 0), of_seed(3, AFTER, 0)]
+    (row,) = seed_rows_of([*results, of_seed(2, "guided:falsify1", 0)])
+    assert row == SeedRow("traffic", (0, 1), (0.05, 0.15), (0.1, 0.2))
+    searched = [_result("random"), _result("falsify", failing=7), _result("fresh", failing=4)]
+    (alone,) = rows_of([*searched, of_seed(1, "guided", 9, 600)])
+    assert (alone.fresh, alone.before) == (60, 4)
 
 
 def test_searches_of_one_size_are_compared() -> None:
