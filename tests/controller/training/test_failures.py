@@ -137,8 +137,9 @@ class Clock:
         return self.time
 
 
+@pytest.mark.parametrize("interrupted", [False, True])
 def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
-    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupted: bool
 ) -> None:
     clock = Clock()
 
@@ -152,8 +153,12 @@ def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
         **{"held_out": 50, "method": "guided", "budget": 40.0, "seed": 3, "batch": 32, "drives": 0},
         falsify=True,
     )
-    search = Slow(batch=1)
-    first = train(car_task, config, _folder(car_task, tmp_path / "a", config), failures=search).run.dir
+    search, once = Slow(batch=1), iter([interrupted])
+    watch = Watch(stop=lambda: bool(search.calls) and next(once, False))
+    first = _folder(car_task, tmp_path / "a", config)
+    assert train(car_task, config, first, watch, failures=search).interrupted == interrupted
+    if interrupted:
+        resume(first, failures=search)
     schedule = StepSchedule.parse(first.record()["schedule"])
     rounds = [each.simulations for each in schedule.rounds]
     assert 0 in rounds
