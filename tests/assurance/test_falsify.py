@@ -284,6 +284,7 @@ class Oscillator:
         return ModelSimulator.load(str(self.folder / "oscillator.stl"), None, {})
 
 
+@pytest.mark.slow
 def test_workers_search_several_requirements_with_the_results_of_one_process(home: Path):
     source = Oscillator(home)
     simulator, order = source.load(), SearchOrder(SearchBudget(30), seed=1, shrinks=False)

@@ -230,7 +230,7 @@ def test_the_command_from_training_to_the_page(
 ) -> None:
     words = ["paper", "--only", "traffic", "--methods", "gradient", "--seeds", "5", "--steps", "2"]
     words += ["--parts", "learners"]
-    words += ["--held-out", "40", "--out", str(tmp_path / "bench"), "--runs", str(tmp_path / "runs")]
+    words += ["--held-out", "20", "--out", str(tmp_path / "bench"), "--runs", str(tmp_path / "runs")]
     words += ["--page", str(tmp_path / "docs" / "results.md"), "--json"]
 
     def answer(*more: str) -> dict[str, Any]:
