@@ -294,13 +294,16 @@ def test_a_budget_that_was_interrupted_near_its_end_tells_its_steps(car_task: Ta
 
 @pytest.mark.usefixtures("ticking")
 def test_a_budget_that_was_killed_before_its_first_checkpoint_is_planned_anew(
-    car_task: Task, tmp_path: Path
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = _folder(car_task, tmp_path / "a", BUDGET)
     steps = itertools.count(1)
-    assert train(car_task, BUDGET, folder, Watch(stop=lambda: next(steps) == 30)).interrupted
+    assert train(car_task, BUDGET, folder, Watch(stop=lambda: next(steps) == 60)).interrupted
     shutil.rmtree(folder.path / "ckpt")
     assert "," in folder.record()["schedule"]
+    slower = Ticks()
+    slower.count = 150
+    monkeypatch.setattr("stlc.controller.training.loop.clock_of", lambda _name: slower)
     resume(folder)
     told = replace(BUDGET, budget=None, steps=StepSchedule.parse(folder.record()["schedule"]))
     again = _folder(car_task, tmp_path / "b", told)

@@ -196,15 +196,21 @@ def test_an_interruption_right_after_a_round_is_repeated_by_the_record(
         assert torch.equal(value, right[name]), name
 
 
-def test_the_rounds_of_a_schedule_are_made_at_its_steps(car_task: Task, tmp_path: Path) -> None:
+def test_the_rounds_of_a_schedule_are_made_at_its_steps(
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decided = loop.resolve_config
+    monkeypatch.setattr(loop, "resolve_config", lambda task, config: replace(decided(task, config), every=10))
     schedule = StepSchedule.parse("60,simulations=7@50")
     config = TrainConfig(
         **{"held_out": 20, "method": "guided", "steps": schedule, "seed": 3, "batch": 16, "drives": 0},
         falsify=True,
     )
     search = Found()
-    train(car_task, config, _folder(car_task, tmp_path / "a", config), failures=search)
+    run = train(car_task, config, _folder(car_task, tmp_path / "a", config), failures=search).run.dir
     assert [simulations for simulations, _, _ in search.calls] == [7]
+    moment, rounds, last, *_ = _saved(run)["failures.counts"].tolist()
+    assert (moment, rounds, last) == (1, 1, 50)
     plain = replace(config, falsify=False)
     with pytest.raises(UsageError, match="rounds of falsification"):
         train(car_task, plain, _folder(car_task, tmp_path / "b", plain))
