@@ -390,6 +390,15 @@ def _option(key: str, value: str) -> tuple[str, ...]:
     return ("--reward", value) if key == "reward" else ("--option", f"{key}={value}")
 
 
+def _portable(word: str) -> str:
+    """Word of a command without folders of this machine: relative to the current one, or the last name."""
+    path = Path(word)
+    if not path.is_absolute():
+        return word
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else path.name
+
+
 def collect(run: RunDir, *, cores: int | None = None) -> Result:
     """Return the result of a finished training run, with its learning curve and its provenance.
 
@@ -405,7 +414,7 @@ def collect(run: RunDir, *, cores: int | None = None) -> Result:
         "training_accuracy": training_accuracy(run),
         "solved": pack(solved),
         "curve": _curve(run),
-        "command": ["stlc", *record["command"]],
+        "command": ["stlc", *map(_portable, record["command"])],
         "made": {**made, "cores": cores, "started": record["started"], "date": record["finished"]},
     }
 

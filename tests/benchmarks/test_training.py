@@ -249,6 +249,7 @@ def test_the_command_from_training_to_the_page(
     assert (before["passes"], after["passes"]) == (1, 2)
     assert first["rows"][0]["accuracy"] <= before["share"] <= after["share"] <= 1.0
     (cell,) = ResultStore("paper", tmp_path / "bench").all().values()
+    assert not [word for word in cell["command"] if word.startswith("/")]
     assert second["rows"][0]["known_feasible"] == after["share"]
     page = (tmp_path / "docs" / "results.md").read_text()
     assert page.count("<!-- paper -->") == 1
