@@ -194,7 +194,7 @@ class StepSchedule:
                 raise ValueError(f"at step {after.step} there cannot be {after.steps} in all")
         steps = [0, *(each.step for each in rounds), plannings[-1].steps]
         if any(after < before for before, after in pairwise(steps)) or len({*steps[1:-1]}) < len(rounds):
-            raise ValueError(f"the steps of its rounds do not rise up to {steps[-1]}")
+            raise ValueError(f"its rounds are not at rising steps from 0 to {steps[-1]}")
         return cls(tuple(plannings), tuple(rounds))
 
     def __str__(self) -> str:

@@ -236,6 +236,8 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     if config.falsify and not method.falsifies:
         able = ", ".join(each for each in METHODS if METHODS.get(each).falsifies)
         raise usage(f"method `{name}` cannot train with `--falsify`", f"methods that can: {able}")
+    if isinstance(config.steps, StepSchedule) and config.steps.rounds and not config.falsify:
+        raise usage("the schedule of `--steps` has rounds of falsification", "repeat it with --falsify")
     return _with_own(replace(found, method=name, falsify=config.falsify), config)
 
 

@@ -127,12 +127,12 @@ def train(
     started = now()
     keep_freed_memory()
     resolved = replace(resolve_config(task, config), ranks=ranks.size)
+    _require_search(resolved, failures)
     watch = watch or Watch()
     declared = task.system.decl.train
     fixed = config.steps or (declared.steps if config.budget is None else None)
     budget = 0.0 if fixed is not None else config.budget or declared.budget or DEFAULT_BUDGET
     schedule = fixed if isinstance(fixed, StepSchedule) else StepSchedule.of(fixed or PROVISIONAL)
-    _require_search(resolved, failures, schedule)
     writer = RunWriter(folder, writes=ranks.first)
     writer.config(resolved)
     writer.note({"engine": asdict(resolved), "schedule": str(schedule), "seconds_allowed": budget or None})
@@ -258,15 +258,8 @@ def _require_as_many(before: int, now: int) -> None:
         )
 
 
-def _require_search(
-    config: ResolvedConfig, failures: FailureSearch | None, schedule: StepSchedule | None = None
-) -> None:
-    """Raise UsageError (U101) if a training with `--falsify` has no search for drives, or several ranks.
-
-    The same holds for a training without it that should follow a `schedule` with rounds of falsification.
-    """
-    if schedule is not None and schedule.rounds and not config.falsify:
-        raise usage("the schedule has rounds of falsification", "stlc train SPEC --falsify --steps SCHEDULE")
+def _require_search(config: ResolvedConfig, failures: FailureSearch | None) -> None:
+    """Raise UsageError (U101) if a training with `--falsify` has no search for drives, or several ranks."""
     if config.falsify and config.ranks > 1:
         raise usage("`--falsify` is for a training in one process", "stlc train SPEC --falsify")
     if config.falsify and failures is None:

@@ -213,7 +213,8 @@ def test_the_rounds_of_a_schedule_are_made_at_its_steps(
     assert (moment, rounds, last) == (1, 1, 50)
     plain = replace(config, falsify=False)
     with pytest.raises(UsageError, match="rounds of falsification"):
-        train(car_task, plain, _folder(car_task, tmp_path / "b", plain))
+        _folder(car_task, tmp_path / "b", plain)
+    assert not (tmp_path / "b").exists()  # no run is left behind
 
 
 def test_every_plan_from_kept_states_is_trained_to_be_safe(car_task: Task) -> None:
