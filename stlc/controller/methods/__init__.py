@@ -192,6 +192,16 @@ class Learner(ABC):
         If the loss or its gradient is not finite, NaN is returned, and `step` does not count the step.
         """
 
+    def settle(self) -> bool:
+        """Do the work that is due after some steps only; the default does nothing.
+
+        Its duration is not part of the pace from which the number of steps is planned.
+
+        Returns:
+            False if a number was not finite, which ends the training, else True.
+        """
+        return True
+
     @property
     @abstractmethod
     def policy(self) -> Policy:

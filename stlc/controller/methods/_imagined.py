@@ -50,6 +50,9 @@ class ModelConfig(ActorConfig):
         model_held: share of the samples held out for validation of the networks.
         growth: share by which the number of episodes has to grow before the networks are trained again; 0.5
             means 50 %, and 0 means that the networks are trained in every training step.
+        until: share of the planned training steps after which the networks are not trained any more. One
+            training of the networks takes as long as many training steps, and exceeds a time budget if it
+            begins too late. 1: no limit.
         first: number of episodes with random controls before the networks are trained for the first time.
         capacity: number of episodes that are stored; new ones replace the oldest.
     """
@@ -66,6 +69,7 @@ class ModelConfig(ActorConfig):
     model_patience: int = 5
     model_held: float = bounded(0.2, 0, 0.9)
     growth: float = 0.5
+    until: float = bounded(1.0, 0, 1)
     first: int = bounded(200, 2, 10**6)
     capacity: int = bounded(20_000, 2, 10**6)
 
@@ -247,9 +251,9 @@ class LearntModel:
 class ModelLearner(Learner):
     """Training with a learnt model. An ensemble of networks learns the system from observed episodes.
 
-    One step of the training simulates `config.environments` episodes, trains the ensemble if enough episodes
-    were added, and then does what the subclass adds. A checkpoint holds the networks, the stored episodes and
-    the state of the random number generator.
+    One step of the training simulates `config.environments` episodes and does what the subclass adds. After
+    it, the ensemble is trained if enough episodes were added since its last training. A checkpoint holds the
+    networks, the stored episodes and the state of the random number generator.
 
     Attributes:
         episodes: the stored episodes.
@@ -293,33 +297,50 @@ class ModelLearner(Learner):
         """Learnt model of the system with the present weights of the ensemble."""
         return LearntModel(self.task, self.ensemble.predictor())
 
-    def observed(self, act: Callable[[Tensor, int], Tensor] | None) -> bool:
-        """Simulate `config.environments` episodes and store them; train the ensemble if enough were added.
+    def observed(self, act: Callable[[Tensor, int], Tensor]) -> bool:
+        """Simulate `config.environments` episodes and store them.
 
-        The ensemble is trained once the number of episodes has grown by the share `config.growth` since its
-        last training. The first call simulates at least `config.first` episodes, with random controls.
+        The first call simulates at least `config.first` episodes with random controls instead, and trains the
+        ensemble with them.
 
         Args:
-            act: function from states (N, n) and the step to controls (N, m); None for random controls.
+            act: function from states (N, n) and the step to controls (N, m).
 
         Returns:
-            False if the training of the ensemble diverged, else True.
+            False if the first training of the ensemble diverged, else True.
         """
         config = self.config
-        count = config.environments if self.episodes.total else max(config.first, config.environments)
+        begins = not self.episodes.total
+        count = max(config.first, config.environments) if begins else config.environments
         x0 = self.task.sample(count, generator=self.generator)
-        if act is None or not self.episodes.total:
+        if begins:
             plans = random_controls(self.task, count, self.generator)
             states, actions = play(self.task, x0, lambda _, step: plans[:, step])
         else:
             states, actions = play(self.task, x0, act)
         self.episodes.add(states, actions, rewards(self.task, self.reward, states, actions))
-        if self.episodes.total < (1.0 + config.growth) * self.fitted:
+        return self._fit() if begins else True
+
+    def settle(self) -> bool:
+        """Train the ensemble if the number of episodes has grown by the share `config.growth`.
+
+        After the share `config.until` of the planned steps, nothing is done.
+
+        Returns:
+            False if the training diverged, else True.
+        """
+        config = self.config
+        enough = self.episodes.total >= (1.0 + config.growth) * self.fitted
+        if not enough or self.episodes.total == self.fitted or self.step > config.until * self.steps:
             return True
+        return self._fit()
+
+    def _fit(self) -> bool:
+        """Train the ensemble with the stored episodes; return False if the training diverged."""
         own = len(self.task.system.decl.signature.names)
         inputs, targets = self.episodes.transitions(own)
         self.error = train_ensemble(
-            self.ensemble, self.optimizer, inputs, targets, fit=config.fit, generator=self.generator
+            self.ensemble, self.optimizer, inputs, targets, fit=self.config.fit, generator=self.generator
         )
         self.fitted = self.episodes.total
         return not math.isnan(self.error)

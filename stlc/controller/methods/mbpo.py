@@ -8,8 +8,8 @@ episode reaches the last step of a plan. The trajectory then consists of the obs
 imagined episode, followed by the imagined states.
 
 Meng and Fan (2023) compare with MBPO under these settings: `environments=1 growth=0 imagined=400 longest=15
-growing_from=20 growing_to=150 updates=10 critic_width=512 model_lr=1e-3 model_batch=256 temperature=0.2`, and
-`--lr 3e-4`. Unlike here, they also learn the reward.
+growing_from=20 growing_to=150 until=1 updates=10 critic_width=512 model_lr=1e-3 model_batch=256
+temperature=0.2`, and `--lr 3e-4`. Unlike here, they also learn the reward.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ class MbpoConfig(ModelConfig):
         longest: length of imagined episodes at the end of training, in steps.
         growing_from: training step from which the length grows linearly from `shortest`.
         growing_to: training step at which the length reaches `longest`.
+        until: share of the planned steps after which the networks are not trained any more, see
+            `ModelConfig`.
         observed: share of observed transitions in a batch; the others are imagined.
         updates: number of gradient steps of actor and critics for every observed step.
         critic_width: number of units per hidden layer of actor and critics.
@@ -63,6 +65,7 @@ class MbpoConfig(ModelConfig):
     longest: int = bounded(5, 1, 10**6)
     growing_from: int = 5
     growing_to: int = 40
+    until: float = bounded(0.5, 0, 1)
     observed: float = bounded(0.05, 0, 1)
     updates: float = 0.5
     critic_width: int = bounded(128, 1, 8192)
@@ -139,10 +142,11 @@ class MbpoLearner(ModelLearner):
         return max(1, round(config.shortest + share * (config.longest - config.shortest)))
 
     def advance(self) -> float:
-        """Simulate one episode per environment; then train ensemble, actor and critics, in this order.
+        """Simulate one episode per environment; then train actor and critics.
 
         Returns:
-            The mean loss of the critics; NaN if it is not finite or the ensemble diverged.
+            The mean loss of the critics; NaN if it is not finite, or if the first training of the ensemble
+            diverged.
         """
         before = self.environment_steps
 

@@ -217,10 +217,10 @@ class PetsLearner(ModelLearner):
         return PetsPolicy(self.task, self.model, self.config)
 
     def advance(self) -> float:
-        """Plan and simulate `config.environments` episodes; train the ensemble if enough were added.
+        """Plan and simulate `config.environments` episodes.
 
         Returns:
-            The validation error of the ensemble, see `train_ensemble`; NaN if its training diverged.
+            The validation error of the ensemble, see `train_ensemble`; NaN if its first training diverged.
         """
         plans: list[Tensor] = []
         planner = self.policy

@@ -277,8 +277,8 @@ class Pace:
         self._apart += seconds
         self._since_validation += seconds
 
-    def searched_drives(self, seconds: float) -> None:
-        """Record that a round of falsification took `seconds`."""
+    def irregular(self, seconds: float) -> None:
+        """Record that work which few steps need took `seconds`, such as a round of falsification."""
         self._apart += seconds
 
     def validated(self, step: int, seconds: float) -> None:

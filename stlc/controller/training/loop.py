@@ -350,7 +350,11 @@ class _Session:
         while (more := self._goes_on()) and not self._hopeless():
             if not math.isfinite(learner.advance()):
                 raise self._broken()
-            self.pace.stepped(learner.step, self.now(), search_runs=learner.searching)
+            began = self.now()
+            self.pace.stepped(learner.step, began, search_runs=learner.searching)
+            if not learner.settle():
+                raise self._broken()
+            self.pace.irregular(self.now() - began)
             due = learner.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
             if learner.ranks.any(due):
                 self._save()
@@ -450,7 +454,7 @@ class _Session:
             self.schedule = self.schedule.with_round(step, made)
             self._note_schedule()
         self.falsified += self.now() - began
-        self.pace.searched_drives(self.now() - began)
+        self.pace.irregular(self.now() - began)
         self.writer.note({"falsification": bank.summary()})
         return True
 

@@ -37,7 +37,7 @@ TINY["pets"] |= {"population": 10, "rounds": 2, "particles": 4, "model_epochs": 
 
 def tiny(task: Task, method: str, **changed: object) -> ResolvedConfig:
     config = resolve_config(task, TrainConfig(method=method, seed=3))
-    return replace(config, **TINY[method], **changed)  # type: ignore[arg-type]
+    return replace(config, **TINY[method] | changed)  # type: ignore[arg-type]
 
 
 def learner_of(task: Task, method: str, **changed: object) -> imagined.ModelLearner:
@@ -77,15 +77,41 @@ def test_kept_episodes_replace_the_oldest(car_task: Task) -> None:
     assert torch.equal(again.states, kept.states)
 
 
+def _made(learner: imagined.ModelLearner) -> float:
+    """Loss of one whole step: `advance`, then `settle`."""
+    loss = learner.advance()
+    assert learner.settle()
+    return loss
+
+
+def test_networks_are_trained_once_enough_episodes_were_added_and_not_near_the_end(car_task: Task) -> None:
+    def fitted(**changed: object) -> list[int]:
+        learner = learner_of(car_task, "mbpo", **changed)  # 4 steps of 2 episodes, after 6 random ones
+        return [(_made(learner), learner.fitted)[1] for _ in range(4)]
+
+    assert fitted(until=1.0) == [6, 8, 10, 12]
+    assert fitted(until=0.5) == [6, 8, 8, 8]
+    assert fitted(until=1.0, growth=0.5) == [6, 6, 10, 10]
+    assert fitted(until=0.0, growth=0.5) == [6, 6, 6, 6]
+
+
+def test_a_late_training_of_the_networks_that_diverges_ends_the_run(car_task: Task) -> None:
+    learner = learner_of(car_task, "mbpo")
+    _made(learner)
+    learner.advance()
+    learner.ensemble.highest.data.fill_(math.nan)
+    assert not learner.settle()
+
+
 @pytest.mark.parametrize("method", ["mbpo", "pets"])
 @pytest.mark.parametrize("kind", ["robustness", "task"])
 def test_it_resumes_bit_for_bit(car_task: Task, method: str, kind: str) -> None:
     whole, part = (learner_of(car_task, method, reward=kind) for _ in range(2))
-    losses = [whole.advance() for _ in range(3)]
-    part.advance()
+    losses = [_made(whole) for _ in range(3)]
+    _made(part)
     resumed = learner_of(car_task, method, reward=kind)
     resumed.restore({name: value.clone() for name, value in part.tensors().items()}, part.facts())
-    assert [resumed.advance() for _ in range(2)] == losses[1:]
+    assert [_made(resumed) for _ in range(2)] == losses[1:]
     assert resumed.step == 3
     assert resumed.environment_steps == whole.environment_steps == car_task.horizon * (6 + 2 + 2)
     assert all(torch.equal(value, resumed.tensors()[name]) for name, value in whole.tensors().items())

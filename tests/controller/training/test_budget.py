@@ -141,6 +141,16 @@ def test_a_run_is_left_alone_while_it_is_in_time() -> None:
     assert pace.plan(101, 101 + 480, 150, 50.0) == 101 + 400
 
 
+def test_irregular_work_is_no_part_of_the_pace() -> None:
+    pace = Pace(every=50, searching=False, now=0.0, seconds=100.0)
+    for step in range(1, 21):
+        pace.stepped(step, 0.5 * step + (30.0 if step > 15 else 0.0), search_runs=False)
+        if step == 15:
+            pace.irregular(30.0)
+    assert pace.per_step == 0.5
+    assert pace.plan(20, PROVISIONAL, 10**6, 60.0) == 20 + 120
+
+
 def test_the_verdict_has_a_share_of_the_budget() -> None:
     for seconds in (5.0, 30.0, 300.0, 3600.0):
         assert 0.02 * seconds <= verdict_reserve(seconds) <= 0.08 * seconds

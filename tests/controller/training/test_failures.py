@@ -133,7 +133,7 @@ class Clock:
         self.time = 0.0
 
     def __call__(self) -> float:
-        self.time += 0.1
+        self.time += 0.05
         return self.time
 
 
