@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import re
@@ -173,6 +174,16 @@ def reported(action: str) -> Iterator[None]:
 # ----------------------------------------------------------------------- finding
 
 
+def require_folder(path: Path) -> None:
+    """Check, before any work, that a path is a folder or can become one.
+
+    Raises:
+        FileExistsError: it is a file.
+    """
+    if path.exists() and not path.is_dir():
+        raise FileExistsError(errno.EEXIST, "it is a file, and a folder is needed", str(path))
+
+
 def find_system(name: str, spec_path: Path | None = None) -> Path:
     """Find the system file called `name` and return its path.
 
@@ -223,6 +234,9 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
         path = folder / name
         if path.is_file() or _is_bag(path):
             return path
+    if Path(name).is_dir():
+        advice = f"name its traces: '{Path(name) / '*'}'"
+        raise UsageError(Diagnostic("U102", f"`{name}` is a folder, not a trace", help=(advice,)))
     raise UsageError(_no_such("trace", name, folders))
 
 

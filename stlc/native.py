@@ -520,6 +520,8 @@ def _compile(using: str, source: Path, target: Path, key: str) -> None:
     except TooMuchError as much:
         remember(key, much.why, seconds=LONG_REMEMBERED)
         raise
+    if why and not source.exists():
+        raise CompilerError("was interrupted: a forced exit removed its folder")
     if why:
         remember(key, why)
         raise CompilerError(why)

@@ -189,6 +189,29 @@ def written_unit(text: str) -> Unit:
     return parse_unit(text) if text else DIMENSIONLESS
 
 
+_QUANTITY = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>[^\d\s.].*)?")
+
+
+def parse_quantity(text: str, unit: Unit) -> float:
+    """Parse a finite number with or without a unit, such as `36 km/h`, and return its value in `unit`.
+
+    Raises:
+        ValueError: the text is not such a number, or its unit has another dimension than `unit`; the message
+            has the reason.
+    """
+    match = _QUANTITY.fullmatch(text.strip())
+    found = float(match["number"]) if match is not None else math.nan
+    if match is None or not math.isfinite(found):
+        raise ValueError(f"`{text.strip()}` is not a finite number")
+    given = parse_unit(match["unit"]) if match["unit"] else unit
+    if given.dims != unit.dims:
+        raise ValueError(f"`{given}` is not a unit of [{unit}]")
+    if given == unit:
+        return found
+    in_si = found * given.scale + float(given.offset)
+    return (in_si - float(unit.offset)) / unit.scale
+
+
 CELSIUS = "degrees Celsius are written `degC`, kelvin `K`"
 _CELSIUS = re.compile(r"deg(?:ree)?s?[_. ]*C(?:elsius)?|°[_ ]*C|Cel(?:sius)?|centigrade", re.IGNORECASE)
 

@@ -10,8 +10,13 @@ import sys
 import pytest
 from hypothesis import HealthCheck, settings
 
+from stlc.__main__ import GARBAGE
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ["COLUMNS"] = "100"  # layout must not depend on the terminal that runs the tests
+for _name in ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "PY_COLORS"):
+    os.environ.pop(_name, None)
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of tests start the program
 sys.dont_write_bytecode = False
 
@@ -38,6 +43,7 @@ def pytest_collection_finish() -> None:
     """Modules and test items, some 600,000 objects, are not searched for garbage again and again."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(*GARBAGE)
 
 
 @pytest.fixture(autouse=True)
@@ -46,14 +52,6 @@ def _one_torch_thread() -> None:
     torch = sys.modules.get("torch")
     if torch is not None and torch.get_num_threads() != 1:
         torch.set_num_threads(1)
-
-
-@pytest.fixture(autouse=True)
-def _plain_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Layout must not depend on the terminal that runs the tests."""
-    for name in ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "PY_COLORS"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("COLUMNS", "100")
 
 
 @pytest.fixture(autouse=True)

@@ -16,6 +16,7 @@ from stlc.cache import persistent
 from stlc.compile.backends.c.emit import LANES, Motion, emit
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Notice
+from stlc.toolchain import CompilerError
 
 MOTION = Motion(("x",), ("u",), (), {"x": ir.Op("add", (ir.Signal("x"), ir.Signal("u")))}, 5, 0.1)
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
@@ -87,6 +88,16 @@ def test_a_compiler_that_fails_is_not_tried_again_at_once(
             assert native.load(SMALL) is None
         toolchain._known.clear()
     assert native.why_none(SMALL) == "the C compiler fails with exit code 1"
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_compilation_whose_folder_a_forced_exit_removed_is_no_failure(tmp_path: Path) -> None:
+    removing = tmp_path / "cc"
+    removing.write_text('#!/bin/sh\nfor each; do test -f "$each" && rm "$each"; done\nexit 1\n')
+    removing.chmod(0o755)
+    with pytest.raises(CompilerError, match="was interrupted"):
+        native._built(SMALL, str(removing), "key")
+    assert toolchain.trouble("key") == ""
 
 
 def test_another_version_of_the_compiler_has_another_kernel(

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_quantity, parse_unit, same_dims
 
 _PRODUCTS = sorted(symbol for symbol, unit in SYMBOLS.items() if not unit.offset)
 _factors = st.lists(st.tuples(st.sampled_from(_PRODUCTS), st.integers(-3, 3)), min_size=1, max_size=3)
@@ -155,3 +155,34 @@ def test_other_spellings_of_degrees_celsius(text: str) -> None:
 @pytest.mark.parametrize("text", ["deg", "C", "degrees", "cell", "degF", "c"])
 def test_what_means_something_else(text: str) -> None:
     assert not means_celsius(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("36 km/h", "m/s", 10.0),
+        ("36km/h", "m/s", 10.0),
+        ("-1.5e1", "m", -15.0),
+        (" .5 m ", "cm", 50.0),
+        ("20 degC", "K", 293.15),
+        ("293.15 K", "degC", 20.0),
+        ("50 %", "1", 0.5),
+    ],
+)
+def test_a_quantity(text, unit, value):
+    assert parse_quantity(text, parse_unit(unit)) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("5 kg", r"`kg` is not a unit of \[m\]"),
+        ("1e999", "`1e999` is not a finite number"),
+        ("inf", "`inf` is not a finite number"),
+        ("", "`` is not a finite number"),
+        ("2 bananas", "unknown unit `bananas`"),
+    ],
+)
+def test_what_is_no_quantity(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_quantity(text, parse_unit("m"))

@@ -162,3 +162,29 @@ def test_the_document_has_the_diagnosis(capsys: pytest.CaptureFixture[str]) -> N
     document = json.loads(capsys.readouterr().out)
     assert (document["ok"], [finding["code"] for finding in document["diagnostics"]]) == (False, ["R404"])
     assert document["result"]["feasible"] == 0.0
+
+
+def test_a_file_where_a_folder_is_needed_is_told_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("taken").write_text("mine", encoding="utf-8")
+    Path("s.stl").write_text("spec s\nsignal x [m]\nrequire r: always[0 s, 1 s] x > 0\n", encoding="utf-8")
+    for name in ("a.csv", "b.csv"):
+        Path(name).write_text("t,x\n0,1\n1,1\n", encoding="utf-8")
+    assert main(["check", "s.stl", "a.csv", "b.csv", "--out", "taken"]) == 5
+    assert "error[R201]: cannot use `taken`" in capsys.readouterr().err
+    spec = str(Path(__file__).parents[2] / "specs/arch/chasing_cars.stl")
+    assert main(["falsify", spec, "--simulations", "1", "--output", "taken"]) == 5
+    assert "error[R201]: cannot use `taken`" in capsys.readouterr().err
+    assert Path("taken").read_text(encoding="utf-8") == "mine"
+
+
+def test_a_folder_of_traces_is_told_how_to_be_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("logs").mkdir()
+    Path("s.stl").write_text(SPEC + NEAR, encoding="utf-8")
+    assert main(["check", "s.stl", "logs"]) == 2
+    assert "`logs` is a folder, not a trace\n  = help: name its traces: 'logs/*'" in capsys.readouterr().err

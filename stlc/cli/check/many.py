@@ -16,6 +16,7 @@ from stlc.cli.framework.documents import InvalidTrace
 from stlc.cli.framework.output import COLOR, table
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, usage
 from stlc.escape import operand
+from stlc.files import require_folder
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Sample
@@ -280,6 +281,7 @@ def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:
     if out.suffix:
         message = f"`--out {out}` is one file, and {len(names)} traces are judged"
         raise usage(message, "name a folder: --out robustness/")
+    require_folder(out)
     stems = [Path(name).stem for name in names]
     if len(set(stems)) < len(stems):
         stems = [f"{i:04d}-{stem}" for i, stem in enumerate(stems)]

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     "stlc check specs/traffic.stl drives/*.parquet --jobs 0 --junit checks.xml",
     "stlc check specs/traffic.stl 'logs/**/*.parquet' --cluster auto --table verdicts.parquet",
     "stlc check specs/traffic.stl logs/*.csv --certify .95",
-    "stlc check specs/traffic.stl drive.csv --uncertain dx=0.1m --uncertain v=2%",
+    "stlc check specs/traffic.stl drive.csv --uncertain dx=0.1m --uncertain x=2%",
     "stlc check specs/traffic.stl bag.mcap --resample 0.1s --map dx=lead.gap",
 )
 def check(

@@ -21,6 +21,7 @@ from stlc.cli.framework.assured import (
     ReplayedCounterexample,
 )
 from stlc.cli.framework.options import (
+    MOST_SEED,
     ClusterOption,
     GuardOption,
     RequireOption,
@@ -75,7 +76,7 @@ def falsify(
     time: Annotated[
         str | None, typer.Option("--time", metavar="TIME", help="Time per requirement at most.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of the search.")] = 0,
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that simulate.")] = 1,
     cluster: ClusterOption = None,
     batch: Annotated[
@@ -115,11 +116,13 @@ def falsify(
     simulation fails; else 5 if simulations were lost with their processes, three times each; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
+    from stlc.files import require_folder
 
     made = _Target(target, system, plant, guard, agents, steps, scenario, seed)
     overrides = parse_overrides(set_)
     if replay is not None:
         return _replayed(made, replay, overrides, runs)
+    require_folder(output)
     limit = None if time is None else parse_seconds(time)
     require_no_jobs(cluster, jobs)
     source = _Source(made, overrides, runs, jobs, cluster)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stlc.cli.framework.options import (
+    MOST_SEED,
     FailUnderOption,
     PlannerOptionsOption,
     SetOption,
@@ -18,7 +21,7 @@ from stlc.cli.framework.options import (
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.plan_documents import Plans, PlanTubes
-from stlc.cli.framework.program import command
+from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
 from stlc.registry import PLANNERS
 
@@ -56,7 +59,9 @@ def plan(
     target: Annotated[
         str, typer.Option(metavar="RHO|max", help="Robustness at which the search ends.")
     ] = "0",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the planner and of random states.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=MOST_SEED, help="Seed of the planner and of random states.")
+    ] = 0,
     tube: Annotated[
         str | None,
         typer.Option(
@@ -73,15 +78,17 @@ def plan(
 
     The best plan from each initial state is written to a trace, which `stlc check` and `stlc plot` can read.
     Every plan is judged exactly in float64. If the search finds no satisfying plan, there may still be one.
-    Only the planner milp can prove that there is none. Ctrl-C ends the search and keeps the best plans found.
-    With --tube, the states and the robustness that the errors of a scenario can lead to are bounded: wrong
-    parameters, actuators and measurements, and disturbances. A plan then counts as satisfying only if the
-    lower bound does. Without --fail-under, the exit code is 1 if a plan does not satisfy the specification.
+    Only the planner milp can prove that there is none. Ctrl-C and SIGTERM end the search; the plans found are
+    kept, and initial states without any left out. With --tube, the states and the robustness that the errors
+    of a scenario can lead to are bounded: wrong parameters, actuators and measurements, and disturbances. A
+    plan then counts as satisfying only if the lower bound does. Without --fail-under, the exit code is 1 if a
+    plan does not satisfy the specification.
     """
     from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.controller.planning.traces import starts_of, trace_of
     from stlc.controller.problem.load import load_task
     from stlc.controller.verification.tubes import TubeModel
+    from stlc.stopping import leaving
     from stlc.trace import check_writable, save_trace
 
     check_writable(output)
@@ -92,29 +99,48 @@ def plan(
     show_diagnostics(task.compiled.warnings)
     model = None if tube is None else TubeModel(task)
     states = starts_of(task, from_, starts, seed)
-    search = PlanSearch(task, states, PlanBudget(choice.seconds, judged, _target(target)), seed=seed)
+    limits = PlanBudget(choice.seconds, judged, _target(target))
+
+    def save(found: PlanResult) -> None:
+        if len(found.rho):
+            save_trace(output, trace_of(task, found, seed))
+
+    def interrupted(found: PlanResult) -> None:
+        say(f"interrupted: {len(found.rho):,} of {len(states):,} initial states were planned for")
+
+    def forced(_code: int) -> None:
+        save(search.result.tried)
+        interrupted(search.result.tried)
+
     with PULSE.doing(f"planning, {method}"):
         solver = prepared(planner, task)
-        try:
-            solver(search)
-        except KeyboardInterrupt:
-            say("interrupted: the best plans so far are kept")
-    result = search.result
-    save_trace(output, trace_of(task, result, seed))
+        with noting_signals() as signals:
+            search = PlanSearch(task, states, replace(limits, stop=lambda: bool(signals)), seed=seed)
+            with leaving(forced):
+                solver(search)
+                result = search.result.tried if signals else search.result
+                save(result)
+    if signals:
+        interrupted(result)
+        if not len(result.rho):
+            raise typer.Exit(signals[0])
     record = _record(task, result, choice, output)
     if model is not None:
         record["tube"] = _bounded(model, result, tube)
     good = record["tube"]["guaranteed"] if model is not None else record["satisfied"]
     missed = good / record["starts"] < (1.0 if fail_under is None else fail_under)
-    return Answer(record, lambda: emit("\n".join(_lines(record))), int(missed))
+    return Answer(record, lambda: emit("\n".join(_lines(record))), signals[0] if signals else int(missed))
 
 
 def _target(text: str) -> float:
     """Parse the robustness at which a search ends; `max` is infinity. Raises UsageError (U101)."""
     try:
-        return float("inf") if text.strip() == "max" else float(text)
+        found = float("inf") if text.strip() == "max" else float(text)
     except ValueError:
-        raise usage(f"`--target {text}` is no robustness", "--target 0.1 or max") from None
+        found = math.nan
+    if math.isnan(found):
+        raise usage(f"`--target {text}` is no robustness", "--target 0.1 or max")
+    return found
 
 
 def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path) -> Plans:

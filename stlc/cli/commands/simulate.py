@@ -345,6 +345,7 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
     """Return the scenarios that are simulated in addition to the system without a scenario: name -> scenario.
 
     The mapping is empty if `scenario`, the value of `--scenario`, is None or the name of a single scenario.
+    Raises UsageError (U101) if the system declares none although all are asked for.
     """
     from stlc.dynamics.scenarios.scenario import DISTURBED, find_scenario
 
@@ -352,6 +353,8 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
     declared = {each.name: each for each in decl.scenarios}
     if scenario in declared:
         return {}
+    if scenario == ALL and not declared:
+        raise usage(f"`{decl.name}` declares no scenarios", f"--scenario {USUAL}: those of every system")
     if scenario == ALL:
         return declared
     return {name: find_scenario(decl, name) for name in DISTURBED} if scenario == USUAL else {}

@@ -16,6 +16,7 @@ import typer
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.documents import TrainedRun, TrainedRuns
 from stlc.cli.framework.options import (
+    MOST_SEED,
     PicturesOption,
     RunsOption,
     SetOption,
@@ -77,7 +78,7 @@ def train(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the system file's if not given."),
+        typer.Option(min=0, max=MOST_SEED, help="Seed of everything random; the system file's if not given."),
     ] = None,
     seeds: Annotated[
         str | None,

@@ -13,6 +13,7 @@ import typer
 from stlc.cli.framework.assured import Verified, VerifiedMode
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
+    MOST_SEED,
     FailUnderOption,
     RunsOption,
     SystemOption,
@@ -71,7 +72,7 @@ def verify(
         str, typer.Option(metavar="wall|processor", help="Clock of the search for proofs.")
     ] = "wall",
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that prove.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the sampled states.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of the sampled states.")] = 0,
     fail_under: FailUnderOption = None,
     runs: RunsOption = Path("runs"),
 ) -> Answer[Verified]:

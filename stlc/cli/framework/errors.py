@@ -20,7 +20,10 @@ INTERRUPTED = 130
 TERMINATED = 143
 
 _NO_WRITING = frozenset(
-    {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.EIO, errno.EMFILE}
+    {
+        *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.EIO),
+        *(errno.EMFILE, errno.EEXIST),
+    }
 )
 _NO_FILE = frozenset({errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
 _EXTRAS = {"matplotlib": "plot", "PIL": "plot", "pybullet": "panda", "pytorch_kinematics": "panda"}

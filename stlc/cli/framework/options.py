@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from stlc.controller.training.budget import Clock
     from stlc.controller.training.config import PlannerChoice
 
+MOST_SEED = 2**63 - 1
+"""Greatest seed of torch's random numbers."""
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
 GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS), help="Guard of the policy.")]
 SystemOption = Annotated[
@@ -205,7 +208,7 @@ def parse_seconds(text: str) -> float:
         if parse_unit(unit).dims != parse_unit("s").dims or not 0.0 < value < 1e9:
             raise ValueError
     except ValueError as error:
-        raise usage(f"`{text}` is not a duration", "write it as --budget 60s or 5min") from error
+        raise usage(f"`{text}` is not a duration", "write it as 60s or 5min") from error
     return value
 
 

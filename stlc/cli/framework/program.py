@@ -315,6 +315,30 @@ def _stoppable() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def noting_signals() -> Iterator[list[int]]:
+    """Context in which the first Ctrl-C or SIGTERM is only noted, and a second one ends the command.
+
+    Yields a list, to which the exit code of each received signal is appended.
+    """
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        noted.append(INTERRUPTED if number == signal.SIGINT else TERMINATED)
+        if len(noted) > 1:
+            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(TERMINATED)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield noted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 # ------------------------------------------------------- option values: metavars, no pydantic
 
 _METAVARS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH"}

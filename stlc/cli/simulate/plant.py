@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from stlc.cli.framework.plant_documents import (
 from stlc.diagnostics import usage
 from stlc.escape import operand, shell, visible
 from stlc.registry import did_you_mean
-from stlc.units import parse_unit
+from stlc.units import parse_quantity
 
 if TYPE_CHECKING:
     from stlc.monitor.judgement import Status
@@ -36,7 +35,6 @@ CARRYING = (".npz", ".mcap")
 """Suffixes of recorded traces that carry their specification."""
 MOST_SHOWN = 5
 """Findings that are printed in full."""
-_VALUE = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>\D.*)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,17 +137,11 @@ def _assignments(plant: Plant, text: str) -> Iterator[tuple[str, float]]:
 
 def _value(variable: PlantVariable, part: str, text: str) -> float:
     """Return the value of a variable in its unit, from a text such as `1 m`. Raises UsageError (U101)."""
-    match = _VALUE.fullmatch(text)
     try:
-        unit = parse_unit(match["unit"].strip()) if match is not None and match["unit"] else variable.unit
+        found = parse_quantity(text, variable.unit)
     except ValueError as error:
-        raise usage(f"`{part}`: {error}") from None
-    if match is None or unit.dims != variable.unit.dims:
-        raise usage(f"`{part}` is not of the form NAME=NUMBER", f"`{variable.name}` is in [{variable.unit}]")
-    found = float(match["number"])
-    if unit != variable.unit:
-        in_si = found * unit.scale + float(unit.offset)
-        found = (in_si - float(variable.unit.offset)) / variable.unit.scale
+        advice = f"write NAME=NUMBER; `{variable.name}` is in [{variable.unit}]"
+        raise usage(f"`{part}`: {error}", advice) from None
     if not variable.low <= found <= variable.high:
         span = in_unit(f"[{variable.low:g}, {variable.high:g}]", variable.unit.text)
         raise usage(f"`{part}` is outside the range of `{variable.name}`, {span}")

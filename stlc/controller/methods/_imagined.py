@@ -17,10 +17,10 @@ from torch import Tensor
 from stlc.controller.methods import Learner
 from stlc.controller.methods._actor import ActorConfig, optimizer_tensors, restore_optimizer
 from stlc.controller.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
+from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import MOST, Environments, Reward, reward_at_end
 from stlc.controller.training.checkpoint import below
-from stlc.controller.training.config import bounded
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:

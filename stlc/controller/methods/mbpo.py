@@ -25,9 +25,10 @@ from stlc.controller.methods import Method
 from stlc.controller.methods._actor import ActorPolicy
 from stlc.controller.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
 from stlc.controller.methods._soft_actor_critic import BOUND, SacOptions, SoftActorCritic, TransitionBatch
+from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers
-from stlc.controller.training.config import base_config, bounded
+from stlc.controller.training.config import base_config
 from stlc.controller.training.run import load_weights
 
 if TYPE_CHECKING:

@@ -28,8 +28,9 @@ from stlc.controller.methods._imagined import (
     final_reward,
     step_rewards,
 )
+from stlc.controller.options import bounded
 from stlc.controller.policies.policy import Policy
-from stlc.controller.training.config import base_config, bounded
+from stlc.controller.training.config import base_config
 from stlc.controller.training.run import load_weights
 
 if TYPE_CHECKING:

@@ -25,6 +25,7 @@ from stlc.controller.methods._actor import (
     optimizer_tensors,
     restore_optimizer,
 )
+from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers
 from stlc.controller.problem.environments import Environments, Reward
@@ -76,14 +77,14 @@ class PpoConfig(ActorConfig):
     """
 
     environments: int = ENVIRONMENTS
-    epochs: int = 5
-    minibatches: int = 8
-    discount: float = 1.0
-    trace: float = 0.95
+    epochs: int = bounded(5, 1, 10**6)
+    minibatches: int = bounded(8, 1, 10**6)
+    discount: float = bounded(1.0, 0, 1)
+    trace: float = bounded(0.95, 0, 1)
     ratio: float = 0.2
     entropy: float = 0.005
-    deviation: float = 1.0
-    correlation: float = 0.8
+    deviation: float = bounded(1.0, 1e-6, 1e3)
+    correlation: float = bounded(0.8, 0, 1)
 
 
 class Moments(nn.Module):

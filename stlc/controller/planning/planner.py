@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import Field, dataclass, fields
 from time import process_time
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.options import allowed, bounds_of
 from stlc.controller.policies.policy import Policy
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.native import Stop, never
@@ -76,6 +77,13 @@ class PlanResult:
     def satisfied(self) -> Tensor:
         """Mask of the initial states whose plan satisfies the specification, (B,)."""
         return self.rho >= -TOLERANCE
+
+    @property
+    def tried(self) -> PlanResult:
+        """Results of the initial states for which a plan was judged or a proof was found."""
+        rows = (self.evaluations > 0) | self.infeasible
+        parts = (self.states, self.plans, self.rho, self.infeasible, self.seconds, self.evaluations)
+        return PlanResult(*(part[rows] for part in parts))
 
 
 class PlanSearch:
@@ -217,7 +225,8 @@ def planner_named(name: str, **options: Any) -> Planner:
         options: fields of the planner; values may be texts, as on a command line.
 
     Raises:
-        UsageError: U101, there is no such planner or option, or a value has the wrong type.
+        UsageError: U101, there is no such planner or option, or a value has the wrong type or is out of
+            bounds.
     """
     kind = PLANNERS.get(name)
     known = {each.name: each for each in fields(kind)}
@@ -228,7 +237,7 @@ def planner_named(name: str, **options: Any) -> Planner:
             listed = f"options: {', '.join(known)}" if known else "it has none"
             advice = listed if near is None else f"did you mean `{near}`?  {listed}"
             raise UsageError(Diagnostic("U101", f"planner `{name}` has no option `{key}`", help=(advice,)))
-        values[key] = _value(name, key, value, type(known[key].default))
+        values[key] = _value(name, known[key], value)
     planner: Planner = kind(**values)
     return planner
 
@@ -249,22 +258,28 @@ def _without_choice(search: PlanSearch) -> None:
     search.ended[rows] = True
 
 
-def _value(name: str, key: str, value: object, kind: type) -> Any:
-    """Convert the value of a planner's option from text to the option's type `kind`.
+def _value(name: str, option: Field[Any], value: object) -> Any:
+    """Convert the value of a planner's option from text to the type of its default.
 
     Raises:
-        UsageError: U101, the text is not of this type.
+        UsageError: U101, the text is not of this type, or the number is out of its bounds.
     """
-    if not isinstance(value, str) or kind is str:
-        return value
-    try:
-        if kind is bool:
-            return {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}[value]
-        return kind(value)
-    except (ValueError, KeyError):
-        wanted = {bool: "`true` or `false`", int: "a whole number"}.get(kind, "a number")
-        message = f"option `{key}` of planner `{name}` is {wanted}, not `{value}`"
-        raise UsageError(Diagnostic("U101", message)) from None
+    kind: Any = type(option.default)
+    message = f"option `{option.name}` of planner `{name}` is"
+    wanted = {bool: "`true` or `false`", int: "a whole number"}.get(kind, "a number")
+    if isinstance(value, str) and kind is not str:
+        try:
+            value = _WORDS[value] if kind is bool else kind(value)
+        except (ValueError, KeyError):
+            raise usage(f"{message} {wanted}, not `{value}`") from None
+    if kind in (int, float):
+        least, most = bounds_of(option)
+        if not isinstance(value, (int, float)) or not least <= value <= most:
+            raise usage(f"{message} {wanted} {allowed(least, most)}, not `{value}`")
+    return value
+
+
+_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
 def plan(

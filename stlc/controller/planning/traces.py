@@ -18,7 +18,7 @@ from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.trace import Trace, TraceMeta, load_trace
-from stlc.units import parse_unit
+from stlc.units import parse_quantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -39,7 +39,8 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         seed: seed of random states.
 
     Raises:
-        UsageError: U101, an assignment is invalid, or the traces lack a state; U102, there is no such file.
+        UsageError: U101, an assignment is invalid, or the traces lack a state or its first value; U102, there
+            is no such file.
         TraceError: the trace file is invalid.
     """
     if text == RANDOM:
@@ -57,8 +58,8 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
     """Name of a state and its value in SI units, from a text such as `v = 2 m/s`.
 
     Raises:
-        UsageError: U101, the system has no such state; or the value is neither a number, with or without a
-            unit, nor a label of the state.
+        UsageError: U101, the system has no such state; or the value is not a finite number with or without a
+            unit of its dimension, not a label of the state, or a value that the state never has.
     """
     name, _, value = (each.strip() for each in part.partition("="))
     if name not in task.system.names:
@@ -66,17 +67,23 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
         known = f"states: {', '.join(task.system.names)}"
         advice = known if near is None else f"did you mean `{near}`?  {known}"
         raise usage(f"`{task.system.decl.name}` has no state `{name}`", advice)
-    number, _, unit = value.partition(" ")
     column = task.system.signature.columns[task.system.names.index(name)]
+    labels = dict(column.labels)
+    if value in labels:
+        return name, float(labels[value])
     try:
-        given = parse_unit(unit.strip()) if unit.strip() else None
-        labels = dict(column.labels)
-        if number in labels:
-            return name, float(labels[number])
-        found = float(number)
-    except ValueError:
-        raise usage(f"`{part.strip()}` is not of the form NAME=NUMBER", "x=1.5, v=2 m/s") from None
-    return name, found if given is None else found * float(given.scale) + float(given.offset)
+        found = parse_quantity(value, column.unit)
+    except ValueError as error:
+        listed = f"or {', '.join(labels)}" if labels else f"`{name}` is in [{column.unit}]"
+        raise usage(
+            f"`{part.strip()}`: {error}", f"write NAME=NUMBER, such as x=1.5, v=2 m/s; {listed}"
+        ) from None
+    if labels and found not in labels.values():
+        raise usage(f"`{part.strip()}`: `{name}` is one of {', '.join(labels)}")
+    low, high = column.low, column.high
+    if column.fact and not labels and low is not None and high is not None and not low <= found <= high:
+        raise usage(f"`{part.strip()}`: `{name}` is always within [{low:g}, {high:g}]")
+    return name, found
 
 
 def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
@@ -87,7 +94,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     Raises:
         UsageError: U101, the traces lack a state; U102, there is no such file.
     """
-    if not Path(text).exists():
+    if not text.strip() or not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
         raise UsageError(Diagnostic("U102", f"there is no file `{text}` with initial states", help=help_))
     trace = load_trace(text)
@@ -99,6 +106,10 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     for index, name in enumerate(task.system.names):
         if name in trace.data:
             states[:, index] = torch.tensor(trace.data[name][:rows, 0])
+    absent = (~torch.isfinite(states)).nonzero()
+    if len(absent):
+        row, column = absent[0].tolist()
+        raise usage(f"trace {row} of `{text}` has no first value of `{task.system.names[column]}`")
     return states
 
 

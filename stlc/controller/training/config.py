@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import torch
 
+from stlc.controller.options import MOST, allowed, bounds_of
 from stlc.controller.problem.environments import Reward
 from stlc.controller.training.budget import Clock, StepSchedule, cores
 from stlc.diagnostics import usage
@@ -174,11 +175,6 @@ _MOST = {
 MOST_TEXT = 1000
 
 
-def bounded(default: float, least: float, most: float) -> Any:
-    """Field of an options class: a number from `least` to `most`; `checked_config` checks these bounds."""
-    return field(default=default, metadata={"bounds": (least, most)})
-
-
 _POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks", "environments")
 
 
@@ -210,11 +206,12 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
                 raise ValueError(f"`{option.name}` is {value!r:.40}, neither true nor false")
             continue
         kinds = (int, float) if option.type in ("float", float) else (int,)
-        low, most = option.metadata.get("bounds", (0, _MOST.get(option.name, 1e12)))
+        least, most = bounds_of(option)
+        most = min(most, _MOST.get(option.name, MOST))
+        least = max(least, 1.0) if option.name in _POSITIVE else least
         each = value if option.name == "hidden" else (value,)
-        least = 1 if option.name in _POSITIVE else low
         if not all(_is_number(number, kinds) and least <= number <= most for number in each):
-            raise ValueError(f"`{option.name}` is {value!r:.40}")
+            raise ValueError(f"`{option.name}` is {value!r:.40}, not {allowed(least, most)}")
     return config
 
 

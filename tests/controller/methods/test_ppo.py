@@ -140,7 +140,11 @@ def test_options_of_the_method(car_task: Task) -> None:
         ({"epoch": "3"}, "method `ppo` has no option `epoch`"),
         ({"epochs": "3.5"}, "`epochs=3.5` is no whole number"),
         ({"trace": "much"}, "`trace=much` is no number"),
-        ({"environments": "0"}, "method `ppo`: `environments` is 0"),
+        ({"environments": "0"}, "method `ppo`: `environments` is 0, not from 1 to 65,536"),
+        ({"epochs": "0"}, "method `ppo`: `epochs` is 0, not from 1 to 1,000,000"),
+        ({"minibatches": "0"}, "method `ppo`: `minibatches` is 0, not from 1 to 1,000,000"),
+        ({"correlation": "2"}, "method `ppo`: `correlation` is 2.0, not from 0 to 1"),
+        ({"entropy": "-1"}, "method `ppo`: `entropy` is -1.0, not at least 0"),
         ({"reward": "money"}, "method `ppo`: `reward` is 'money', none of task, robustness, accuracy"),
     ):
         with pytest.raises(UsageError) as caught:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import stlc
+from stlc.controller.options import bounds_of
 from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, PlanSearch, plan, planner_named
 from stlc.controller.planning.traces import starts_of, trace_of
 from stlc.controller.problem.task import Task
@@ -77,7 +78,7 @@ def test_a_plan_is_a_trace_that_the_monitor_judges_alike(car_task: Task, tmp_pat
 
 
 def test_starts_are_drawn_written_or_recorded(car_task: Task, tmp_path: Path) -> None:
-    given = starts_of(car_task, "x=-5, v = 36 km/h, sign=light", 2, 0)
+    given = starts_of(car_task, "x=-5, v = 36km/h, sign=light", 2, 0)
     names = car_task.system.names
     assert given[:, names.index("x")].tolist() == [-5.0, -5.0]
     assert given[:, names.index("v")].tolist() == [10.0, 10.0]
@@ -86,13 +87,24 @@ def test_starts_are_drawn_written_or_recorded(car_task: Task, tmp_path: Path) ->
     save_trace(tmp_path / "plan.npz", trace_of(car_task, found))
     assert torch.equal(starts_of(car_task, str(tmp_path / "plan.npz"), None, 0), given)
     assert starts_of(car_task, "random", 3, 0).shape == (3, len(names))
+    holes = load_trace(tmp_path / "plan.npz")
+    speeds = holes.data["v"].copy()
+    speeds[1, 0] = np.nan
+    save_trace(tmp_path / "holes.npz", replace(holes, data={**holes.data, "v": speeds}))
+    with pytest.raises(UsageError, match=r"trace 1 of `.*holes\.npz` has no first value of `v`"):
+        starts_of(car_task, str(tmp_path / "holes.npz"), None, 0)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("vv=1", "has no state `vv`"),
-        ("v=fast", "not of the form NAME=NUMBER"),
+        ("v=fast", "`fast` is not a finite number"),
+        ("v=1e400", "`1e400` is not a finite number"),
+        ("v=nan", "`nan` is not a finite number"),
+        ("v=5 m", r"`m` is not a unit of \[m/s\]"),
+        ("sign=7", "`sign` is one of stop, light"),
+        ("sign=halt", "`halt` is not a finite number"),
         ("nowhere.npz", "there is no file `nowhere.npz`"),
     ],
 )
@@ -113,6 +125,27 @@ def test_options_are_checked(planner: str) -> None:
     )
     with pytest.raises(UsageError, match="unknown planner `serach`"):
         planner_named("serach")
+
+
+def test_numbers_out_of_their_bounds_are_refused(planner: str) -> None:
+    kind = PLANNERS.get(planner)
+    numbers = [each for each in fields(kind) if type(each.default) in (int, float)]
+    assert numbers
+    for each in numbers:
+        least, most = bounds_of(each)
+        assert least <= each.default <= most
+        for value in ("nan", str(int(most) + 1), "-1", *(("0",) if least > 0.0 else ())):
+            with pytest.raises(UsageError, match=f"option `{each.name}` of planner `{planner}` is a"):
+                planner_named(planner, **{each.name: value})
+
+
+@pytest.mark.slow
+def test_least_numbers_plan_too(car_task: Task, planner: str) -> None:
+    x0 = car_task.sample(2, seed=3, dtype=torch.float64)
+    for each in fields(PLANNERS.get(planner)):
+        if type(each.default) in (int, float) and planner != "mpc":
+            least = type(each.default)(bounds_of(each)[0])
+            plan(car_task, x0, planner, budget=PlanBudget(0.05), **{each.name: least})
 
 
 def test_a_planner_is_a_policy(car_task: Task) -> None:

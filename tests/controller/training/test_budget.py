@@ -267,7 +267,7 @@ def test_the_schedule_on_record_repeats_a_budget(car_task: Task, tmp_path: Path)
 
 
 @pytest.mark.usefixtures("ticking")
-@pytest.mark.parametrize("stopped_at", [4, 30])
+@pytest.mark.parametrize("stopped_at", [4, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_budget_that_was_interrupted_is_repeated_too(
     car_task: Task, tmp_path: Path, stopped_at: int
 ) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from stlc.controller.options import bounded
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.model.controls import raw_width, squash
 
@@ -60,14 +61,14 @@ class Cem:
         hidden: number of hidden units of the network.
     """
 
-    population: int = 1_000
-    elites: int = 100
-    deviation: float = 0.5
+    population: int = bounded(1_000, 1, 10**6)
+    elites: int = bounded(100, 1, 10**6)
+    deviation: float = bounded(0.5, 0, 1e6)
     physical: bool = False
-    floor: float = 0.01
-    rounds: int = 50
+    floor: float = bounded(0.01, 0, 1e6)
+    rounds: int = bounded(50, 1, 10**9)
     over: str = "plan"
-    hidden: int = 16
+    hidden: int = bounded(16, 1, 4096)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by the cross-entropy method.

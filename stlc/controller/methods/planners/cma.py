@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from stlc.controller.options import bounded
 from stlc.diagnostics import not_installed
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ class Cma:
         diagonal: whether the covariance is diagonal, which is faster for long plans.
     """
 
-    sigma: float = 0.5
-    population: int = 0
+    sigma: float = bounded(0.5, 1e-9, 1000000.0)
+    population: int = bounded(0, 0, 10**6)
     diagonal: bool = False
 
     def prepare(self, task: Task) -> Solver:  # noqa: ARG002 - the same for all tasks

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.controller.options import bounded
 from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
 from stlc.dynamics.model.controls import raw_width, squash
 
@@ -36,10 +37,10 @@ class GradientPlanner:
     """
 
     objective: str = "exact"
-    steps: int = 50
-    starts: int = 8
-    rate: float = 0.1
-    slope: float = 2.0
+    steps: int = bounded(50, 1, 10**9)
+    starts: int = bounded(8, 1, 10**6)
+    rate: float = bounded(0.1, 0, 1e6)
+    slope: float = bounded(2.0, 1e-9, 1e9)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by gradient steps on the objective.

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.options import bounded
 from stlc.controller.training.local_search import Searcher
 
 if TYPE_CHECKING:
@@ -35,10 +36,10 @@ class Halving:
         pieces: maximum number of constant pieces of a random plan.
     """
 
-    starts: int = 64
-    tries: int = 64
-    keep: int = 4
-    pieces: int = 12
+    starts: int = bounded(64, 1, 10**6)
+    tries: int = bounded(64, 1, 10**6)
+    keep: int = bounded(4, 1, 10**6)
+    pieces: int = bounded(12, 1, 10**6)
 
     def prepare(self, task: Task) -> Solver:  # noqa: ARG002 - the same for all tasks
         """Return a function that searches for plans by successive halving."""

@@ -23,6 +23,7 @@ from stlc.compile.backends.milp.encode import MARGIN, Demand, Encoding
 from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.feasibility import extremes
+from stlc.controller.options import bounded
 from stlc.controller.training.local_search import Searcher
 from stlc.diagnostics import Diagnostic, UsageError, not_installed
 from stlc.native import Stop
@@ -53,7 +54,7 @@ class Milp:
             only for the states where these plans miss the target robustness. 0: no local search.
     """
 
-    gap: float = 1e-3
+    gap: float = bounded(1e-3, 0, 1)
     prove: bool = True
     tries: int = 0
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.options import bounded
 from stlc.controller.training.local_search import Searcher
 from stlc.diagnostics import not_installed, usage
 from stlc.dynamics.model.step import build_step
@@ -53,11 +54,11 @@ class Mpc:
         repair: number of plans that a local search tries if the best plan nearly reaches the target.
     """
 
-    guesses: int = 12
-    drawn: int = 16
-    iterations: int = 100
-    smoothing: float = 50.0
-    sharpness: float = 20.0
+    guesses: int = bounded(12, 1, 10**6)
+    drawn: int = bounded(16, 0, 10**6)
+    iterations: int = bounded(100, 1, 10**6)
+    smoothing: float = bounded(50.0, 1e-9, 1e9)
+    sharpness: float = bounded(20.0, 1e-9, 1e9)
     margin: float = 0.01
     repair: int = 100
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stlc.controller.training.run import Run
+from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
     from stlc.controller.planning.planner import PlanSearch, Solver
@@ -35,7 +36,13 @@ class PolicyPlans:
         Raises:
             RunError: R101, the run is damaged; U101, it was trained for another system.
         """
-        policy = Run.open(self.run, root=Path(self.runs)).policy
+        run = Run.open(self.run, root=Path(self.runs))
+        policy, own = run.policy, run.task.system
+        same = (own.names, own.control_names, own.horizon)
+        if same != (task.system.names, task.system.control_names, task.system.horizon):
+            trained = f"{run.task.compiled.name} and {own.decl.name}"
+            message = f"run `{run.dir.name}` is a policy for {trained}, not for {task.compiled.name}"
+            raise usage(message, "stlc plan SPEC --method policy --option run=RUN", "stlc runs list")
         return partial(self._run, policy=policy.for_task(task))
 
     def _run(self, search: PlanSearch, policy: Policy) -> None:

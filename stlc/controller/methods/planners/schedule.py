@@ -18,6 +18,7 @@ from numpy.random import Generator
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.controller.options import bounded
 from stlc.controller.planning.newton import GaussNewton, Pull, state_gradient, values_of
 from stlc.controller.planning.schedules import GoalScheduler, tempo
 from stlc.controller.training.local_search import Searcher
@@ -64,18 +65,18 @@ class SchedulePlanner:
         first: number of changed plans that the local search before the first round tries per plan.
     """
 
-    schedules: int = 48
-    draws: int = 1_024
-    steps: int = 12
-    halvings: int = 2
-    library: int = 512
-    rows: int = 16
+    schedules: int = bounded(48, 1, 10**6)
+    draws: int = bounded(1_024, 1, 10**6)
+    steps: int = bounded(12, 1, 10**6)
+    halvings: int = bounded(2, 0, 64)
+    library: int = bounded(512, 1, 10**6)
+    rows: int = bounded(16, 1, 10**6)
     margin: float = 0.03
     greed: float = 10.0
-    best: int = 8
-    tries: int = 500
-    starts: int = 16
-    first: int = 1_000
+    best: int = bounded(8, 1, 10**6)
+    tries: int = bounded(500, 1, 10**9)
+    starts: int = bounded(16, 1, 10**6)
+    first: int = bounded(1_000, 1, 10**9)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that draws random schedules and searches for plans that meet them.

@@ -10,6 +10,7 @@ import torch
 
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.feasibility import extremes
+from stlc.controller.options import bounded
 from stlc.controller.training.local_search import Searcher
 
 if TYPE_CHECKING:
@@ -33,9 +34,9 @@ class SearchPlanner:
         library: maximum number of plans in the library, which all initial states share.
     """
 
-    tries: int = 2_000
-    longest: int = 20_000
-    library: int = 2_048
+    tries: int = bounded(2_000, 1, 10**9)
+    longest: int = bounded(20_000, 1, 10**9)
+    library: int = bounded(2_048, 1, 10**6)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by local search, with the initial library."""

@@ -1,0 +1,92 @@
+"""`stlc plan`: what makes no sense is refused, and what was found before a signal is kept."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+
+from stlc.cli.framework.app import main
+from stlc.controller.planning.planner import PlanSearch
+from stlc.trace import load_trace
+
+ROOT = Path(__file__).parents[3]
+SPEC, SYSTEM = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
+OTHER, SHIP = str(ROOT / "specs/ship_safe.stl"), str(ROOT / "examples/ship_safe.yaml")
+
+
+def planned(*options: str) -> int:
+    return main(["plan", SPEC, "--system", SYSTEM, *options])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--target", "nan"), "`--target nan` is no robustness"),
+        (("--seed", str(2**63)), "should be less than or equal to 9223372036854775807"),
+        (("--from", ""), "there is no file `` with initial states"),
+        (("--method", "cem", "--option", "population=0"), "a whole number from 1 to 1,000,000, not `0`"),
+    ],
+)
+def test_what_makes_no_sense(
+    options: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert planned(*options, "--output", str(tmp_path / "plan.npz")) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_plans_found_before_a_signal_are_kept_and_counted(
+    number: int,
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    offer = PlanSearch.offer
+
+    def interrupted(
+        search: PlanSearch, rows: torch.Tensor, plans: torch.Tensor, **given: int
+    ) -> torch.Tensor:
+        signal.raise_signal(number)
+        return offer(search, rows[:2], plans[:2], **given)
+
+    before = signal.getsignal(number)
+    monkeypatch.setattr(PlanSearch, "offer", interrupted)
+    trace = tmp_path / "plan.npz"
+    options = ["--method", "gradient", "--option", "starts=1", "--starts", "5", "--output", str(trace)]
+    assert planned(*options, "--json") == code
+    captured = capsys.readouterr()
+    assert "interrupted: 2 of 5 initial states were planned for" in captured.err
+    found = json.loads(captured.out)["result"]
+    assert found["starts"] == load_trace(trace).traces == 2
+    assert found["robustness"]["least"] > -100.0
+    assert signal.getsignal(number) is before
+
+
+def test_without_any_plan_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        "stlc.controller.planning.planner.prepared",
+        lambda *_: lambda _search: signal.raise_signal(signal.SIGTERM),
+    )
+    trace = tmp_path / "plan.npz"
+    assert planned("--starts", "5", "--output", str(trace)) == 143
+    assert "interrupted: 0 of 5 initial states were planned for" in capsys.readouterr().err
+    assert not trace.exists()
+
+
+def test_the_policy_of_another_specification(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ["--steps", "1", "--batch", "8", "--held-out", "5", "--drives", "0", "--no-pictures"]
+    main(["train", OTHER, "--system", SHIP, "--method", "gradient", *options])
+    assert planned("--method", "policy") == 2
+    assert "is a policy for ship_safe and ship_safe, not for traffic" in capsys.readouterr().err
+    assert not Path("plan.npz").exists()
