@@ -118,7 +118,8 @@ class Cell:
             self.name,
             {
                 **inputs_of(load(self.benchmark, tuple(self.overrides.items()))),
-                **{"benchmark": self.benchmark, "method": self.method, "method_version": ENGINE_VERSION},
+                **{"benchmark": self.benchmark, "method": self.method},
+                **{"method_version": ENGINE_VERSION + METHODS.get(self.method).version},
                 **{"seed": self.seed, "budget": self.length.seconds, "steps": self.length.steps},
                 **{"clock": self.length.clock, "held_out": self.held_out, "held_out_seed": HELD_OUT_SEED},
                 **{"axis": self.axis, "value": self.value, "overrides": dict(self.overrides)},

@@ -189,7 +189,10 @@ def written_unit(text: str) -> Unit:
     return parse_unit(text) if text else DIMENSIONLESS
 
 
-_QUANTITY = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>[^\d\s.].*)?")
+_QUANTITY = re.compile(
+    r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)"
+    r"(\s*(?P<unit>[^\d\s.].*)|\s+(?P<per>1(/.*)?))?"  # such as `2 1/s`
+)
 
 
 def parse_quantity(text: str, unit: Unit) -> float:
@@ -203,7 +206,7 @@ def parse_quantity(text: str, unit: Unit) -> float:
     found = float(match["number"]) if match is not None else math.nan
     if match is None or not math.isfinite(found):
         raise ValueError(f"`{text.strip()}` is not a finite number")
-    given = parse_unit(match["unit"]) if match["unit"] else unit
+    given = parse_unit(written) if (written := match["unit"] or match["per"]) else unit
     if given.dims != unit.dims:
         raise ValueError(f"`{given}` is not a unit of [{unit}]")
     if given == unit:

@@ -167,6 +167,9 @@ def test_what_means_something_else(text: str) -> None:
         ("20 degC", "K", 293.15),
         ("293.15 K", "degC", 20.0),
         ("50 %", "1", 0.5),
+        ("2 1/s", "1/s", 2.0),
+        ("3 1", "%", 300.0),
+        ("1e3 m", "km", 1.0),
     ],
 )
 def test_a_quantity(text, unit, value):

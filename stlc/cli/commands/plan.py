@@ -117,13 +117,17 @@ def plan(
         with noting_signals() as signals:
             search = PlanSearch(task, states, replace(limits, stop=lambda: bool(signals)), seed=seed)
             with leaving(forced):
-                solver(search)
+                try:
+                    solver(search)
+                except SystemExit:  # of a second signal
+                    if not signals:
+                        raise
                 result = search.result.tried if signals else search.result
                 save(result)
     if signals:
         interrupted(result)
         if not len(result.rho):
-            raise typer.Exit(signals[0])
+            raise SystemExit(signals[0])
     record = _record(task, result, choice, output)
     if model is not None:
         record["tube"] = _bounded(model, result, tube)

@@ -317,8 +317,9 @@ def _stoppable() -> Iterator[list[int]]:
 
 @contextmanager
 def noting_signals() -> Iterator[list[int]]:
-    """Context in which the first Ctrl-C or SIGTERM is only noted, and a second one ends the command.
+    """Context in which the first Ctrl-C or SIGTERM is only noted, and a second one raises SystemExit.
 
+    A signal that the process ignores stays ignored: shells start what runs in the background in this way.
     Yields a list, to which the exit code of each received signal is appended.
     """
     noted: list[int] = []
@@ -329,9 +330,10 @@ def noting_signals() -> Iterator[list[int]]:
     def note(number: int, _frame: FrameType | None) -> None:
         noted.append(INTERRUPTED if number == signal.SIGINT else TERMINATED)
         if len(noted) > 1:
-            raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(TERMINATED)
+            raise SystemExit(noted[-1])
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    heeded = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN]
+    before = {number: signal.signal(number, note) for number in heeded}
     try:
         yield noted
     finally:

@@ -47,11 +47,14 @@ class Method(ABC):
         learns: class of the learner; None if the method plans without training, or if the subclass defines
             the function `learner` itself.
         falsifies: whether the method can train on states of failing closed-loop drives (`--falsify`).
+        version: number that rises with every change of the policies that the method trains; measurements of
+            older versions are repeated.
         extendable: whether no step depends on the planned number of steps. Then a longer training begins like
             a shorter one, and can continue it.
     """
 
     falsifies: ClassVar[bool] = False
+    version: ClassVar[int] = 0
     extendable: ClassVar[bool] = False
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
     learns: ClassVar[type[Learner] | None] = None
@@ -164,12 +167,14 @@ class Learner(ABC):
         searching: whether such a search is running now.
         solved: whether any search has found a satisfying plan.
         exhausted: whether exploration has found no plan, even with its largest effort.
+        settles_rarely: whether `settle` has nothing to do after most steps.
         failures: states of failing closed-loop drives, which are mixed into the training; None without
             `--falsify`.
     """
 
     failures: FailureBank | None = None
 
+    settles_rarely: bool = True
     searches: bool = False
     searching: bool = False
     solved: bool = False
@@ -195,7 +200,7 @@ class Learner(ABC):
     def settle(self) -> bool:
         """Do the work that is due after some steps only; the default does nothing.
 
-        Its duration is not part of the pace from which the number of steps is planned.
+        If `settles_rarely`, its duration is no part of the pace from which the number of steps is planned.
 
         Returns:
             False if a number was not finite, which ends the training, else True.

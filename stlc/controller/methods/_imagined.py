@@ -32,6 +32,10 @@ PIECE = 5
 """Steps over which the controls of the first, random episodes are constant."""
 
 
+RARE = 0.1
+"""Growth of the number of episodes from which trainings of the networks are rare."""
+
+
 @dataclass(frozen=True, slots=True)
 class ModelConfig(ActorConfig):
     """Options of a method that learns a model of the system.
@@ -320,6 +324,11 @@ class ModelLearner(Learner):
             states, actions = play(self.task, x0, act)
         self.episodes.add(states, actions, rewards(self.task, self.reward, states, actions))
         return self._fit() if begins else True
+
+    @property
+    def settles_rarely(self) -> bool:  # type: ignore[override]
+        """True unless the networks are trained after nearly every step."""
+        return self.config.growth >= RARE
 
     def settle(self) -> bool:
         """Train the ensemble if the number of episodes has grown by the share `config.growth`.

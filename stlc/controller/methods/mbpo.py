@@ -285,6 +285,7 @@ class Mbpo(Method):
 
     options = MbpoConfig
     learns = MbpoLearner
+    version = 1
 
     def resolve(self, task: Task, config: TrainConfig) -> MbpoConfig:
         """Determine the options; `--batch` and `--lr` apply to actor and critics, not to the ensemble."""

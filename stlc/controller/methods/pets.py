@@ -237,6 +237,12 @@ class PetsLearner(ModelLearner):
         self.loss = self.error
         return self.loss
 
+    def settle(self) -> bool:
+        """Train the ensemble if enough episodes were added; its validation error is the loss of the step."""
+        good = super().settle()
+        self.loss = self.error
+        return good
+
 
 class Pets(Method):
     """Planning with a learnt ensemble by the cross-entropy method."""

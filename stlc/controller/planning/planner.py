@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.options import allowed, bounds_of
+from stlc.controller.options import FINITE, bounds_of
 from stlc.controller.policies.policy import Policy
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.native import Stop, never
@@ -265,17 +265,21 @@ def _value(name: str, option: Field[Any], value: object) -> Any:
         UsageError: U101, the text is not of this type, or the number is out of its bounds.
     """
     kind: Any = type(option.default)
+    kinds = (int, float) if kind is float else (kind,)
     message = f"option `{option.name}` of planner `{name}` is"
-    wanted = {bool: "`true` or `false`", int: "a whole number"}.get(kind, "a number")
+    names = {bool: "`true` or `false`", int: "a whole number", str: "a text"}
+    wanted = names.get(kind, "a number")
     if isinstance(value, str) and kind is not str:
         try:
             value = _WORDS[value] if kind is bool else kind(value)
         except (ValueError, KeyError):
             raise usage(f"{message} {wanted}, not `{value}`") from None
+    if not isinstance(value, kinds) or (kind is not bool and isinstance(value, bool)):
+        raise usage(f"{message} {wanted}, not `{value}`")
     if kind in (int, float):
-        least, most = bounds_of(option)
-        if not isinstance(value, (int, float)) or not least <= value <= most:
-            raise usage(f"{message} {wanted} {allowed(least, most)}, not `{value}`")
+        bounds = bounds_of(option, FINITE)
+        if value not in bounds:
+            raise usage(f"{message} {wanted} {bounds}, not `{value}`")
     return value
 
 

@@ -55,7 +55,7 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
 
 
 def _assignment(task: Task, part: str) -> tuple[str, float]:
-    """Name of a state and its value in SI units, from a text such as `v = 2 m/s`.
+    """Name of a state and its value as it is stored, from a text such as `v = 36 km/h`.
 
     Raises:
         UsageError: U101, the system has no such state; or the value is not a finite number with or without a

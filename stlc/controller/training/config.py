@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import torch
 
-from stlc.controller.options import MOST, allowed, bounds_of
+from stlc.controller.options import MOST, Bounds, bounds_of
 from stlc.controller.problem.environments import Reward
 from stlc.controller.training.budget import Clock, StepSchedule, cores
 from stlc.diagnostics import usage
@@ -206,12 +206,11 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
                 raise ValueError(f"`{option.name}` is {value!r:.40}, neither true nor false")
             continue
         kinds = (int, float) if option.type in ("float", float) else (int,)
-        least, most = bounds_of(option)
-        most = min(most, _MOST.get(option.name, MOST))
-        least = max(least, 1.0) if option.name in _POSITIVE else least
+        general = Bounds(float(option.name in _POSITIVE), _MOST.get(option.name, MOST))
+        bounds = bounds_of(option, general)
         each = value if option.name == "hidden" else (value,)
-        if not all(_is_number(number, kinds) and least <= number <= most for number in each):
-            raise ValueError(f"`{option.name}` is {value!r:.40}, not {allowed(least, most)}")
+        if not all(_is_number(number, kinds) and number in bounds for number in each):
+            raise ValueError(f"`{option.name}` is {value!r:.40}, not {bounds}")
     return config
 
 

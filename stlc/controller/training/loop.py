@@ -351,10 +351,12 @@ class _Session:
             if not math.isfinite(learner.advance()):
                 raise self._broken()
             began = self.now()
-            self.pace.stepped(learner.step, began, search_runs=learner.searching)
             if not learner.settle():
                 raise self._broken()
-            self.pace.irregular(self.now() - began)
+            ended = self.now()
+            if learner.settles_rarely:
+                self.pace.irregular(ended - began)
+            self.pace.stepped(learner.step, ended, search_runs=learner.searching)
             due = learner.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
             if learner.ranks.any(due):
                 self._save()

@@ -39,21 +39,23 @@ def test_what_makes_no_sense(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("signals", [1, 2])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_plans_found_before_a_signal_are_kept_and_counted(
     number: int,
     code: int,
+    signals: int,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     offer = PlanSearch.offer
 
-    def interrupted(
-        search: PlanSearch, rows: torch.Tensor, plans: torch.Tensor, **given: int
-    ) -> torch.Tensor:
-        signal.raise_signal(number)
-        return offer(search, rows[:2], plans[:2], **given)
+    def interrupted(search: PlanSearch, rows: torch.Tensor, plans: torch.Tensor) -> torch.Tensor:
+        found = offer(search, rows[:2], plans[:2])
+        for _ in range(signals):
+            signal.raise_signal(number)
+        return found
 
     before = signal.getsignal(number)
     monkeypatch.setattr(PlanSearch, "offer", interrupted)
@@ -76,8 +78,10 @@ def test_without_any_plan_nothing_is_written(
         lambda *_: lambda _search: signal.raise_signal(signal.SIGTERM),
     )
     trace = tmp_path / "plan.npz"
-    assert planned("--starts", "5", "--output", str(trace)) == 143
-    assert "interrupted: 0 of 5 initial states were planned for" in capsys.readouterr().err
+    assert planned("--starts", "5", "--output", str(trace), "--json") == 143
+    captured = capsys.readouterr()
+    assert "interrupted: 0 of 5 initial states were planned for" in captured.err
+    assert json.loads(captured.out)["exit_code"] == 143
     assert not trace.exists()
 
 

@@ -95,6 +95,11 @@ def test_networks_are_trained_once_enough_episodes_were_added_and_not_near_the_e
     assert fitted(until=0.0, growth=0.5) == [6, 6, 6, 6]
 
 
+def test_rare_trainings_of_the_networks_are_no_part_of_the_pace(car_task: Task) -> None:
+    assert learner_of(car_task, "mbpo", growth=0.5).settles_rarely
+    assert not learner_of(car_task, "mbpo", growth=0.0).settles_rarely
+
+
 def test_a_late_training_of_the_networks_that_diverges_ends_the_run(car_task: Task) -> None:
     learner = learner_of(car_task, "mbpo")
     _made(learner)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import stlc
-from stlc.controller.options import bounds_of
+from stlc.controller.options import FINITE, bounds_of
 from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, PlanSearch, plan, planner_named
 from stlc.controller.planning.traces import starts_of, trace_of
 from stlc.controller.problem.task import Task
@@ -123,6 +123,9 @@ def test_options_are_checked(planner: str) -> None:
     assert planner_named("cem", physical="true", population="7") == planner_named(
         "cem", physical=True, population=7
     )
+    for wrong in ({"population": 2.5}, {"population": True}, {"physical": 1}, {"over": 3}, {"floor": None}):
+        with pytest.raises(UsageError, match="of planner `cem` is"):
+            planner_named("cem", **wrong)
     with pytest.raises(UsageError, match="unknown planner `serach`"):
         planner_named("serach")
 
@@ -132,9 +135,9 @@ def test_numbers_out_of_their_bounds_are_refused(planner: str) -> None:
     numbers = [each for each in fields(kind) if type(each.default) in (int, float)]
     assert numbers
     for each in numbers:
-        least, most = bounds_of(each)
-        assert least <= each.default <= most
-        for value in ("nan", str(int(most) + 1), "-1", *(("0",) if least > 0.0 else ())):
+        bounds = bounds_of(each, FINITE)
+        assert each.default in bounds
+        for value in ("nan", str(2 * int(bounds.most)), str(bounds.least - 1)[:-2]):
             with pytest.raises(UsageError, match=f"option `{each.name}` of planner `{planner}` is a"):
                 planner_named(planner, **{each.name: value})
 
@@ -144,7 +147,7 @@ def test_least_numbers_plan_too(car_task: Task, planner: str) -> None:
     x0 = car_task.sample(2, seed=3, dtype=torch.float64)
     for each in fields(PLANNERS.get(planner)):
         if type(each.default) in (int, float) and planner != "mpc":
-            least = type(each.default)(bounds_of(each)[0])
+            least = type(each.default)(max(bounds_of(each, FINITE).least, 0))
             plan(car_task, x0, planner, budget=PlanBudget(0.05), **{each.name: least})
 
 
