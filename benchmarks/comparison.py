@@ -15,7 +15,7 @@ from benchmarks.options import Training
 from benchmarks.plannings import LONG, SECONDS, PlanRow
 from benchmarks.roster import Contender
 from benchmarks.store import BENCHMARKS
-from benchmarks.table import Columns, listed
+from benchmarks.table import Columns, bullet, listed
 from benchmarks.training import Length
 from stlc.cli.framework.options import parse_seeds
 
@@ -115,11 +115,9 @@ def accuracies(
     for each in planners:
         for limit in (None,) if each.evaluations else SECONDS:
             own_rows = {name: rows.get((each.name, limit, name)) for name in BENCHMARKS}
-            spared = {name for name in BENCHMARKS if _spared(rows, each.name, limit, name)}
-            texts = {
-                name: "no gain" if name in spared else _planned_text(row) for name, row in own_rows.items()
-            }
-            missing = [name for name, row in own_rows.items() if row is None and name not in spared]
+            spared = {name: _spared(rows, each.name, limit, name) for name in BENCHMARKS}
+            texts = {name: spared[name] or _planned_text(row) for name, row in own_rows.items()}
+            missing = [name for name, row in own_rows.items() if row is None and not spared[name]]
             time = "" if limit is None else f"--plan-time {budget_text(limit).replace(' ', '')}"
             lines.append(
                 Line(each.name, budget_text(limit), texts, _command(each, missing, f"{time} --parts plans"))
@@ -136,10 +134,11 @@ def _command(contender: Contender, missing: Sequence[str], options: str) -> str:
 
 def _spared(
     rows: Mapping[tuple[str, float | None, str], PlanRow], method: str, limit: float | None, name: str
-) -> bool:
-    """True if a planner was not measured with the time budget `limit` on purpose.
+) -> str:
+    """Text of the entry of a planner that is not measured with the time budget `limit` on purpose, else "".
 
-    A long budget is skipped if, between two shorter budgets, ten times the time did not raise the accuracy.
+    A long budget is skipped if, between two shorter budgets, ten times the time did not raise the accuracy
+    (`no gain`), or if the planner cannot solve the task (`refused`).
 
     Args:
         rows: (planner, time budget, benchmark) -> measured result.
@@ -148,11 +147,13 @@ def _spared(
         name: name of the benchmark.
     """
     if limit is None or limit < LONG or (method, limit, name) in rows:
-        return False
+        return ""
     few, many = rows.get((method, SECONDS[1], name)), rows.get((method, SECONDS[2], name))
-    if few is None or many is None or few.accuracy is None or many.accuracy is None:
-        return False
-    return many.accuracy <= few.accuracy
+    if few is None or many is None:
+        return ""
+    if few.accuracy is None or many.accuracy is None:
+        return "refused"
+    return "no gain" if many.accuracy <= few.accuracy else ""
 
 
 def _learned_text(cell: Learned | None, seeds: Sequence[int]) -> str:
@@ -179,15 +180,16 @@ def _interval(value: float, interval: tuple[float, float]) -> str:
 
 
 def refusals(plans: Iterable[PlanRow]) -> list[str]:
-    """Return the reasons for which planners cannot solve some benchmarks, as Markdown bullets."""
+    """Return the reasons for which planners cannot solve some benchmarks: lines of Markdown bullets."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in plans:
         if row.refused:
             found.setdefault((row.method, row.refused), []).append(row.benchmark)
-    return [
-        f"- {method} refuses {', '.join(dict.fromkeys(names))}: {why}"
+    bullets = [
+        bullet(f"{method} refuses {', '.join(dict.fromkeys(names))}: {why}")
         for (method, why), names in found.items()
     ]
+    return [line for lines in bullets for line in lines]
 
 
 def latencies(plans: Iterable[PlanRow]) -> list[Line]:

@@ -214,9 +214,13 @@ def provenance(results: Iterable[Result], what: str) -> list[str]:
         dates = sorted({str(made["date"])[:10] for made in group})
         when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
         commits = ", ".join(f"`{commit}`" for commit in sorted({_commit(made) for made in group}))
-        line = f"- {_counted(len(group), what)} on {told}; {when}; commit {commits}"
-        lines += wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+        lines += bullet(f"{_counted(len(group), what)} on {told}; {when}; commit {commits}")
     return lines
+
+
+def bullet(text: str) -> list[str]:
+    """Lines of a Markdown bullet with a text, which is wrapped at `WIDTH`."""
+    return wrap(f"- {text}", WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def measured_here() -> str:

@@ -262,6 +262,24 @@ def test_an_empty_cell_names_the_command_that_fills_it() -> None:
     assert ten.command.endswith("--plan-time 10ms --parts plans")
 
 
+def test_a_long_cell_of_a_planner_that_refuses_or_gains_nothing_says_so() -> None:
+    def long_cell(*found: float | None) -> tuple[str, str]:
+        rows = [
+            replace(row("plan:search", seconds, 0.5), accuracy=each, interval=each and (0.0, 1.0))
+            for seconds, each in zip((0.01, 0.1), found, strict=True)
+        ]
+        lines = accuracies([], [SEARCH], [], rows, [])
+        line = next(each for each in lines if each.budget == "1 s")
+        return line.cells["traffic"], line.command
+
+    text, command = long_cell(None, None)
+    assert text == "refused"
+    assert "traffic" not in command
+    assert long_cell(0.5, 0.5)[0] == "no gain"
+    assert long_cell(0.5, 0.6)[0] == ""
+    assert "--only" not in long_cell(0.5, 0.6)[1]
+
+
 def test_a_cell_of_fewer_seeds_names_them_and_the_command_for_the_rest() -> None:
     budget = "60 s of processor time"
     whole = [Learned(name, "guided", budget, 0.9, (0.8, 1.0), 60.0) for name in BENCHMARKS]

@@ -228,7 +228,7 @@ def test_types_and_remarks_of_definitions() -> None:
 def test_a_bag_is_found_by_its_folder(tmp_path: Path) -> None:
     folder = tmp_path / "drive"
     folder.mkdir()
-    with pytest.raises(StlcError, match="there is no trace"):
+    with pytest.raises(StlcError, match="is a folder, not a trace"):
         find_trace(str(folder))
     (folder / "drive_0.db3").write_bytes(robot_logs.bag2(X.tolist()))
     assert find_trace(str(folder)) == folder
