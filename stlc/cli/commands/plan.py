@@ -117,11 +117,7 @@ def plan(
         with noting_signals() as signals:
             search = PlanSearch(task, states, replace(limits, stop=lambda: bool(signals)), seed=seed)
             with leaving(forced):
-                try:
-                    solver(search)
-                except SystemExit:  # of a second signal
-                    if not signals:
-                        raise
+                solver(search)
                 result = search.result.tried if signals else search.result
                 save(result)
     if signals:

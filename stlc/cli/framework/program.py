@@ -317,10 +317,11 @@ def _stoppable() -> Iterator[list[int]]:
 
 @contextmanager
 def noting_signals() -> Iterator[list[int]]:
-    """Context in which the first Ctrl-C or SIGTERM is only noted, and a second one raises SystemExit.
+    """Context in which Ctrl-C and SIGTERM are only noted; the caller stops and saves what it has.
 
-    A signal that the process ignores stays ignored: shells start what runs in the background in this way.
-    Yields a list, to which the exit code of each received signal is appended.
+    If that takes too long, `stlc.stopping` ends the command. A signal that the process ignores stays ignored:
+    shells start what runs in the background in this way. Yields a list, to which the exit code of each
+    received signal is appended.
     """
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -329,8 +330,6 @@ def noting_signals() -> Iterator[list[int]]:
 
     def note(number: int, _frame: FrameType | None) -> None:
         noted.append(INTERRUPTED if number == signal.SIGINT else TERMINATED)
-        if len(noted) > 1:
-            raise SystemExit(noted[-1])
 
     heeded = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) != signal.SIG_IGN]
     before = {number: signal.signal(number, note) for number in heeded}

@@ -92,7 +92,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     A state that the specification adds (timer or parameter) is random if the traces do not contain it.
 
     Raises:
-        UsageError: U101, the traces lack a state; U102, there is no such file.
+        UsageError: U101, the traces lack a state or its first value; U102, there is no such file.
     """
     if not text.strip() or not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")

@@ -28,7 +28,7 @@ class Cma:
         diagonal: whether the covariance is diagonal, which is faster for long plans.
     """
 
-    sigma: float = bounded(0.5, 1e-9, 1000000.0)
+    sigma: float = bounded(0.5, 1e-9, 1e6)
     population: int = bounded(0, 0, 10**6)
     diagonal: bool = False
 

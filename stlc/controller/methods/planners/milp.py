@@ -56,7 +56,7 @@ class Milp:
 
     gap: float = bounded(1e-3, 0, 1)
     prove: bool = True
-    tries: int = 0
+    tries: int = bounded(0, 0, 10**9)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by mixed-integer linear programs.

@@ -60,7 +60,7 @@ class Mpc:
     smoothing: float = bounded(50.0, 1e-9, 1e9)
     sharpness: float = bounded(20.0, 1e-9, 1e9)
     margin: float = 0.01
-    repair: int = 100
+    repair: int = bounded(100, 0, 10**9)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by solving the nonlinear program of the task.
