@@ -288,14 +288,16 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | Non
     from stlc.cli.train.session import Session
     from stlc.controller.parallel.ddp import joined
     from stlc.controller.training.launch import open_folder
-    from stlc.controller.training.loop import find_device, train
+    from stlc.controller.training.loop import prepare, run
+    from stlc.stopping import age
 
+    before = age()
     with joined(config.device) as ranks:
-        find_device(ranks.device(config.device))
+        prepared = prepare(task, config, ranks=ranks, failures=round_of)
         made = str(open_folder(task, config, launch).path) if ranks.first else ""
         folder = RunDir(Path(ranks.agree_text(made)))
-        with Session(folder, logger=logger, writes=ranks.first) as session:
-            session.outcome = train(task, config, folder, session.watch, ranks=ranks, failures=round_of)
+        with Session(folder, logger=logger, writes=ranks.first, before=before) as session:
+            session.outcome = run(prepared, folder, session.watch)
     return session
 
 

@@ -14,6 +14,7 @@ from stlc.cli.framework.documents import TrainedRun, verdict_record
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import PULSE, Answer, console, say, show_diagnostics
 from stlc.cli.train.progress import TrainingDisplay, final_screen
+from stlc.controller.training.checkpoint import never_saved
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
     from stlc.controller.training.tensorboard import Opener, TensorBoardLogger
-    from stlc.rundir import RunDir
+    from stlc.rundir import RunDir, Status
 
 BESIDE = 10.0
 """Seconds of a command beyond its budget."""
@@ -49,6 +50,8 @@ class Session:
         progress: display of the progress.
         logger: function that opens an additional logger, if any.
         writes: whether this process writes the run's folder; of several processes only the first one does.
+        before: seconds from the start of the process to that of the training; None: to the start of the
+            session.
     """
 
     folder: RunDir
@@ -56,10 +59,12 @@ class Session:
     progress: TrainingDisplay = field(default_factory=TrainingDisplay)
     logger: Opener | None = None
     writes: bool = True
+    before: float | None = None
     _log: TensorBoardLogger | None = None
     _signals: list[int] = field(default_factory=list)
     _deferring: bool = False
     _seconds_before: float = 0.0
+    _begun: bool = False
     _forced: ExitStack = field(default_factory=ExitStack)
     _handlers: dict[int, Any] = field(default_factory=dict)
 
@@ -89,6 +94,7 @@ class Session:
             self._deferring = False
 
     def _resolved(self, engine: dict[str, Any]) -> None:
+        self._begun = True
         self.progress.chosen(engine)
         if self._log is not None:
             self._log.started(engine)
@@ -99,7 +105,7 @@ class Session:
             self._log.row(row)
 
     def __enter__(self) -> Self:
-        self._seconds_before = age()
+        self._seconds_before = age() if self.before is None else self.before
         for number in (signal.SIGINT, signal.SIGTERM):
             self._handlers[number] = signal.signal(number, self._interrupt)
         if self.writes:
@@ -119,17 +125,21 @@ class Session:
             if isinstance(error, KeyboardInterrupt | SystemExit):
                 self._ended()
             else:
-                with suppress(StlcError):
-                    self.folder.finish("failed")
+                self._close("failed")
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         self._forced.close()
 
     def _ended(self, _code: int = INTERRUPTED) -> None:
         """Record the status "interrupted" for a run that is killed; its last checkpoint remains."""
-        with suppress(StlcError):
-            self.folder.finish("interrupted")
+        self._close("interrupted")
         self._say_interrupted()
+
+    def _close(self, status: Status) -> None:
+        """Record how the run ended; one whose continuation was refused, or did not begin, stays as it was."""
+        if self._begun or never_saved(self.folder):
+            with suppress(StlcError):
+                self.folder.finish(status)
 
     def _say_interrupted(self) -> None:
         ranks = 1 if self.outcome is None else self.outcome.ranks

@@ -92,6 +92,71 @@ class Watch:
     evaluating: Callable[[str], None] = silent
 
 
+@dataclass(frozen=True, slots=True)
+class Preparation:
+    """A training that has not begun: what can be refused has been accepted, and no file is written.
+
+    Attributes:
+        task: problem to train for.
+        config: the resolved options.
+        learner: state before the first step; None if the method plans without training.
+        schedule: number of steps.
+        budget: training time in seconds; 0 if the schedule alone decides.
+        now: clock of the budget, in seconds.
+        started: time on that clock when the preparation began, which belongs to the budget.
+        ranks: processes that train together.
+        failures: search for failing drives, of a training with `--falsify`.
+    """
+
+    task: Task
+    config: ResolvedConfig
+    learner: Learner | None
+    schedule: StepSchedule
+    budget: float
+    now: Callable[[], float]
+    started: float
+    ranks: Ranks
+    failures: FailureSearch | None
+
+
+def prepare(
+    task: Task, config: TrainConfig, *, ranks: Ranks = ALONE, failures: FailureSearch | None = None
+) -> Preparation:
+    """Prepare a training, so that what is refused leaves no run behind.
+
+    Args:
+        task: problem to train for.
+        config: the user's options.
+        ranks: processes that train together. All of them call this function at the same time.
+        failures: search for failing drives; needed if `config.falsify` is True.
+
+    Raises:
+        UsageError: U101, the system has no control, or the method does not train with these options, on this
+            device or with several ranks.
+        SystemFileError: S301, hardly any initial state is admissible; S302, predicted states are not finite;
+            S304, the declared mirror is not a symmetry of the system or the specification.
+        MissingError: R302, the device does not exist; R403, the process of another rank has ended or does not
+            answer; or a package that the method needs is missing.
+    """
+    require_controls(task)
+    now = clock_of(config.clock)
+    started = now()
+    keep_freed_memory()
+    resolved = replace(resolve_config(task, config), ranks=ranks.size)
+    _require_search(resolved, failures)
+    declared = task.system.decl.train
+    fixed = config.steps or (declared.steps if config.budget is None else None)
+    budget = 0.0 if fixed is not None else config.budget or declared.budget or DEFAULT_BUDGET
+    schedule = fixed if isinstance(fixed, StepSchedule) else StepSchedule.of(fixed or PROVISIONAL)
+    device = find_device(ranks.device(config.device))
+    task.system.initial.require_many()
+    check_mirror(task)
+    torch.set_num_threads(resolved.threads)
+    method: Method = METHODS.get(resolved.method)
+    learner = method.learner(task, resolved, steps=schedule.at(0), device=device, ranks=ranks)
+    return Preparation(task, resolved, learner, schedule, budget, now, started, ranks, failures)
+
+
 def train(
     task: Task,
     config: TrainConfig,
@@ -101,52 +166,37 @@ def train(
     ranks: Ranks = ALONE,
     failures: FailureSearch | None = None,
 ) -> TrainingOutcome:
+    """Prepare a training and run it, in a new folder that already holds its specification and system.
+
+    The arguments and errors are those of `prepare` and `run`.
+    """
+    return run(prepare(task, config, ranks=ranks, failures=failures), folder, watch)
+
+
+def run(prepared: Preparation, folder: RunDir, watch: Watch | None = None) -> TrainingOutcome:
     """Train a policy in a new run folder that already holds its specification and system.
 
     Args:
-        task: problem to train for.
-        config: the user's options.
-        folder: folder of the run.
+        prepared: the training.
+        folder: folder of the run; of several ranks, only the first writes files.
         watch: functions that are called during the run; see `Watch`.
-        ranks: processes that train together. All of them call this function at the same time; only the first
-            writes files.
-        failures: search for failing drives; needed if `config.falsify` is True.
 
     Raises:
-        UsageError: U101, the system has no control, or `config.falsify` is True and the method, the number of
-            ranks or the arguments do not allow it.
-        SystemFileError: S301, hardly any initial state is admissible; S302, predicted states are not finite;
-            S304, the declared mirror is not a symmetry of the system or the specification.
-        MissingError: R201, a checkpoint cannot be written; R302, the device does not exist; R403, the process
-            of another rank has ended or does not answer.
+        MissingError: R201, a checkpoint cannot be written; R403, the process of another rank has ended or
+            does not answer.
         RunError: R401, the loss or its gradient is not finite.
-
     """
-    require_controls(task)
-    now = clock_of(config.clock)
-    started = now()
-    keep_freed_memory()
-    resolved = replace(resolve_config(task, config), ranks=ranks.size)
-    _require_search(resolved, failures)
-    watch = watch or Watch()
-    declared = task.system.decl.train
-    fixed = config.steps or (declared.steps if config.budget is None else None)
-    budget = 0.0 if fixed is not None else config.budget or declared.budget or DEFAULT_BUDGET
-    schedule = fixed if isinstance(fixed, StepSchedule) else StepSchedule.of(fixed or PROVISIONAL)
-    writer = RunWriter(folder, writes=ranks.first)
+    watch, resolved, learner = watch or Watch(), prepared.config, prepared.learner
+    budget, schedule = prepared.budget, prepared.schedule
+    writer = RunWriter(folder, writes=prepared.ranks.first)
     writer.config(resolved)
     writer.note({"engine": asdict(resolved), "schedule": str(schedule), "seconds_allowed": budget or None})
-    task.system.initial.require_many()
-    check_mirror(task)
-    device = find_device(ranks.device(config.device))
-    torch.set_num_threads(resolved.threads)
-    method: Method = METHODS.get(resolved.method)
-    learner = method.learner(task, resolved, steps=schedule.at(0), device=device, ranks=ranks)
-    allowed = TimeBudget.of(now, started, budget, watch.late if config.clock == "wall" else None)
+    late = watch.late if resolved.clock == "wall" else None
+    allowed = TimeBudget.of(prepared.now, prepared.started, budget, late)
     if learner is None:
-        return _without_steps(method, task, resolved, writer, allowed, watch)
+        return _without_steps(METHODS.get(resolved.method), prepared.task, resolved, writer, allowed, watch)
     writer.note({"margin": learner.margin})
-    return _Session(writer, learner, watch, allowed, schedule, failures).finish()
+    return _Session(writer, learner, watch, allowed, schedule, prepared.failures).finish()
 
 
 def resume(
@@ -275,9 +325,9 @@ def find_device(name: str) -> torch.device:
     try:
         best = "cuda" if torch.cuda.is_available() else "cpu"
         device = torch.device(best if name == "auto" else name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
+        torch.zeros(1, device=device).cpu()  # `meta` and others hold no numbers
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0].partition(". ")[0]
         raise MissingError(
             Diagnostic(
                 "R302", f"there is no device `{name}` here", help=("use --device cpu",), note=(reason,)

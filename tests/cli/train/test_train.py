@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -100,3 +101,26 @@ def test_a_run_that_breaks_off_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Trainer, "advance", full)
     assert main([*TRAIN, "--steps", "5"]) == 5
     assert RunDir.newest().status == "failed"
+
+
+@pytest.mark.parametrize(
+    ("option", "code"), [(["--device", "meta"], 5), (["--device", "cuda:77"], 5), (["--method", "sac"], 5)]
+)
+def test_what_the_learner_refuses_makes_no_run(
+    option: list[str], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    monkeypatch.delitem(sys.modules, "stlc.controller.methods._sb3", raising=False)
+    assert main([*TRAIN, "--steps", "5", *option]) == code
+    assert "error[" in capsys.readouterr().err
+    assert not Path("runs").exists()
+
+
+def test_a_refused_continuation_leaves_the_run_as_it_was(capsys: pytest.CaptureFixture[str]) -> None:
+    few = ["--steps", "3", "--batch", "16", "--held-out", "40", "--drives", "0", "--no-pictures"]
+    assert main([*TRAIN, *few]) in (0, 1)
+    folder = RunDir.newest()
+    before = (folder.path / "run.json").read_bytes()
+    assert main(["train", "--resume", folder.shown, "--steps", "9", "--device", "meta"]) == 5
+    assert "there is no device `meta` here" in capsys.readouterr().err
+    assert (folder.path / "run.json").read_bytes() == before

@@ -239,7 +239,7 @@ def test_a_run_that_was_interrupted_before_its_first_checkpoint_begins_again(
     whole = train(car_task, config, _folder(car_task, tmp_path / "a", config))
     folder = _folder(car_task, tmp_path / "b", config)
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "_feasible_margin", lambda _self: signal.raise_signal(signal.SIGINT))
+        patch.setattr(Trainer, "advance", lambda _self: signal.raise_signal(signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             train(car_task, config, folder)
     assert resume(folder).steps == 4
