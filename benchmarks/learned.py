@@ -26,7 +26,8 @@ the known feasible states (in brackets that of the worst seed). A slow policy is
 held-out states only: their number stands behind its accuracy, and its shares refer to them. `known feasible`
 is the share of the same states for which some satisfying plan is known, a lower bound of the feasible share.
 From those `proved infeasible` no plan exists, by the planner `milp` (traffic and reach_n_avoid, whose
-encodings are exact).
+encodings are exact). How many `steps` a budget pays for depends on the machine and on its load; the seeds
+of a row may come from different machines, which the end of the section lists.
 {OUTDATED_TEXT}"""
 
 
@@ -47,7 +48,7 @@ class Row:
             before a search.
         requirements: name of a requirement -> share of plans that satisfy it, mean over seeds.
         seconds: training time, mean over seeds.
-        steps: number of training steps, mean over seeds.
+        steps: number of training steps for each seed.
         outdated: inputs that have changed since the training runs.
     """
 
@@ -62,7 +63,7 @@ class Row:
     known_shares: tuple[float, ...]
     requirements: Mapping[str, float]
     seconds: float
-    steps: float
+    steps: tuple[int, ...]
     outdated: tuple[str, ...] = ()
 
     @property
@@ -104,7 +105,7 @@ def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
             name: fmean(each["requirements"][name] for each in results) for name in results[0]["requirements"]
         },
         seconds=group.mean("seconds"),
-        steps=group.mean("steps"),
+        steps=tuple(int(each["steps"]) for each in results),
         outdated=group.outdated,
     )
 
@@ -120,7 +121,7 @@ SHOWN: Columns[Row] = {
     "worst seed": lambda row: f"{min(row.accuracies):.4f}",
     "known feasible": "{known_feasible:.4f}",
     "share of feasible": lambda row: "" if row.share is None else f"{row.share:.3f} ({row.worst_share:.3f})",
-    "steps": "{steps:,.0f}",
+    "steps": lambda row: " to ".join(f"{each:,}" for each in sorted({min(row.steps), max(row.steps)})),
     "inputs": lambda row: inputs_text(row.outdated),
 }
 REQUIREMENTS: Columns[Row] = {

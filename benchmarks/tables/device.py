@@ -29,9 +29,10 @@ STEPS = 100_000
 TEXT = """### On a GPU
 
 Written by `python -m benchmarks device`. Elapsed milliseconds of a training step of `guided`, the median of
-at least three, after {warm} others: with the network of the benchmark and with a wide one, for the usual number of
-states in a step and for {many:,}. On the processor ({threads}) rollouts and verdicts are C, on the GPU torch.
-The search runs beside the steps on the processor in both cases. If the ratio is above 1, the GPU is faster.
+at least three, after {warm} others: with the network of the benchmark and with a wide one, for the usual
+number of states in a step and for {many:,}. On the processor ({threads}) rollouts and verdicts are C, on
+the GPU torch. The search runs beside the steps on the processor in both cases. If the ratio is above 1, the
+GPU is faster.
 """
 _OUTPUT = Output()
 
