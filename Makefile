@@ -3,11 +3,12 @@ BIN := .venv/bin
 # Hundreds of tests start the program: what Python compiles is kept, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test format docs site environment clean
+.PHONY: help demo test test-apart format docs site environment clean
 
 help:
 	@echo 'make demo    train, simulate, check and report the traffic benchmark, from nothing'
 	@echo 'make test    lint, format, types and tests: what has to be green'
+	@echo 'make test-apart  tests that start programs of their own: an installed wheel, documented examples'
 	@echo 'make docs    write anew what documents take from the code: commands, codes, files'
 	@echo 'make site    build the documentation site into docs/_build; warnings are errors'
 	@echo 'make format  lay the code out and fix what can be fixed'
@@ -21,6 +22,9 @@ test: environment
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal
+
+test-apart: environment
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m apart
 
 format: environment
 	$(BIN)/ruff check --fix .

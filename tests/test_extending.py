@@ -104,6 +104,7 @@ def test_an_extension_needs_the_files_that_the_page_promises():
             assert counts == (line if "1 line" in text else file), name
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("name", [name for name, _ in CHECKS])
 def test_an_example_works(name, failures):
     assert name not in failures, failures.get(name)

@@ -59,6 +59,7 @@ def test_every_kind_has_an_example():
         assert word in text
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("index", range(len(RUNS)))
 def test_an_example_runs(index, folder, request, monkeypatch, capsys):
     needs, body = RUNS[index]

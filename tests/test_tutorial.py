@@ -19,6 +19,7 @@ def test_the_files_were_found():
     assert labels("worst   room 0.1\nfails in most\n  a b_1  c  d\nstep 5  0.1") == ["worst", "a b_1"]
 
 
+@pytest.mark.apart
 def test_a_tank_is_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     says_no = {"stlc check tank.stl": (1,), "stlc explain tank.csv": (1,), "stlc check trace.npz": ANY}

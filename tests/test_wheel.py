@@ -53,6 +53,7 @@ def test_what_is_in_it(wheel):
     assert sum(info.file_size for info in zipfile.ZipFile(wheel).infolist()) < 12_000_000
 
 
+@pytest.mark.apart
 def test_nothing_of_the_tree_is_seen(bare, folder):
     said = bare.python(folder, "import stlc, sys; print(stlc.__file__); print(sys.path)")
     assert said.out.startswith(str(bare.packages)), said.err
@@ -70,6 +71,7 @@ JUDGES = {Path(name).name for path in (ROOT / "examples").glob("*.yaml") for nam
 """Specifications that only judge drives: they may look back farther than a policy remembers."""
 
 
+@pytest.mark.apart
 def test_every_shipped_specification_compiles_and_names_what_is_there(bare, folder):
     lines = [["lint", str(bare.library / spec), "--json"] for spec in SPECS]
     lines += [
@@ -85,6 +87,7 @@ def test_every_shipped_specification_compiles_and_names_what_is_there(bare, fold
             assert (system.parent / name).is_file()
 
 
+@pytest.mark.apart
 def test_a_specification_of_the_library_is_found_by_name(bare, folder):
     for said in bare.run(
         folder, ["compile", "specs/traffic.stl", "--json"], ["lint", "traffic.stl", "--json"]
@@ -94,6 +97,7 @@ def test_a_specification_of_the_library_is_found_by_name(bare, folder):
     assert [finding["code"] for finding in findings(said)] == ["U102"]
 
 
+@pytest.mark.apart
 def test_every_example_begins_a_project(bare, folder):
     examples = [name.removesuffix(".yaml") for name in SYSTEMS]
     begun = bare.run(folder, *(["init", name, "--example", name] for name in examples))
@@ -119,6 +123,7 @@ THREE = (
 )
 
 
+@pytest.mark.apart
 def test_the_three_commands_from_an_empty_folder(bare, folder):
     train, simulate, check, doctor = bare.run(folder, *THREE)
     assert train.code == 0, train.err
@@ -188,6 +193,7 @@ def without(bare, recordings) -> dict[str, Said]:
     return dict(zip(QUICK, bare.run(recordings, *(line for _, line in QUICK.values())), strict=True))
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("extra", QUICK)
 def test_an_extra(extra, wheel, without, recordings, tmp_path):
     ready = install(wheel, tmp_path / "env", extra)
@@ -239,6 +245,7 @@ with video("a.mp4", (64, 64), 40) as write:
 NEEDS = {"video": ("plot",)}
 
 
+@pytest.mark.apart
 def test_the_language_server(wheel, bare, folder):
     (said,) = bare.run(folder, ["lsp"])
     assert (said.code, "pip install 'stlc[lsp]'" in said.err) == (5, True)

@@ -44,6 +44,7 @@ FMUS = {
 }
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("name", FMUS)
 def test_an_fmu_is_simulated_falsified_and_certified(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -98,6 +98,7 @@ def test_a_run_goes_on_where_it_was_stopped(
     assert lines[-1].split()[1] == "250"
 
 
+@pytest.mark.apart
 def test_it_needs_neither_pytest_nor_what_the_command_line_needs() -> None:
     absent = ("pytest", "pydantic", "safetensors", "rtamt")
     hidden = "; ".join(f"sys.modules[{name!r}] = None" for name in absent)

@@ -205,6 +205,7 @@ def a_whole_run(tmp_path_factory):
     return time.monotonic() - begun
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("share", [pytest.param(0.3, marks=pytest.mark.slow), 0.8])
 def test_ctrl_c_at_any_time_of_the_imports(share, tmp_path, a_whole_run):
     with _started(*_importing(tmp_path)) as process:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -37,6 +38,7 @@ def test_what_breaks_off_is_told() -> None:
     assert found[0].document["diagnostics"][0]["code"] == "U101"
 
 
+@pytest.mark.apart
 def test_what_is_no_longer_wanted_is_saved(tmp_path: Path) -> None:
     long = Job("long", (SPEC, "--steps", "100000", "--runs", str(tmp_path), *QUICK))
     bad = Job("bad", ("--stepps", "2"))
