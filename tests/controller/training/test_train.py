@@ -146,10 +146,10 @@ def test_seeds_matter_and_repeat(car_task: Task, tmp_path: Path) -> None:
 
 
 def test_a_short_run_learns_and_opens_again(car_task: Task, tmp_path: Path) -> None:
-    config = TrainConfig(held_out=300, steps=250, seed=0)
+    config = TrainConfig(held_out=300, steps=150, drives=0, seed=0)
     outcome = train(car_task, config, _folder(car_task, tmp_path, config))
     assert outcome.score is not None
-    assert outcome.score.accuracy > 0.7
+    assert outcome.score.accuracy > 0.6
     assert outcome.score.feasible >= outcome.score.accuracy
     low, high = outcome.score.interval
     assert low < outcome.score.accuracy < high
