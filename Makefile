@@ -24,7 +24,7 @@ test: environment
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 test-apart: environment
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m apart
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "apart and not slow and not bench"
 
 format: environment
 	$(BIN)/ruff check --fix .

@@ -74,7 +74,7 @@ class RunDir:
             UsageError: U101, `words` cannot be part of a folder's name.
             MissingError: R201, the folder cannot be created.
         """
-        words = _checked(words) if words is not None else draw_words()
+        words = require_name(words) if words is not None else draw_words()
         home = root / _slug(spec_name)
         with reported(f"make a run below `{root}`"):
             home.mkdir(parents=True, exist_ok=True)
@@ -324,7 +324,8 @@ def _slug(name: str) -> str:
     return file_part(name, empty="spec")
 
 
-def _checked(words: str) -> str:
+def require_name(words: str) -> str:
+    """Return the name of a run; raise UsageError (U101) if no folder can have it."""
     if _slug(words) != words or words == LATEST:
         raise usage(f"`{words}` cannot name a run", "use letters, digits, `-`, `_` and `.`")
     return words

@@ -291,12 +291,12 @@ def _train(task: Task, config: TrainConfig, launch: Launch, logger: Opener | Non
     from stlc.controller.training.loop import prepare, run
     from stlc.stopping import age
 
-    before = age()
     with joined(config.device) as ranks:
+        before = age()
         prepared = prepare(task, config, ranks=ranks, failures=round_of)
         made = str(open_folder(task, config, launch).path) if ranks.first else ""
         folder = RunDir(Path(ranks.agree_text(made)))
-        with Session(folder, logger=logger, writes=ranks.first, before=before) as session:
+        with Session(folder, logger=logger, writes=ranks.first, before=before, new=True) as session:
             session.outcome = run(prepared, folder, session.watch)
     return session
 

@@ -14,7 +14,6 @@ from stlc.cli.framework.documents import TrainedRun, verdict_record
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import PULSE, Answer, console, say, show_diagnostics
 from stlc.cli.train.progress import TrainingDisplay, final_screen
-from stlc.controller.training.checkpoint import never_saved
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
@@ -52,6 +51,7 @@ class Session:
         writes: whether this process writes the run's folder; of several processes only the first one does.
         before: seconds from the start of the process to that of the training; None: to the start of the
             session.
+        new: whether the run has been made for this training, instead of being gone on with.
     """
 
     folder: RunDir
@@ -60,11 +60,13 @@ class Session:
     logger: Opener | None = None
     writes: bool = True
     before: float | None = None
+    new: bool = False
     _log: TensorBoardLogger | None = None
     _signals: list[int] = field(default_factory=list)
     _deferring: bool = False
     _seconds_before: float = 0.0
     _begun: bool = False
+    _status_before: Status | None = None
     _forced: ExitStack = field(default_factory=ExitStack)
     _handlers: dict[int, Any] = field(default_factory=dict)
 
@@ -106,6 +108,8 @@ class Session:
 
     def __enter__(self) -> Self:
         self._seconds_before = age() if self.before is None else self.before
+        with suppress(StlcError):
+            self._status_before = self.folder.status
         for number in (signal.SIGINT, signal.SIGTERM):
             self._handlers[number] = signal.signal(number, self._interrupt)
         if self.writes:
@@ -137,8 +141,8 @@ class Session:
 
     def _close(self, status: Status) -> None:
         """Record how the run ended; one whose continuation was refused, or did not begin, stays as it was."""
-        if self._begun or never_saved(self.folder):
-            with suppress(StlcError):
+        with suppress(StlcError):
+            if self.new or self._begun or self.folder.status != self._status_before:
                 self.folder.finish(status)
 
     def _say_interrupted(self) -> None:

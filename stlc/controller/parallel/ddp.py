@@ -28,6 +28,9 @@ PATIENCE = timedelta(minutes=10)
 _SPREAD = 0x9E3779B97F4A7C15
 """Seed offset between ranks: 2^64 over the golden ratio (D. Knuth, The Art of Computer Programming 6.4)."""
 
+KINDS = ("cpu", "cuda", "mps", "xpu")
+"""Kinds of torch devices on which a policy can be trained."""
+
 T = TypeVar("T")
 
 
@@ -156,6 +159,28 @@ def expected() -> Ranks:
     return Ranks(rank, size, local) if size > 1 else ALONE
 
 
+def find_device(name: str) -> torch.device:
+    """Return the torch device `name`; `auto` is the GPU if there is one, else the CPU.
+
+    Raises:
+        MissingError: R302, the device does not exist.
+    """
+    try:
+        best = "cuda" if torch.cuda.is_available() else "cpu"
+        device = torch.device(best if name == "auto" else name)
+        if device.type not in KINDS:
+            raise RuntimeError(f"the kind `{device.type}` is none of {', '.join(KINDS)}")
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0].partition(". ")[0]
+        raise MissingError(
+            Diagnostic(
+                "R302", f"there is no device `{name}` here", help=("use --device cpu",), note=(reason,)
+            )
+        ) from error
+    return device
+
+
 @contextmanager
 def joined(device: str) -> Iterator[Ranks]:
     """Context in which the ranks (processes) of this training are connected; yields this process's `Ranks`.
@@ -164,14 +189,14 @@ def joined(device: str) -> Iterator[Ranks]:
         device: torch device; on `cuda` every rank of a machine takes a GPU of its own.
 
     Raises:
-        MissingError: R403, another rank cannot be reached.
+        MissingError: R302, the device does not exist; R403, another rank cannot be reached.
     """
     ranks = expected()
     if ranks.size == 1:
         yield ranks
         return
     own = ranks.device(device)
-    gpu = own.startswith("cuda")
+    gpu = find_device(own).type == "cuda"
     try:
         if gpu:
             torch.cuda.set_device(own)

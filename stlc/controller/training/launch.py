@@ -11,12 +11,12 @@ from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.methods.plan import planner_of
 from stlc.controller.planning.planner import prepared
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
-from stlc.controller.training.loop import train
+from stlc.controller.training.loop import prepare, run
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.dynamics.robots.functions import function_files
 from stlc.files import write_atomic
 from stlc.provenance import git_state, hardware, versions
-from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, now
+from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, now, require_name
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Launch:
 
     Attributes:
         root: folder of all runs.
-        name: name of the run; random if None.
+        name: name of the run; random if None. One that cannot name a folder is refused (U101).
         overrides: constants and keys of the system file that `--set` changed, name -> text.
         command: command line, which the run's record keeps.
     """
@@ -42,6 +42,10 @@ class Launch:
     name: str | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     command: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if self.name is not None:
+            require_name(self.name)
 
 
 def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -> RunDir:
@@ -54,7 +58,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
 
     Raises:
         MissingError: R201, the folder cannot be written.
-        UsageError: U101, `launch.name` cannot name a folder, or an option is refused.
+        UsageError: U101, an option is refused.
     """
     decl, launch = task.system.decl, launch or Launch()
     resolved = resolve_config(task, config)  # before the folder: a refused option leaves no run behind
@@ -115,7 +119,8 @@ def train_here(
             None: that of the system file.
     """
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
-    return train(task, config, open_folder(task, config)).run
+    prepared = prepare(task, config)
+    return run(prepared, open_folder(task, config)).run
 
 
 def open_planner(task: Task, choice: PlannerChoice, *, seed: int, launch: Launch) -> RunDir:

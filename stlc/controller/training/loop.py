@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from stlc.controller.evaluation.held_out import silent
-from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.parallel.ddp import ALONE, Ranks, find_device
 from stlc.controller.problem.load import require_controls
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
 from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
@@ -23,7 +23,7 @@ from stlc.controller.training.diagnose import check_mirror, refuted
 from stlc.controller.training.failures import SHARE
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.run import Run, RunWriter, load_config, spec_hash, system_hash, task_of_run
-from stlc.diagnostics import Diagnostic, MissingError, RunError, StlcError, UsageError, usage
+from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, usage
 from stlc.native import never
 from stlc.registry import METHODS
 
@@ -154,6 +154,7 @@ def prepare(
     torch.set_num_threads(resolved.threads)
     method: Method = METHODS.get(resolved.method)
     learner = method.learner(task, resolved, steps=schedule.at(0), device=device, ranks=ranks)
+    ranks.any(False)  # the first rank makes the run once all are ready
     return Preparation(task, resolved, learner, schedule, budget, now, started, ranks, failures)
 
 
@@ -314,26 +315,6 @@ def _require_search(config: ResolvedConfig, failures: FailureSearch | None) -> N
         raise usage("`--falsify` is for a training in one process", "stlc train SPEC --falsify")
     if config.falsify and failures is None:
         raise usage("`falsify` needs a search", "train(..., failures=stlc.assurance.drive_search.round_of)")
-
-
-def find_device(name: str) -> torch.device:
-    """Return the torch device `name`; `auto` is the GPU if there is one, else the CPU.
-
-    Raises:
-        MissingError: R302, the device does not exist.
-    """
-    try:
-        best = "cuda" if torch.cuda.is_available() else "cpu"
-        device = torch.device(best if name == "auto" else name)
-        torch.zeros(1, device=device).cpu()  # `meta` and others hold no numbers
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0].partition(". ")[0]
-        raise MissingError(
-            Diagnostic(
-                "R302", f"there is no device `{name}` here", help=("use --device cpu",), note=(reason,)
-            )
-        ) from error
-    return device
 
 
 class _Session:

@@ -104,9 +104,16 @@ def test_a_run_that_breaks_off_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "code"), [(["--device", "meta"], 5), (["--device", "cuda:77"], 5), (["--method", "sac"], 5)]
+    ("option", "code"),
+    [
+        (["--device", "meta"], 5),
+        (["--device", "hpu"], 5),
+        (["--device", "cuda:77"], 5),
+        (["--method", "sac"], 5),
+        (["--name", "a/b"], 2),
+    ],
 )
-def test_what_the_learner_refuses_makes_no_run(
+def test_what_is_refused_makes_no_run(
     option: list[str], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
@@ -116,11 +123,31 @@ def test_what_the_learner_refuses_makes_no_run(
     assert not Path("runs").exists()
 
 
-def test_a_refused_continuation_leaves_the_run_as_it_was(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("planned", [False, True])
+def test_a_refused_continuation_leaves_the_run_as_it_was(
+    planned: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
     few = ["--steps", "3", "--batch", "16", "--held-out", "40", "--drives", "0", "--no-pictures"]
-    assert main([*TRAIN, *few]) in (0, 1)
+    simulated = ["simulate", *TRAIN[1:], "--method", "search", "--agents", "1", "--steps", "2"]
+    assert main(simulated if planned else [*TRAIN, *few]) in (0, 1)
     folder = RunDir.newest()
     before = (folder.path / "run.json").read_bytes()
     assert main(["train", "--resume", folder.shown, "--steps", "9", "--device", "meta"]) == 5
     assert "there is no device `meta` here" in capsys.readouterr().err
     assert (folder.path / "run.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_continuation_that_breaks_off_before_its_first_step_has_failed(
+    killed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = ["--steps", "3", "--batch", "16", "--held-out", "40", "--drives", "0", "--no-pictures"]
+    assert main([*TRAIN, *few]) in (0, 1)
+    folder = RunDir.newest()
+
+    def broken(_self: Trainer) -> dict[str, str]:
+        raise KeyboardInterrupt if killed else OSError(28, "No space left on device", "run.json")
+
+    monkeypatch.setattr(Trainer, "torch_reasons", broken)
+    assert main(["train", "--resume", folder.shown, "--steps", "9"]) == (130 if killed else 5)
+    assert folder.status == ("interrupted" if killed else "failed")

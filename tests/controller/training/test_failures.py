@@ -137,7 +137,6 @@ class Clock:
         return self.time
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("interrupted", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupted: bool

@@ -219,3 +219,10 @@ def test_torchrun_on_the_command_line(number: int, status: str, tmp_path: Path) 
 
 def _facts(run: RunDir) -> object:
     return load_checkpoint(run, spec_hash=spec_hash(run), system_hash=system_hash(run)).facts["step"]
+
+
+def test_a_rank_without_a_gpu_of_its_own_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("RANK", "7"), ("WORLD_SIZE", "99"), ("LOCAL_RANK", "77")):
+        monkeypatch.setenv(name, value)
+    with pytest.raises(MissingError, match="no device `cuda:77`"), joined("cuda"):
+        pass
