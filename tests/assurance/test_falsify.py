@@ -208,6 +208,7 @@ def fall() -> None:
     )
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("fall")
 def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     simulator = PlantSimulator.load("fall.stl", Path("fall.yaml"), {})

@@ -17,6 +17,8 @@ from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.controller.parallel.workers import LocalProcesses
 
+pytestmark = pytest.mark.apart
+
 
 @dataclass(frozen=True)
 class Bowl:

@@ -225,6 +225,7 @@ def test_a_run_that_was_cut_short_goes_on(tmp_path: Path) -> None:
     assert broken.name not in place.store.all()
 
 
+@pytest.mark.apart
 def test_the_command_from_training_to_the_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

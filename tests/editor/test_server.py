@@ -13,6 +13,8 @@ from lsp_client import Client, LspError
 
 from stlc.cli.framework.app import main
 
+pytestmark = pytest.mark.apart
+
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 

@@ -26,6 +26,8 @@ import time
 
 import numpy as np
 
+pytestmark = pytest.mark.apart
+
 
 class Hostile:
     def reset(self, initial, params):

@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[3]
 CONFIG = TrainConfig(held_out=20, steps=12, seed=3, batch=8, threads=1)
 TINY = {"pool": 32, "every": 4, "most": 8, "hidden": (8,)}
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+pytestmark = [pytest.mark.apart, pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")]
 
 
 def _tensors(run: RunDir) -> dict[str, torch.Tensor]:
