@@ -1,4 +1,4 @@
-"""Figure of plan accuracy over training time, one panel per benchmark.
+"""Figure of plan accuracy over training time on a logarithmic axis, one panel per benchmark.
 
 A dashed line shows the share of initial states from which a satisfying plan is known.
 """
@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from benchmarks.training import Cell
 from stlc.files import write_atomic
 from stlc.view import available
-from stlc.view.style import BLUE, INK, MUTED, ORANGE, Picture, new_figure, picture_style
+from stlc.view.style import BLUE, GREEN, INK, MUTED, ORANGE, PINK, SKY, Picture, new_figure, picture_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +23,11 @@ if TYPE_CHECKING:
 
 PICTURE = "img/results.svg"
 """The picture, relative to the page."""
-COLORS = {"guided": BLUE, "gradient": ORANGE}
+COLORS = {"guided": BLUE, "gradient": ORANGE, "ppo": GREEN, "pets": PINK, "mbpo": SKY}
+"""Colours of methods; those of a method with several rewards differ in their lines."""
+LINES = {"robustness": "-", "task": "--", "accuracy": ":"}
+"""Lines of the curves of a reward."""
+TICKS = {10: "10 s", 60: "1 min", 300: "5 min", 3600: "1 h"}
 COLUMNS = 3
 
 
@@ -31,7 +36,7 @@ class Curve:
     """Learning curve of one training run.
 
     Attributes:
-        method: name of the training method.
+        method: name of the training method, with its reward if it has several.
         seconds: training time at each point.
         accuracies: plan accuracy at each point, on new random initial states.
         end: (training time in seconds, final accuracy on held-out initial states).
@@ -47,7 +52,7 @@ class Curve:
         """Return the learning curve that is stored in the result of a training run."""
         points = [(float(point["seconds"]), float(point["accuracy"])) for point in result["curve"]]
         times, accuracies = zip(*points, strict=True) if points else ((), ())
-        return cls(result["key"]["method"], times, accuracies, (result["seconds"], result["accuracy"]))
+        return cls(Cell.of(result).contender, times, accuracies, (result["seconds"], result["accuracy"]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +77,10 @@ def draw_results(results: Sequence[Result], known: Mapping[str, KnownFeasible | 
     states from which a satisfying plan is known, or None. Returns False if matplotlib is missing or nothing
     was measured.
     """
-    longest: dict[str, dict[tuple[str, int], Result]] = {}
+    longest: dict[str, dict[tuple[object, ...], Result]] = {}
     for each in sorted(results, key=lambda each: float(each["seconds"])):
         key = each["key"]
-        longest.setdefault(key["benchmark"], {})[key["method"], key["seed"]] = each
+        longest.setdefault(key["benchmark"], {})[Cell.of(each).contender, key["seed"]] = each
     panels = [
         Panel(name, tuple(map(Curve.of, longest[name].values())), None if share is None else share.share)
         for name, share in known.items()
@@ -101,20 +106,21 @@ def draw_benchmarks(panels: Sequence[Panel]) -> Picture | None:
             axes.set_ylabel("plan accuracy, share of starts")
         for axes in grid[len(shown) :]:
             axes.set_visible(False)
-        grid[0].legend(loc="lower right", handlelength=1.2)
+        grid[0].legend(loc="lower right", ncols=2, handlelength=1.4, columnspacing=1.0, fontsize="x-small")
     reached = (f"{panel.title} {max(curve.end[1] for curve in panel.curves):.3f}" for panel in shown)
     return Picture(figure, f"Plan accuracy over training time; the best at the end: {', '.join(reached)}.")
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_title(panel.title)
-    axes.set_xlabel("training time [s]")
+    axes.set_xlabel("training time")
     named: set[str] = set()
     for curve in panel.curves:
-        color = COLORS.get(curve.method, INK)
+        method, _, reward = curve.method.partition(":")
+        color, line = COLORS.get(method, INK), LINES.get(reward, "-")
         label = None if curve.method in named else curve.method
         named.add(curve.method)
-        axes.plot(curve.seconds, curve.accuracies, color=color, lw=0.9, alpha=0.7, label=label)
+        axes.plot(curve.seconds, curve.accuracies, color=color, ls=line, lw=0.9, alpha=0.7, label=label)
         axes.plot(*curve.end, "o", color=color, ms=3.2, zorder=3)
     top = max(accuracy for curve in panel.curves for accuracy in (*curve.accuracies, curve.end[1]))
     if panel.feasible is not None:
@@ -128,5 +134,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
             color=MUTED,
         )
         top = max(top, panel.feasible)
-    axes.set_xlim(left=0)
+    axes.set_xscale("log")
+    axes.set_xticks([*TICKS], [*TICKS.values()])
+    axes.minorticks_off()
+    axes.set_xlim(5.0, 4800.0)
     axes.set_ylim(0, min(1.08, 1.15 * top + 0.01))
