@@ -16,6 +16,8 @@ from helpers.plants import changed, read
 from stlc.plants.plant import FindingError, Plant, PlantFinding
 from stlc.trace import Trace
 
+pytestmark = pytest.mark.apart
+
 CODE = '''
 import ctypes
 import os
@@ -25,8 +27,6 @@ import sys
 import time
 
 import numpy as np
-
-pytestmark = pytest.mark.apart
 
 
 class Hostile:
