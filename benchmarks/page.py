@@ -131,6 +131,7 @@ def section(stored: Stored, page: Path) -> list[str]:
         *("## The paper's comparison", ""),
         *_search_first(plans),
         *(line for picture in pictures for line in (picture, "")),
+        *((BARS_TEXT, "") if drawn else ()),
         *("### Plan accuracy", "", COMPARED, *markdown(lines), "", *refusals(plans), ""),
         *_block(
             "### Known and proved ceilings", CEILING, listed("c", [*ceiling.values()], CEILINGS).markdown()
@@ -148,6 +149,9 @@ _PICTURES = (
     "Plan accuracy of all methods, with intervals",
     "Plan accuracy over the processor time of a plan",
 )
+BARS_TEXT = """\
+A bar is the longest training of a method, which is an hour for `sac:robustness` where the table has one, or
+its largest planning time. The dashed line is the known feasible share."""
 CEILING = """\
 On the planners' starts: the share for which any cell found a satisfying plan, and the share that `plan:milp`
 proved to have none. A contradiction would be a start with both.
