@@ -274,10 +274,13 @@ def resume(
             )
         )
     writer.before(learner.next_validation)
-    writer.note({"status": "running", "seconds_allowed": allowed or None})
     time_ = TimeBudget.of(now, started - before, allowed, late)
     falsified = float(facts.get("falsified") or 0.0)
-    return _Session(writer, learner, watch, time_, schedule, failures, falsified).finish()
+    session = _Session(writer, learner, watch, time_, schedule, failures, falsified)
+    if saved is not None and (steps is not None or budget is not None):
+        session.save()  # the longer schedule first: a run that is killed now still has its steps to make
+    writer.note({"status": "running", "seconds_allowed": allowed or None})
+    return session.finish()
 
 
 def _without_steps(
@@ -365,7 +368,7 @@ class _Session:
         try:
             with self.watch.deferring():
                 if not self._trained():
-                    self._save()
+                    self.save()
                     self.writer.close("interrupted")
                     return self._unjudged(interrupted=True)
                 self.writer.note({"steps": learner.step})
@@ -390,13 +393,13 @@ class _Session:
             self.pace.stepped(learner.step, ended, search_runs=learner.searching)
             due = learner.step % SAVE_EVERY == 0 or time.perf_counter() - saved > SAVE_SECONDS
             if learner.ranks.any(due):
-                self._save()
+                self.save()
                 saved = time.perf_counter()
             if learner.ranks.any(self.watch.stop()):
                 return False
         if more is None:
             return False
-        self._save()
+        self.save()
         return not learner.ranks.any(self.watch.stop())
 
     def _goes_on(self) -> bool | None:
@@ -529,7 +532,7 @@ class _Session:
             run, None, self.time.spent, interrupted, learner.ranks.size, steps=learner.step
         )
 
-    def _save(self) -> None:
+    def save(self) -> None:
         """Write a checkpoint.
 
         If a search is running, its inputs are saved, not its result.
@@ -572,7 +575,7 @@ class _Session:
         """
         error, good = self.learner.diagnose()
         if good:
-            self._save()
+            self.save()
         self.writer.close("failed")
         note = (
             "the run keeps the weights before that step" if good else "the last checkpoint of the run is kept"

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -332,6 +333,23 @@ def test_a_run_that_goes_on_past_its_end_is_repeated_too(car_task: Task, tmp_pat
     again = _folder(car_task, tmp_path / "b", told)
     train(car_task, told, again)
     assert _same(folder, again)
+
+
+@pytest.mark.usefixtures("ticking")
+@pytest.mark.parametrize("more", [{"steps": 80}, {"budget": 20.0}])
+def test_a_continuation_that_is_killed_at_once_still_has_its_steps_to_make(
+    more: dict[str, Any], car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig(held_out=50, drives=0, steps=60, seed=3, batch=16, threads=1)
+    folder = _folder(car_task, tmp_path / "a", config)
+    train(car_task, config, folder)
+    with monkeypatch.context() as patch:
+        patch.setattr("stlc.controller.training.loop._Session.finish", lambda _self: sys.exit(137))
+        with pytest.raises(SystemExit):
+            resume(folder, **more)
+    assert folder.status == "running"
+    resume(folder)
+    assert (folder.record()["steps"] == 80) if "steps" in more else (folder.record()["steps"] > 60)
 
 
 @pytest.mark.bench
