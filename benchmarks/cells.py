@@ -65,9 +65,9 @@ class Selection:
         cell, known = Cell.of(result), {each.name: each for each in self.contenders}
         if cell.benchmark not in self.benchmarks or cell.contender not in known:
             return []
-        run, label = place.newest_run(cell.key), cell.name.removeprefix(f"{cell.benchmark}-")
+        run = place.newest_run(cell.key)
         own = known[cell.contender], math.inf, self.comparing.starts
-        return [] if run is None else [PlanCell(cell.benchmark, *own, run, label)]
+        return [] if run is None else [PlanCell(cell.benchmark, *own, run, cell.label)]
 
     def drives(self, place: Place) -> list[Drive]:
         """Return the requested closed-loop measurements.

@@ -5,19 +5,20 @@ An entry that is not measured stays empty. The last column of its line shows the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
 from benchmarks.claims import OURS, Standing, Upset
-from benchmarks.drives import DriveRow, budget_text
-from benchmarks.options import Training
+from benchmarks.drives import GUARDS, DriveRow, budget_text
+from benchmarks.options import Comparing, Training
 from benchmarks.plannings import LONG, SECONDS, PlanRow
 from benchmarks.roster import Contender
 from benchmarks.store import BENCHMARKS
 from benchmarks.table import Columns, bullet, listed
 from benchmarks.training import Length
-from stlc.cli.framework.options import parse_seeds
+from stlc.cli.framework.options import parse_seconds, parse_seeds
 
 HOUR = 3600.0
 SEEDS = parse_seeds(Training().seeds)
@@ -205,16 +206,49 @@ def latencies(plans: Iterable[PlanRow]) -> list[Line]:
     return [Line(*own, cells) for own, cells in groups.items()]
 
 
-def deployments(drives: Iterable[DriveRow]) -> list[Line]:
-    """Return lines with accuracy and safety in closed loop, one line per method and guard."""
-    groups: dict[tuple[str, str], dict[str, str]] = {}
-    for row in drives:
-        backup = "with backup" if row.guard == "paper" else "no guard"
-        budget = backup if row.label else f"{budget_text(row.seconds)}, {backup}"
-        parts = [_with_half(row.accuracy, row.accuracy_half), _with_half(row.safety, row.safety_half)]
-        text = "refused" if row.refused else " / ".join(parts)
-        groups.setdefault((row.label or row.method, budget), {})[row.benchmark] = text
-    return [Line(*own, cells) for own, cells in groups.items()]
+def deployments(
+    drives: Iterable[DriveRow], trained: Mapping[tuple[str, str], float], contenders: Iterable[Contender]
+) -> list[Line]:
+    """Return lines with accuracy and safety in closed loop, one line per method and guard.
+
+    Of the policies of one training method on one benchmark, the most accurate is shown.
+
+    Args:
+        drives: measured results.
+        trained: (benchmark, label of a trained policy) -> plan accuracy on held-out states.
+        contenders: methods in the order of their lines; those that are not measured have empty lines.
+    """
+    known = {each.name: each for each in contenders}
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for each in known.values():
+        seconds = None if each.evaluations else parse_seconds(Comparing().decision)
+        for guard in GUARDS:
+            cells[each.name, _loop_text(guard, seconds if each.plans else math.inf)] = {}
+    for row in sorted(drives, key=lambda row: trained.get((row.benchmark, row.label), 0.0)):
+        budget = _loop_text(row.guard, math.inf if row.label else row.seconds)
+        cells.setdefault((row.method, budget), {})[row.benchmark] = _deployed_text(row)
+    lines = []
+    for (name, budget), own in cells.items():
+        missing = [benchmark for benchmark in BENCHMARKS if benchmark not in own]
+        command = _command(known[name], missing, "--parts drives") if name in known else ""
+        lines.append(Line(name, budget, own, command))
+    return lines
+
+
+def _loop_text(guard: str, seconds: float | None) -> str:
+    """Text for the guard, and for the time budget of a planner; `seconds` is inf for a trained policy."""
+    backup = "with backup" if guard == "paper" else "no guard"
+    return backup if seconds == math.inf else f"{budget_text(seconds)}, {backup}"
+
+
+def _deployed_text(row: DriveRow) -> str:
+    """Text of an entry: accuracy / safety, the trained policy, and the size if it is not the usual one."""
+    if row.refused:
+        return "refused"
+    parts = [_with_half(row.accuracy, row.accuracy_half), _with_half(row.safety, row.safety_half)]
+    run = row.label.removeprefix(f"{row.method.replace(':', '-')}-")
+    notes = [note for note in (run, row.fewer) if note]
+    return " / ".join(parts) + (f" ({'; '.join(notes)})" if notes else "")
 
 
 def _with_half(value: float | None, half: float | None) -> str:

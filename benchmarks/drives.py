@@ -164,6 +164,7 @@ class DriveRow:
         median_ms: median processor time of a decision for one agent.
         p99_ms: 99th percentile of the processor time of a decision.
         refused: reason why the planner cannot solve the task; "" if it can.
+        fewer: worlds, agents and steps if they are fewer than in the system file, else "".
         outdated: whether the specification, the system or a version has changed since the measurement.
     """
 
@@ -180,6 +181,7 @@ class DriveRow:
     median_ms: float | None
     p99_ms: float | None
     refused: str = ""
+    fewer: str = ""
     outdated: bool = False
 
     @classmethod
@@ -191,8 +193,18 @@ class DriveRow:
             *(key["benchmark"], key["contender"], key["label"], key["seconds"], key["guard"]),
             f"{len(key['seeds'])} x {key['agents']} x {key['steps']}",
             *(accuracy.get("mean"), _half(accuracy), safety.get("mean"), _half(safety)),
-            *(decision.get("median"), decision.get("p99"), result.get("refused", ""), is_outdated(result)),
+            *(decision.get("median"), decision.get("p99"), result.get("refused", "")),
+            *(_fewer(key), is_outdated(result)),
         )
+
+
+def _fewer(key: Mapping[str, Any]) -> str:
+    """Size of a measurement as text, such as `3 worlds of 5 agents`; "" if it is the system file's."""
+    test, agents, steps = load(key["benchmark"]).system.decl.test, key["agents"], key["steps"]
+    worlds = len(key["seeds"])
+    of_agents = f"{worlds} world{'s' * (worlds > 1)} of {agents} agent{'s' * (agents > 1)}"
+    notes = (of_agents if agents < test.agents else "", f"{steps} steps" if steps < test.steps else "")
+    return ", ".join(filter(None, notes))
 
 
 def _half(metric: Mapping[str, Any]) -> float | None:

@@ -108,6 +108,11 @@ class Cell:
         return "-".join([*filter(None, first), self.length.name, f"seed{self.seed}"])
 
     @property
+    def label(self) -> str:
+        """Name without the benchmark, such as `guided-60s-seed0`."""
+        return self.name.removeprefix(f"{self.benchmark}-")
+
+    @property
     def key(self) -> Key:
         """Key under which the result is stored: its name and all its inputs.
 

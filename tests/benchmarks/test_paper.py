@@ -14,8 +14,8 @@ from helpers.documents import misfits
 from benchmarks.__main__ import main as measure_by_command
 from benchmarks.bars import Bar, Facet, Point, draw
 from benchmarks.claims import FAILS, HOLDS, OPEN, Claim, Standing, claims
-from benchmarks.comparison import Learned, accuracies, standings, upsets
-from benchmarks.drives import Drive, driven
+from benchmarks.comparison import Learned, accuracies, deployments, standings, upsets
+from benchmarks.drives import Drive, DriveRow, driven
 from benchmarks.options import Comparing
 from benchmarks.plannings import PlanCell, PlanRow, ceilings, improves, measure, planned
 from benchmarks.roster import Contender, learners, planners, roster
@@ -332,6 +332,34 @@ def test_a_drive_is_stored_with_guard_and_size(tmp_path: Path) -> None:
     for result in found.results:
         assert 0.0 <= result["metrics"]["plan_accuracy"]["mean"] <= 1.0
         assert result["decision"]["median"] <= result["decision"]["p99"]
+
+
+def test_the_closed_loop_shows_the_best_policy_of_a_method_and_what_is_missing() -> None:
+    def driven_by(label: str, accuracy: float, fewer: str = "") -> DriveRow:
+        first = "traffic", "sac:task", label, None, "none", "3 x 20 x 150"
+        return DriveRow(*first, accuracy, None, 1.0, None, 1.0, 2.0, fewer=fewer)
+
+    rows = (
+        driven_by("sac-task-300s-seed1", 0.75, "3 worlds of 5 agents"),
+        driven_by("sac-task-60s-seed0", 0.5),
+    )
+    trained = {("traffic", "sac-task-300s-seed1"): 0.7, ("traffic", "sac-task-60s-seed0"): 0.6}
+    known = roster()
+    lines = deployments(rows, trained, [known["sac:task"], known["plan:cem"]])
+    assert [(line.method, line.budget) for line in lines] == [
+        *(("sac:task", "no guard"), ("sac:task", "with backup")),
+        *(("plan:cem", "10 ms, no guard"), ("plan:cem", "10 ms, with backup")),
+    ]
+    assert lines[0].cells == {"traffic": "0.750 / 1.000 (300s-seed1; 3 worlds of 5 agents)"}
+    assert lines[0].command.startswith("python -m benchmarks paper --methods sac:task --only reach_n_avoid,")
+    assert lines[2].command == "python -m benchmarks paper --methods plan:cem --parts drives"
+
+
+def test_a_drive_of_fewer_agents_says_so(tmp_path: Path) -> None:
+    cells = [Drive(tiny(), "none", (0,), agents=agents, steps=steps) for agents, steps in ((2, 3), (None, 3))]
+    few, short = (DriveRow.of(result) for result in driven(cells, ResultStore("drives", tmp_path)).results)
+    assert few.fewer == "1 world of 2 agents, 3 steps"
+    assert short.fewer == "3 steps"
 
 
 def answer(capsys: pytest.CaptureFixture[str], words: list[str]) -> dict[str, Any]:
