@@ -16,14 +16,22 @@ from benchmarks.curves import PICTURE, draw_results
 from benchmarks.feasible import KnownFeasible
 from benchmarks.store import Result
 from benchmarks.table import Columns, Table, listed, provenance, text_of
-from benchmarks.training import OUTDATED_TEXT, SeedGroup, benchmark_order, fewer_text, grouped, inputs_text
-from stlc.controller.evaluation.held_out import wilson
+from benchmarks.training import (
+    OUTDATED_TEXT,
+    SeedGroup,
+    benchmark_order,
+    fewer_text,
+    grouped,
+    inputs_text,
+    interval_over_seeds,
+)
 from stlc.registry import METHODS
 
 TEXT = f"""\
-`accuracy` is the mean over seeds with its 95 % Wilson interval, `share of feasible` that mean as a share of
-the known feasible states (in brackets that of the worst seed). A slow policy is judged on the first of the
-held-out states only: their number stands behind its accuracy, and its shares refer to them. `known feasible`
+`accuracy` is the mean over seeds with its 95 % interval over seeds and states (Student's t and Wilson, added
+in quadrature), `share of feasible` that mean as a share of the known feasible states (in brackets that of the
+worst seed). A slow policy is judged on the first of the held-out states only: their number stands behind its
+accuracy, and its shares refer to them. `known feasible`
 is the share of the same states for which some satisfying plan is known, a lower bound of the feasible share.
 From those `proved infeasible` no plan exists, by the planner `milp` (traffic and reach_n_avoid, whose
 encodings are exact). How many `steps` a budget pays for depends on the machine and on its load; the seeds
@@ -41,7 +49,7 @@ class Row:
         length: training time as text, such as `60 s`.
         seeds: seeds of the training runs, in order.
         accuracies: plan accuracy for each seed, on the same held-out initial states.
-        interval: 95 % Wilson interval of the mean accuracy, over the judged states of all seeds.
+        interval: 95 % interval of the mean accuracy, over seeds and states.
         judged: number of held-out states on which the policy was judged, for each seed.
         held_out: number of held-out states that were requested. Slow policies are judged on the first only.
         known_shares: share of the judged states from which a satisfying plan is known, for each seed; empty
@@ -97,7 +105,7 @@ def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
     found = known.get(cell.benchmark)
     return Row(
         *(cell.benchmark, cell.contender, cell.length.text, group.seeds, group.accuracies),
-        interval=wilson(group.mean("accuracy"), sum(judged)),
+        interval=interval_over_seeds(group.accuracies, judged),
         judged=judged,
         held_out=cell.held_out,
         known_shares=() if found is None else tuple(map(found.share_among, judged)),

@@ -17,6 +17,7 @@ from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, lo
 from stlc.cli.framework.output import say
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.evaluation.held_out import wilson
+from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.parallel import executor
 from stlc.controller.parallel.bundle import input_files
 from stlc.controller.parallel.jobs import Job
@@ -481,6 +482,22 @@ class SeedGroup:
     def mean(self, name: str) -> float:
         """Return the mean over the seeds of the number that the results store under `name`."""
         return fmean(float(each[name]) for each in self.results)
+
+
+def interval_over_seeds(accuracies: Sequence[float], judged: Sequence[int]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean accuracy over seeds, for other seeds and other held-out states.
+
+    The scatter of the seeds (Student's t) and the error of a share of states (Wilson) are added in
+    quadrature. All seeds are judged on the same states, so more seeds do not reduce the second. A single seed
+    has no scatter: its interval is that of the states alone.
+
+    Args:
+        accuracies: accuracy of each seed.
+        judged: number of held-out states on which each seed was judged.
+    """
+    mean, scatter = fmean(accuracies), MeanInterval.of(accuracies).half or 0.0
+    low, high = wilson(mean, round(fmean(judged)))
+    return max(mean - math.hypot(mean - low, scatter), 0.0), min(mean + math.hypot(high - mean, scatter), 1.0)
 
 
 def judged_states(result: Result) -> int:

@@ -15,10 +15,19 @@ from typing import Any
 from benchmarks.options import OnlyOption, Output, Training, chosen
 from benchmarks.store import Key, Result, ResultStore, load
 from benchmarks.table import Columns, Table, provenance, publish
-from benchmarks.training import OUTDATED_TEXT, Cell, Place, SeedGroup, filled, grouped, inputs_text
+from benchmarks.training import (
+    OUTDATED_TEXT,
+    Cell,
+    Place,
+    SeedGroup,
+    filled,
+    grouped,
+    inputs_text,
+    interval_over_seeds,
+)
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.controller.evaluation.held_out import score, wilson
+from stlc.controller.evaluation.held_out import score
 from stlc.controller.training.run import Run
 
 BUDGETS = (60.0,)
@@ -82,7 +91,7 @@ class Row:
         length: training time as text, such as `60 s`.
         seeds: seeds of the training runs.
         accuracy: plan accuracy, mean over seeds.
-        interval: 95 % Wilson interval of the accuracy, over the held-out states of all seeds.
+        interval: 95 % interval of the accuracy, over seeds and states.
         feasible: share of the states from which a satisfying plan is known, mean over seeds.
         outdated: inputs that have changed since the training runs.
     """
@@ -176,12 +185,12 @@ def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]
 
 def _row(family: Family, value: float, group: SeedGroup, verdicts: Sequence[Result]) -> Row:
     low, high = family.sampled()
-    accuracy = fmean(float(each["accuracy"]) for each in verdicts)
+    accuracies = [float(each["accuracy"]) for each in verdicts]
     return Row(
         *(family.name, value, low <= value <= high, group.cell.length.text),
         tuple(int(each["key"]["training"]["seed"]) for each in verdicts),
-        accuracy,
-        wilson(accuracy, sum(int(each["held_out"]) for each in verdicts)),
+        fmean(accuracies),
+        interval_over_seeds(accuracies, [int(each["held_out"]) for each in verdicts]),
         fmean(float(each["feasible"]) for each in verdicts),
         group.outdated,
     )

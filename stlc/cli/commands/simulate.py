@@ -84,7 +84,7 @@ def simulate(
     seeds: SeedsOption = "0..9",
     steps: DriveStepsOption = None,
     agents: Annotated[
-        int | None, typer.Option(min=1, help="Agents in each run; by default the system's.")
+        int | None, typer.Option(min=1, help="Agents in each world; by default the system's.")
     ] = None,
     record: Annotated[
         Path | None,

@@ -63,7 +63,8 @@ def train(
     budget: Annotated[
         str | None,
         typer.Option(
-            metavar="TIME", help="Training time, such as 60s or 5min; the number of steps is adapted."
+            metavar="TIME",
+            help="Training time, such as 5min (60s by default); the steps are adapted.",
         ),
     ] = None,
     clock: Annotated[
@@ -123,7 +124,7 @@ def train(
     held_out: Annotated[int | None, typer.Option(min=1, help="Held-out starts of the verdict; 5000.")] = None,
     drives: Annotated[
         int | None,
-        typer.Option(min=0, help="Closed-loop runs after the training, at most, per guard; 400, 0: none."),
+        typer.Option(min=0, help="Drives after the training, at most, per guard; 400, 0: none."),
     ] = None,
     falsify: Annotated[
         bool,

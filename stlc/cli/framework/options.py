@@ -86,7 +86,7 @@ MarginOption = Annotated[
     ),
 ]
 DriveStepsOption = Annotated[
-    int | None, typer.Option(min=1, help="Steps of each run; by default the system's.")
+    int | None, typer.Option(min=1, help="Steps of each drive; by default the system's.")
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
 PicturesOption = Annotated[bool, typer.Option(help="Draw pictures and the report.")]

@@ -296,7 +296,8 @@ class TrainDecl:
     """The section `train`: training settings of this system; None leaves a setting to the training method."""
 
     budget: float | None = key(
-        Kind(lambda cx, node, label: _seconds(cx.here.duration(node, label)), EXPRESSION), "time for training"
+        Kind(lambda cx, node, label: _seconds(cx.here.duration(node, label)), EXPRESSION),
+        "time for training; 60 s by default",
     )
     steps: int | None = key(integer(), "optimiser steps; takes precedence over `budget`")
     seed: int = key(integer(0, 2**63 - 1), "of everything random in training", 0)
