@@ -43,10 +43,10 @@ Plan accuracy. Learners, on held-out states: mean over the seeds 0, 1 and 2 with
 and states (after an hour: seed 0 alone, and the interval of the states); an entry that lacks some lists its
 seeds. Planners (`plan:`), on {STARTS:,} other starts, the same for all (seed {SEED:,}): share with a
 satisfying plan within a processor time a plan, all starts in one batch. Rows `own settings` end as the
-authors' scripts do: CEM with 10,000 samples (manipulation 1,000), 100 elites, a standard deviation of 1 in physical units and at most 10 rounds (navigation: over the
-weights of a small network); STL_G with one start, the paper's objective and 50 Adam steps (ship_safe and
-manipulation 200). An empty cell is not measured; `no gain`: not measured, as ten times the time found no more
-plans before.
+authors' scripts do: CEM with 10,000 samples (manipulation 1,000), 100 elites, a standard deviation of 1 in
+physical units and at most 10 rounds (navigation: over the weights of a small network); STL_G with one start,
+the paper's objective and 50 Adam steps (ship_safe and manipulation 200). An empty cell is not measured;
+`no gain`: not measured, as ten times the time found no more plans before.
 """
 DECIDED = f"""\
 Processor time of a decision in milliseconds, median / 99 %, one start at a time on one thread, over {ALONE}
