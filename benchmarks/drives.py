@@ -75,7 +75,7 @@ class Drive:
     def key(self) -> Key:
         """Key under which the result is stored: its name and all its inputs."""
         task = load(self.plan.benchmark)
-        setting, world = self.setting(task), task.system.decl.test.world
+        setting = self.setting(task)
         planned = {
             name: value for name, value in self.plan.key.values.items() if not name.startswith("starts")
         }
@@ -85,7 +85,7 @@ class Drive:
                 **planned,
                 **{"guard": self.guard, "guard_version": GUARD_VERSION},
                 **{"seeds": list(setting.seeds), "agents": setting.agents, "steps": setting.steps},
-                "world_sha256": None if world is None else sha256(world.path.read_text(encoding="utf-8")),
+                **_deployed(task),
             },
         )
 
@@ -100,6 +100,14 @@ class Drive:
             return Run.open(cell.run.path).policy.for_task(task)
         planner = planner_named(cell.contender.method, **cell.contender.options_on(cell.benchmark))
         return PlannerPolicy(task, planner, PlanBudget(cell.seconds, cell.evaluations))
+
+
+def _deployed(task: Task) -> dict[str, str | None]:
+    """Hashes of the world, and of what a system file says about the backup policy and a deployment."""
+    backup, test = task.system.decl.backup, task.system.decl.test
+    text = repr((backup, test.replan, test.events, test.starts))
+    world = None if test.world is None else sha256(test.world.path.read_text(encoding="utf-8"))
+    return {"world_sha256": world, "deployed_sha256": sha256(text)}
 
 
 def drive(cell: Drive) -> Result:
@@ -213,8 +221,9 @@ def _half(metric: Mapping[str, Any]) -> float | None:
 
 
 def is_outdated(result: Result) -> bool:
-    """True if the specification, the system or a version has changed since a measurement."""
-    return has_changed(result, {"planner_version": PLANNING_VERSION, "guard_version": GUARD_VERSION})
+    """True if the specification, the system, the world or a version has changed since a measurement."""
+    versions = {"planner_version": PLANNING_VERSION, "guard_version": GUARD_VERSION}
+    return has_changed(result, {**versions, **_deployed(load(result["key"]["benchmark"]))})
 
 
 def driven(

@@ -94,8 +94,8 @@ def reason(error: StlcError) -> str:
     return "; ".join(each.message for each in error.diagnostics)
 
 
-def has_changed(result: Result, versions: Mapping[str, Any]) -> bool:
-    """True if the specification, the system or one of the `versions` has changed since a measurement."""
+def has_changed(result: Result, inputs: Mapping[str, Any]) -> bool:
+    """True if the specification, the system or one of the other `inputs` has changed since a measurement."""
     key = result["key"]
-    now = {**inputs_of(load(key["benchmark"])), **versions}
+    now = {**inputs_of(load(key["benchmark"])), **inputs}
     return any(key.get(name) != value for name, value in now.items())

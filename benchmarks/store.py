@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -73,21 +74,54 @@ class ResultStore:
     def put(self, key: Key, result: Result) -> Result:
         """Store `result`, with its date, versions and machine, under the name in `key`; return it as stored.
 
-        An older result of that name is replaced.
+        An older result of that name is replaced. Processes that store results in the same folder at the same
+        time wait for each other.
+
+        Raises:
+            UsageError: U102, the file is there, but its results cannot be read.
         """
         document = {"name": key.name, "key": key.values, "made": made_here(), **result}
-        kept = {**self.all(), key.name: plain(document)}
-        lines = ",\n".join(f"{dumps(name)}: {dumps(each)}" for name, each in kept.items())
-        write_atomic(self.path, f'{{"format": {dumps(FORMAT)}, "results": {{\n{lines}\n}}}}\n')
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with _alone_in(self.folder):
+            kept = {**self.all(), key.name: plain(document)}
+            lines = ",\n".join(f"{dumps(name)}: {dumps(each)}" for name, each in kept.items())
+            write_atomic(self.path, f'{{"format": {dumps(FORMAT)}, "results": {{\n{lines}\n}}}}\n')
         return self.all()[key.name]
 
     def all(self) -> dict[str, dict[str, Any]]:
-        """Return all stored results by name, including outdated ones; empty if the file cannot be read."""
-        with suppress(OSError, ValueError):
+        """Return all stored results by name, including outdated ones; empty if there is no file.
+
+        Raises:
+            UsageError: U102, the file is there, but its results cannot be read.
+        """
+        if not self.path.exists():
+            return {}
+        try:
             document = json.loads(self.path.read_text(encoding="utf-8"))
-            if isinstance(document, dict) and document.get("format") == FORMAT:
-                return dict(document["results"])
-        return {}
+            if document["format"] != FORMAT:
+                raise ValueError(f"its format is {document['format']}")
+            return dict(document["results"])
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            message = f"the results in `{self.path}` cannot be read: {error}"
+            raise UsageError(
+                Diagnostic("U102", message, help=("move the file away, or repair it",))
+            ) from None
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Context in which no other process is in this context of the same folder; on Windows it does nothing."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def made_here() -> dict[str, Any]:

@@ -21,7 +21,7 @@ from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.parallel import executor
 from stlc.controller.parallel.bundle import input_files
 from stlc.controller.parallel.jobs import Job
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.budget import Clock
 from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import (
@@ -32,6 +32,7 @@ from stlc.controller.training.config import (
 )
 from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import StlcError
+from stlc.provenance import sha256
 from stlc.registry import METHODS
 from stlc.rundir import RunDir, every_run
 from stlc.view.held_out import load_held_out
@@ -120,10 +121,11 @@ class Cell:
         Raises:
             UsageError, SpecError, SystemFileError: an input file is missing or invalid.
         """
+        task = load(self.benchmark, tuple(self.overrides.items()))
         return Key(
             self.name,
             {
-                **inputs_of(load(self.benchmark, tuple(self.overrides.items()))),
+                **{**inputs_of(task), **self._declared(task)},
                 **{"benchmark": self.benchmark, "method": self.method},
                 **{"method_version": ENGINE_VERSION + METHODS.get(self.method).version},
                 **{"seed": self.seed, "budget": self.length.seconds, "steps": self.length.steps},
@@ -132,6 +134,15 @@ class Cell:
                 **({"options": dict(self.options)} if self.options else {}),
             },
         )
+
+    def _declared(self, task: Task) -> dict[str, Any]:
+        """Training settings that the system file declares, besides `overrides`, and the result depends on."""
+        train = task.system.decl.train
+        names = [name for name in ("lr", "batch", "samples") if f"train.{name}" not in self.overrides]
+        found = {name: value for name in names if (value := getattr(train, name)) is not None}
+        if self.options.get("reward") == "task":
+            found["reward_sha256"] = sha256(repr(train.reward))
+        return found
 
     @classmethod
     def of(cls, result: Result) -> Cell:
@@ -208,7 +219,10 @@ class Place:
         return sorted(self.store.all().values(), key=lambda each: bool(outdated(each)))
 
 
-INPUTS = {"spec_sha256": "specification", "system_sha256": "system", "method_version": "method"}
+INPUTS = {
+    **{"spec_sha256": "specification", "system_sha256": "system", "method_version": "method"},
+    **{"reward_sha256": "reward", "samples": "training set"},
+}
 """Name of an input of a training run that can change while the result is stored -> the input in words."""
 
 
@@ -382,6 +396,7 @@ def _shorter(cell: Cell, place: Place) -> RunDir | None:
         run = place.newest_run(each.key)
         if run is not None and is_complete(run, each) and _spent(run) < cell.length.seconds:
             target = place.runs_of(cell.key) / run.path.parent.name / run.path.name
+            shutil.rmtree(target, ignore_errors=True)  # what is there has failed, or it would be resumed
             beside = target.with_name(f".{target.name}")
             shutil.rmtree(beside, ignore_errors=True)
             shutil.copytree(run.path, beside)

@@ -19,7 +19,7 @@ from benchmarks.drives import Drive, DriveRow, driven
 from benchmarks.options import Comparing
 from benchmarks.plannings import PlanCell, PlanRow, ceilings, improves, measure, planned
 from benchmarks.roster import Contender, learners, planners, roster
-from benchmarks.store import BENCHMARKS, ResultStore
+from benchmarks.store import BENCHMARKS, ResultStore, load
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place, _job, pack
 from stlc.controller.parallel.jobs import Job
@@ -332,6 +332,23 @@ def test_a_drive_is_stored_with_guard_and_size(tmp_path: Path) -> None:
     for result in found.results:
         assert 0.0 <= result["metrics"]["plan_accuracy"]["mean"] <= 1.0
         assert result["decision"]["median"] <= result["decision"]["p99"]
+
+
+def test_a_drive_depends_on_its_world_and_its_backup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell = Drive(tiny(), "paper", (0,), agents=2, steps=3)
+    (result,) = driven([cell], ResultStore("drives", tmp_path)).results
+    assert not DriveRow.of(result).outdated
+    other = {**result, "key": {**result["key"], "deployed_sha256": ""}}
+    assert DriveRow.of(other).outdated
+    before, decl = cell.key, load("reach_n_avoid").system.decl
+    for changed in (
+        replace(decl, backup=replace(decl.backup, bins=7)),
+        replace(decl, test=replace(decl.test, replan=2)),
+        replace(decl, test=replace(decl.test, starts="savable")),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(load("reach_n_avoid").system, "decl", changed)
+            assert cell.key.digest != before.digest
 
 
 def test_the_closed_loop_shows_the_best_policy_of_a_method_and_what_is_missing() -> None:

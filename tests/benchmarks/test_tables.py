@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 
 from benchmarks.store import Key, ResultStore
 from benchmarks.table import Table, markdown, provenance, show, write_section
+from stlc.diagnostics import UsageError
 
 
 def test_a_section_is_replaced_and_nothing_else(tmp_path: Path) -> None:
@@ -107,5 +110,27 @@ def test_a_result_is_computed_once_for_its_inputs(tmp_path: Path) -> None:
     assert store.get(Key("b", key.values), compute)["made"]["versions"]["python"]
     assert list(store.all()) == ["a", "b"]
     assert len(store.path.read_text().splitlines()) == 4
-    store.path.write_text("{}")
-    assert store.all() == {}
+    assert ResultStore("none", tmp_path).all() == {}
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", '<<<<<<< ours\n{"format": "benchmark-results/1"}', '{"format": "other/1"}']
+)
+def test_results_that_cannot_be_read_are_not_overwritten(text: str, tmp_path: Path) -> None:
+    store = ResultStore("some", tmp_path)
+    store.path.write_text(text)
+    with pytest.raises(UsageError, match="cannot be read"):
+        store.put(Key("a", {}), {"number": 1})
+    assert store.path.read_text() == text
+
+
+def test_processes_that_store_at_the_same_time_keep_all_results(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from benchmarks.store import Key, ResultStore\n"
+        "store = ResultStore('some', Path(sys.argv[1]))\n"
+        "for i in range(8): store.put(Key(f'{sys.argv[2]}{i}', {}), {'number': i})"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path)]
+    processes = [subprocess.Popen([*words, name]) for name in "ab"]
+    assert [process.wait() for process in processes] == [0, 0]
+    assert len(ResultStore("some", tmp_path).all()) == 16

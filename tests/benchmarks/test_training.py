@@ -15,6 +15,7 @@ from helpers.documents import misfits
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks import store
 from benchmarks.__main__ import main as measure
 from benchmarks.feasible import TRIES, KnownFeasible, _union, known_feasible, prove_on, search_on
 from benchmarks.learned import learned
@@ -52,6 +53,16 @@ from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[2]
 QUICK = {"train.batch": "8"}
+TINY_SPEC = 'system "tiny.yaml"\nsignal x\nrequire r: always x < 1\n'
+TINY_SYSTEM = """\
+stlc: 1
+name: tiny
+time: {dt: 1 s, horizon: 3}
+state: {x: {}}
+control: {a: {range: [-1, 1]}}
+flow: {x: a}
+init: {mixture: [{draw: {x: "uniform(-1, 1)"}}]}
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -127,6 +138,25 @@ def test_what_a_result_depends_on() -> None:
     assert len({cell.key.digest, *(each.key.digest for each in others)}) == 8
 
 
+def test_the_key_has_what_the_system_file_declares_for_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tiny.stl").write_text(TINY_SPEC)
+    monkeypatch.chdir(tmp_path)
+
+    def keys(reward: str, more: str = "") -> list[str]:
+        (tmp_path / "tiny.yaml").write_text(TINY_SYSTEM + f"train: {{reward: {reward}{more}}}\n")
+        store._load.cache_clear()
+        options = [{"reward": "task"}, {"reward": "robustness"}]
+        return [Cell("tiny", "sac", 0, Length(1.0), options=each).key.digest for each in options]
+
+    monkeypatch.setattr(store, "spec_path", lambda _name: Path("tiny.stl"))
+    (task, robustness), (other, same), slower = keys("x"), keys("-x"), keys("x", ", lr: 0.1")
+    assert task != other
+    assert robustness == same
+    assert not {task, robustness} & {*slower}
+
+
 # ---------------------------------------------------------------------- filling
 
 
@@ -200,6 +230,7 @@ def test_a_copied_run_is_not_taken_for_the_longer_one(
     filled([short], place)
     long = replace(short, length=Length(60.0, clock="processor"))
     assert _shorter(long, place) is not None
+    assert _shorter(long, place) is not None  # in place of a copy that has failed
     copy = place.newest_run(long.key)
     assert copy is not None
     assert copy.status == "finished"
