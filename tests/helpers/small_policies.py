@@ -12,6 +12,7 @@ from stlc.controller.problem.task import Task
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
+from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
 
@@ -20,6 +21,32 @@ ROOT = Path(__file__).parents[2]
 def task_of(spec: str, system: str) -> Task:
     files = ROOT / "specs" / f"{spec}.stl", ROOT / "examples" / f"{system}.yaml"
     return Task.of(parse(read_source(files[0])), System.load(files[1]))
+
+
+def half_seen_task(folder: Path) -> Task:
+    """A task whose policy sees `y` and not `x`; both are uniform from -1 to 1, and `x < 1.2` is required."""
+    path = folder / "half_seen.yaml"
+    path.write_text(
+        """
+stlc: 1
+name: half_seen
+time: {dt: 1 s, horizon: 1 steps, discrete: true}
+state:
+  y: {range: [-1, 1]}
+  x: {range: [-9, 9]}
+control:
+  u: {range: [-9, 9], squash: clip}
+flow:
+  x: x - u
+init:
+  mixture:
+    - draw: {y: "uniform(-1, 1)", x: "uniform(-1, 1)"}
+policy:
+  observe: [y]
+"""
+    )
+    text = "signal x, y\nrequire r: always[0 s, 1 s] x < 1.2"
+    return Task.of(parse(Source("half_seen.stl", text)), System.load(path))
 
 
 @cache

@@ -11,7 +11,7 @@ Values are computed in float64 without outward rounding. `SLACK` covers the roun
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, cast, final
@@ -122,7 +122,8 @@ class Forms:
         return Forms(self.centre[rows], self.generators[:, rows], self.rest[rows])
 
     def with_symbol(self, index: int) -> Forms:
-        """The same forms, whose remainder is the generator of symbol number `index`."""
+        """The same forms, whose remainder is the generator of symbol number `index`, a new one."""
+        assert not self.generators[index:].any(), "a new symbol has the number of one in use"
         generators = np.zeros((index + 1, *self.shape))
         generators[: len(self.generators)] = self.generators
         known = np.isfinite(self.rest)
@@ -523,6 +524,11 @@ def ranges(forms: Sequence[Forms]) -> Intervals:
     """Ranges of a sequence of forms (batch,) over time: (time, batch)."""
     found = [form.range for form in forms]
     return Intervals(np.stack([each.low for each in found]), np.stack([each.high for each in found]))
+
+
+def in_use(forms: Iterable[Forms]) -> int:
+    """Number of symbols in forms: the number of the next new one, if these are all forms of a computation."""
+    return max(len(form.generators) for form in forms)
 
 
 def together(parts: Sequence[Forms]) -> Forms:

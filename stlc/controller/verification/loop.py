@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from stlc.controller.verification.flow import Flow
-from stlc.controller.verification.forms import FORMS, Floats, Forms
+from stlc.controller.verification.forms import FORMS, Floats, Forms, in_use
 from stlc.controller.verification.network import (
     NetworkBounds,
     NetworkLayer,
@@ -123,7 +123,7 @@ class NetworkLoop(VerificationSubject):
         for step in range(self._task.horizon):
             if step % self._period == 0:
                 env = self._lighter(env, count)
-                inputs = own_symbols(joined(self._seen(env, len(index))))
+                inputs = own_symbols(joined(self._seen(env, len(index)), in_use(env.values())))
                 first = len(inputs.generators)
                 outputs = own_symbols(reduced(self._bounds.outputs(inputs), first, 0), 0.0)
                 controls = [
@@ -146,7 +146,7 @@ class NetworkLoop(VerificationSubject):
         held = dict(zip(self._controls, controls, strict=True))
         later = dict(env)
         for _ in range(self._task.system.decl.substeps):
-            symbols = max(symbols, *(len(form.generators) for form in later.values()))
+            symbols = max(symbols, in_use(later.values()))
             for name, form in flow.step({**later, **held}, symbols).items():
                 later[name] = form.with_symbol(symbols) if (form.rest > _LARGE).any() else form
                 symbols = max(symbols, len(later[name].generators))
@@ -154,7 +154,9 @@ class NetworkLoop(VerificationSubject):
 
     def _lighter(self, env: Mapping[str, Forms], count: int) -> dict[str, Forms]:
         """The states with fewer symbols; what is left out is one symbol for each state that moves."""
-        if max(len(env[name].generators) for name in self._moved) <= count + _KEPT:
+        moved = [env[name] for name in self._moved]
+        symbols = in_use(moved)
+        if symbols <= count + _KEPT:
             return dict(env)
-        states = own_symbols(reduced(joined([env[name] for name in self._moved]), count, _KEPT), 0.0)
+        states = own_symbols(reduced(joined(moved, symbols), count, _KEPT), 0.0)
         return {**env, **dict(zip(self._moved, columns(states), strict=True))}

@@ -97,10 +97,13 @@ class NetworkBounds:
         return active.widened(0.0, 8.0 * self._unit)
 
 
-def joined(forms: Sequence[Forms]) -> Forms:
-    """Forms (batch,) of several quantities as one array of forms, (batch, quantities)."""
-    batch, symbols = len(forms[0].centre), max(len(each.generators) for each in forms)
-    generators = np.zeros((symbols, batch, len(forms)))
+def joined(forms: Sequence[Forms], symbols: int) -> Forms:
+    """Forms (batch,) of several quantities as one array of forms, (batch, quantities).
+
+    The array has generators for all `symbols` that are in use, also by forms that are not among these, so
+    that symbols that are appended to it are new.
+    """
+    generators = np.zeros((symbols, len(forms[0].centre), len(forms)))
     for i, each in enumerate(forms):
         generators[: len(each.generators), :, i] = each.generators
     return Forms(
@@ -117,7 +120,7 @@ def columns(x: Forms) -> list[Forms]:
 
 
 def own_symbols(x: Forms, large: float = _LARGE) -> Forms:
-    """The same forms (batch, width), in which each large remainder has become a symbol."""
+    """The same forms (batch, width), in which each large remainder has become an appended symbol."""
     chosen, size, rest = _large(x.rest, large)
     own = np.zeros((len(chosen), *x.rest.shape))
     np.put_along_axis(own, chosen[:, :, None], size[:, :, None], axis=2)
@@ -177,14 +180,16 @@ class PlanBounds:
         self._low, self._high = _array(task.system.control_low), _array(task.system.control_high)
         self._steps, self._width = task.horizon, raw_width(self._controls)
 
-    def plan(self, observed: Sequence[Forms], index: int) -> list[list[Forms]]:
-        """Forms of proposal number `index`: one list per step with one form (batch,) per control."""
-        first = max(len(each.generators) for each in observed)
+    def plan(self, observed: Sequence[Forms], index: int, symbols: int) -> list[list[Forms]]:
+        """Forms of proposal number `index`: one list per step with one form (batch,) per control.
+
+        `symbols` is the number of symbols in use by all states, observed or not; those of the plan are new.
+        """
         width = self._steps * self._width
         rows = slice(index * width, (index + 1) * width)
-        raw = reduced(self._network.outputs(self._inputs(observed), rows), first, _KEPT)
-        symbols = len(raw.generators)
-        outputs = [each.with_symbol(symbols + i) for i, each in enumerate(columns(raw))]
+        raw = reduced(self._network.outputs(self._inputs(observed, symbols), rows), symbols, _KEPT)
+        first = len(raw.generators)
+        outputs = [each.with_symbol(first + i) for i, each in enumerate(columns(raw))]
         return [
             self._squashed(outputs[step * self._width : (step + 1) * self._width])
             for step in range(self._steps)
@@ -209,8 +214,8 @@ class PlanBounds:
             found.append(share.times(half[i]).widened(middle[i], error[i]))
         return found
 
-    def _inputs(self, observed: Sequence[Forms]) -> Forms:
-        x = joined(observed)
+    def _inputs(self, observed: Sequence[Forms], symbols: int) -> Forms:
+        x = joined(observed, symbols)
         error = 4.0 * UNIT * (np.abs(x.centre) + x.radius + np.abs(self._centre)) + SLACK
         found = Forms(
             (x.centre - self._centre) / self._spread,

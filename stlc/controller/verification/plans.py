@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from stlc.controller.policies.policy import BestOfKPolicy
-from stlc.controller.verification.forms import FORMS, Bools, Floats, Forms, picked, spread, together
+from stlc.controller.verification.forms import FORMS, Bools, Floats, Forms, in_use, picked, spread, together
 from stlc.controller.verification.network import UNIT, PlanBounds
 from stlc.controller.verification.subject import History, Indices, VerificationSubject
 from stlc.diagnostics import usage
@@ -88,7 +88,7 @@ class ProposedPlans(VerificationSubject):
     ) -> tuple[History, Bools | bool]:
         plan, decided = self._plan(start, index)
         env, history = dict(start), {name: [form] for name, form in start.items()}
-        symbols = max(len(control.generators) for step in plan for control in step)
+        symbols = in_use((*start.values(), *(control for step in plan for control in step)))
         for step in plan:
             env, symbols = self._step(env, step, symbols)
             for name, form in env.items():
@@ -128,11 +128,12 @@ class ProposedPlans(VerificationSubject):
 
     def _seen_plan(self, states: Mapping[str, Forms], index: Indices) -> list[list[Forms]]:
         """Forms of the plan from folded states; index: (boxes,)."""
-        observed = self._seen(states, len(index))
+        observed, symbols = self._seen(states, len(index)), in_use(states.values())
         order = [np.flatnonzero(index == number) for number in np.unique(index)]
         order = [rows[i : i + _GROUP] for rows in order for i in range(0, len(rows), _GROUP)]
         parts = [
-            self._bounds.plan([form.at(rows) for form in observed], int(index[rows[0]])) for rows in order
+            self._bounds.plan([form.at(rows) for form in observed], int(index[rows[0]]), symbols)
+            for rows in order
         ]
         if len(parts) == 1:
             return parts[0]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.small_policies import half_seen_task
 
 from stlc.cli.framework.app import main
 from stlc.controller.problem.load import load_task
@@ -86,6 +87,19 @@ def test_sampled_states_of_proved_boxes_satisfy_the_specification() -> None:
     for box in result.boxes[:10]:
         at = box.centre + rng.uniform(-1, 1, (100, 2)) * box.half
         assert (subject.robustness(subject.states(result.mode, at)) >= -1e-6).all()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_states_that_the_network_does_not_see_keep_their_symbols(tmp_path: Path, sign: float) -> None:
+    sizes = NetworkLayer(np.array([[1.0], [-1.0]]), np.zeros(2), "relu")
+    last = NetworkLayer(np.array([[-sign, -sign]]), np.array([0.5 * sign]))  # 0.5 - |y| or the negative
+    found = NetworkLoop(half_seen_task(tmp_path), [sizes, last])
+    mode, whole = found.modes[0], Box(np.full(2, 0.5), np.full(2, 0.5))
+    bounds = found.bound(mode, [whole], 0)
+    rho = found.robustness(found.states(mode, np.random.default_rng(0).random((1000, 2))))
+    assert bounds.low[0] <= rho.min() < -0.2
+    assert bounds.high[0] >= rho.max()
+    assert Verifier(found, seed=0).run(1e6, boxes=50).refuted > 0.0
 
 
 # ---------------------------------------------------------------------------------- networks

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers.small_policies import policy, task_of
+from helpers.small_policies import half_seen_task, policy, task_of
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
@@ -123,7 +124,7 @@ def test_plans_stay_within_their_forms(width: float) -> None:
     generators = rng.normal(size=(4, *centre.shape)) * width
     observed = [Forms(centre[:, i], generators[:, :, i], np.zeros(6)) for i in range(centre.shape[1])]
     for index in range(2):
-        plan = bounds.plan(observed, index)
+        plan = bounds.plan(observed, index, 4)
         for _ in range(10):
             symbols = rng.uniform(-1, 1, 4)
             x0 = torch.from_numpy(centre + np.tensordot(symbols, generators, 1))
@@ -193,6 +194,23 @@ def test_bounds_on_other_benchmarks_are_below_the_robustness(spec: str, system: 
             rho = plans.choices(plans.states(mode, at))[np.arange(24), index]
             assert (bounds.low <= rho + 1e-9).all()
             assert (bounds.high >= rho - 1e-9).all()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_states_that_the_policy_does_not_see_keep_their_symbols(tmp_path: Path, sign: float) -> None:
+    task = half_seen_task(tmp_path)
+    network = PlanNetwork(task, hidden=(2,), plans=1).eval()
+    with torch.no_grad():  # the control is 0.5 - |y| or the negative
+        network.body[0].weight.copy_(torch.tensor([[1.0], [-1.0]]))
+        network.body[0].bias.zero_()
+        network.body[-1].weight.copy_(torch.tensor([[-sign, -sign]]) / 9)
+        network.body[-1].bias.fill_(sign * 0.5 / 9)
+    plans = ProposedPlans(task, BestOfKPolicy(task, network))
+    mode, whole = plans.modes[0], Box(np.full(2, 0.5), np.full(2, 0.5))
+    bounds = plans.bound(mode, [whole], 0)
+    rho = plans.robustness(plans.states(mode, np.random.default_rng(0).random((1000, 2))))
+    assert bounds.low[0] <= rho.min() < -0.2
+    assert bounds.high[0] >= rho.max()
 
 
 def test_a_mirrored_box_is_the_image_of_its_mirror_image() -> None:
