@@ -22,11 +22,11 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.controller.training.budget import clock_of
 from stlc.controller.training.run import Run
-from stlc.controller.verification.boxes import Box
+from stlc.controller.verification.boxes import Box, Mode
 from stlc.controller.verification.examine import SharedExaminer
 from stlc.controller.verification.plans import PolicySource, ProposedPlans
 from stlc.controller.verification.subject import VerificationSubject
-from stlc.controller.verification.verify import Verification, Verifier
+from stlc.controller.verification.verify import Verifier
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
@@ -176,12 +176,11 @@ def _verified(folder: RunDir, sizes: _Sizes, store: ResultStore) -> Result:
             found = verifier.run(sizes.seconds)
             clock = clock_of("processor")
             begun = clock()
-            around = {each.mode.name: each for each in verifier.around(sizes.states)}
+            around = verifier.around(sizes.states)
             spent = clock() - begun
             modes = []
-            for each in found.modes:
-                near = around.get(each.mode.name)
-                boxes = [*_some(each.boxes), *(near.boxes if near else [])]
+            for each, near in zip(found.modes, around, strict=True):
+                boxes = [*_some(each.boxes), *near.boxes]
                 modes.append(
                     {
                         "spec": spec,
@@ -191,10 +190,10 @@ def _verified(folder: RunDir, sizes: _Sizes, store: ResultStore) -> Result:
                         "proved": each.proved,
                         "refuted": each.refuted,
                         "open": each.open,
-                        "states": near.states if near else 0,
-                        "with_proof": near.proved if near else 0,
-                        "violated": near.violated if near else 0,
-                        "violations": _violations(subject, found, each.mode.name, boxes, sizes.points),
+                        "states": near.states,
+                        "with_proof": near.proved,
+                        "violated": near.violated,
+                        "violations": _violations(subject, each.mode, boxes, sizes.points),
                         "points": len(boxes) * sizes.points,
                     }
                 )
@@ -209,12 +208,9 @@ def _some(boxes: Sequence[Box]) -> list[Box]:
     return [boxes[i] for i in rng.permutation(len(boxes))[:BOXES]]
 
 
-def _violations(
-    subject: VerificationSubject, found: Verification, name: str, boxes: Sequence[Box], points: int
-) -> int:
+def _violations(subject: VerificationSubject, mode: Mode, boxes: Sequence[Box], points: int) -> int:
     """Number of violations among random points of proved boxes of a mode."""
     rng = np.random.default_rng(11)
-    (mode,) = (each.mode for each in found.modes if each.mode.name == name)
     count = 0
     for box in boxes:
         at = box.centre + rng.uniform(-1.0, 1.0, (points, len(box.half))) * box.half

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,7 +117,7 @@ def verify(
         with PULSE.doing("proving"):
             found = verifier.run(seconds, boxes=boxes)
     with PULSE.doing("proving boxes around random states"):
-        near = {each.mode.name: each for each in verifier.around(states, seed=seed)} if states else {}
+        near = verifier.around(states, seed=seed)
     record = _record(name, found, near)
     lost = () if shared is None or not shared.lost else (_lost(shared.lost),)
 
@@ -175,11 +175,12 @@ def _exit_code(found: Verification, fail_under: float | None) -> int:
     return 4 if found.open > 0.0 else 0
 
 
-def _record(run: str, found: Verification, near: Mapping[str, Around]) -> Verified:
+def _record(run: str, found: Verification, near: Sequence[Around]) -> Verified:
+    """Result as a record; `near` has one entry for each mode."""
     from stlc.assurance.bounds import clopper_pearson_lower
 
     drawn, proved, violated = (
-        sum(getattr(each, name) for each in near.values()) for name in ("states", "proved", "violated")
+        sum(getattr(each, name) for each in near) for name in ("states", "proved", "violated")
     )
     return {
         "run": run,
@@ -191,11 +192,14 @@ def _record(run: str, found: Verification, near: Mapping[str, Around]) -> Verifi
         "states_proved": proved,
         "states_violated": violated,
         "states_share": clopper_pearson_lower(proved, drawn) if drawn else 0.0,
-        "modes": [_mode(each, found.probability(each), near.get(each.mode.name)) for each in found.modes],
+        "modes": [
+            _mode(each, found.probability(each), around)
+            for each, around in zip(found.modes, near, strict=True)
+        ],
     }
 
 
-def _mode(each: ModeResult, probability: float, near: Around | None) -> VerifiedMode:
+def _mode(each: ModeResult, probability: float, near: Around) -> VerifiedMode:
     return {
         "name": each.mode.name,
         "probability": probability,
@@ -206,9 +210,9 @@ def _mode(each: ModeResult, probability: float, near: Around | None) -> Verified
         "examined_boxes": each.examined,
         "witness": None if each.witness is None else dict(each.witness.state),
         "robustness": None if each.witness is None else each.witness.robustness,
-        "states": 0 if near is None else near.states,
-        "states_proved": 0 if near is None else near.proved,
-        "states_violated": 0 if near is None else near.violated,
+        "states": near.states,
+        "states_proved": near.proved,
+        "states_violated": near.violated,
     }
 
 

@@ -59,7 +59,10 @@ class StateProver:
         self._rng = np.random.default_rng(seed)
 
     def run(self, states: int) -> list[Around]:
-        """Draw initial states, with the conditions of `where`, and search boxes around them; one per mode."""
+        """Draw initial states, with the conditions of `where`, and search boxes around them.
+
+        There is one result for each mode, in their order; modes may have equal names.
+        """
         modes = self._plans.modes
         weights = np.array([mode.weight for mode in modes])
         drawn: list[list[Floats]] = [[] for _ in modes]
@@ -70,7 +73,10 @@ class StateProver:
             if self._plans.admits(modes[number], at[None])[0]:
                 drawn[number].append(at)
                 count += 1
-        return [self._around(mode, np.array(at)) for mode, at in zip(modes, drawn, strict=True) if at]
+        return [
+            self._around(mode, np.array(at)) if at else Around(mode, 0, 0, [])
+            for mode, at in zip(modes, drawn, strict=True)
+        ]
 
     def _around(self, mode: Mode, at: Floats) -> Around:
         """Search boxes around the states with coordinates `at`, (states, coordinates)."""

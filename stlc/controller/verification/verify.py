@@ -247,7 +247,7 @@ class Verifier:
         result.open = max(0.0, 1.0 - result.proved - result.refuted)
 
     def around(self, states: int, *, seed: int = 0) -> list[Around]:
-        """Search boxes with a proof around random initial states; one result per mode that was drawn."""
+        """Search boxes with a proof around random initial states; one result per mode, in their order."""
         return StateProver(self.plans, seed=seed).run(states)
 
     # ---------------------------------------------------------------------------- samples

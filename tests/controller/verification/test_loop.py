@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,39 @@ def test_a_closed_loop_on_the_command_line(tmp_path: Path, capsys: pytest.Captur
     assert main([*arguments, "--period", "0.07s"]) == 2
     assert "not a multiple of the time step" in capsys.readouterr().err
     assert main(["verify", "latest", "--period", "0.1s"]) == 2
+
+
+TWO_PLACES = """
+stlc: 1
+name: two_places
+time: {dt: 1 s, horizon: 1 steps, discrete: true}
+state:
+  x: {range: [-9, 9]}
+control:
+  u: {range: [-1, 1]}
+flow:
+  x: x + u
+init:
+  mixture:
+    - draw: {x: "choice(uniform(0, 1), uniform(5, 6))"}
+"""
+
+
+def test_ways_to_draw_a_state_may_have_equal_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "two_places.yaml").write_text(TWO_PLACES)
+    spec = tmp_path / "two_places.stl"
+    spec.write_text('system "two_places.yaml"\nsignal x\nrequire r: always[0 s, 1 s] x > 3\n')
+    still = [NetworkLayer(np.zeros((1, 1)), np.zeros(1), "tanh"), NetworkLayer(np.zeros((1, 1)), np.zeros(1))]
+    arguments = ["--controller", str(written(tmp_path / "net.onnx", still)), "--boxes", "5"]
+    assert main(["verify", str(spec), *arguments, "--states", "40", "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)["result"]
+    low, high = result["modes"]
+    assert low["name"] == high["name"]
+    assert 0 < low["states"] == low["states_violated"]
+    assert 0 < high["states"] == high["states_proved"]
+    assert result["states"] == low["states"] + high["states"] == 40
 
 
 def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:
