@@ -76,13 +76,13 @@ def sample_of(
 def _judged_by_plans(
     task: Task, recording: DeploymentRecording
 ) -> tuple[tuple[Judged, ...], Mapping[str, float]]:
-    """Verdicts by the specification of the plans, from every start that has a whole window after it."""
-    judged, found = [], executed_robustness(task, recording)
-    for rule in task.rules:
-        least = found[rule.name]
-        known, held = ~np.isneginf(least), least >= -TOLERANCE
-        judged.append(Judged(rule.name, rule.unit, held, known & ~held, least))
-    return tuple(judged), {rule.name: rule.weight / rule.scale for rule in task.rules}
+    """Verdicts by the specification of the plans; undecided where a drive ends before a window does."""
+    found = executed_robustness(task, recording)
+    judged = tuple(
+        Judged(rule.name, rule.unit, low >= -TOLERANCE, high < -TOLERANCE, low)
+        for rule, (low, high) in ((rule, found[rule.name]) for rule in task.rules)
+    )
+    return judged, {rule.name: rule.weight / rule.scale for rule in task.rules}
 
 
 def _judged_by_rules(

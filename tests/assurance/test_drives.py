@@ -12,7 +12,7 @@ from stlc.assurance.campaign import FIRST, SEED, Campaign, campaign
 from stlc.assurance.certificate import Claim
 from stlc.assurance.drives import PolicyDrives, sample_of
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.rules import rules_of
 from stlc.controller.guard.guard import Guard
@@ -27,9 +27,26 @@ from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.jsontext import plain
 from stlc.registry import METHODS
+from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
 SMALL = {"test.steps": "30", "test.agents": "4", "test.world": "null"}
+
+
+CART = """
+stlc: 1
+name: cart
+time: {dt: 1 s, horizon: 6 steps, discrete: true}
+state:
+  x: {range: [-9, 99]}
+control:
+  u: {range: [-1, 1]}
+flow:
+  x: x + u
+init:
+  mixture:
+    - draw: {x: "uniform(0, 1)"}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +80,37 @@ def test_drives_are_judged_as_deployments_are(run: Run) -> None:
     assert found.units.tolist() == list(range(12))
     by_rules = sample_of(run.task, recording, rules_of(run))
     assert {each.name for each in by_rules.requirements} != {each.name for each in found.requirements}
+
+
+@pytest.mark.parametrize(
+    ("formula", "values", "satisfied", "violated", "least"),
+    [
+        ("always[0 s, 6 s] x < 5", [0, 1, 2, 3], False, False, -np.inf),
+        ("always[0 s, 6 s] x < 2", [0, 1, 2, 3], False, True, -np.inf),
+        ("always@[10 s, 20 s] x < 5", [0, 1, 2, 3], False, False, -np.inf),
+        ("eventually@[0 s, 20 s] x > 5", [0, 1, 2, 3], False, False, -2),
+        ("eventually@[0 s, 20 s] x > 2", [0, 1, 2, 3], True, False, 1),
+        ("always[0 s, T] x < 5", [0, 1, 2, 3], False, False, -np.inf),
+        ("always[0 s, 3 s] x < 5", [0, 1, 2, 3], True, False, 2),
+        ("always[0 s, 3 s] x < 5", [0, 1, 2, np.nan], False, True, -np.inf),
+    ],
+)
+def test_a_drive_that_ends_before_a_window_may_be_undecided(
+    tmp_path: Path, formula: str, values: list[float], satisfied: bool, violated: bool, least: float
+) -> None:
+    (tmp_path / "cart.yaml").write_text(CART)
+    spec = parse(Source("cart.stl", f"signal x\nrequire r: {formula}"))
+    task = Task.of(spec, System.load(tmp_path / "cart.yaml"))
+    states = np.zeros((2, 4, len(task.system.names)))
+    states[:, :, task.system.names.index("x")] = values
+    each, none = np.zeros((2, 3)), np.zeros((2, 3), dtype=np.int64)
+    recording = DeploymentRecording(
+        1, states, each[..., None], none, none, each, each, none > 0, ({},) * 2, {}, {}
+    )
+    (found,) = sample_of(task, recording).requirements
+    assert found.satisfied.tolist() == [satisfied] * 2
+    assert found.violated.tolist() == [violated] * 2
+    assert found.robustness.tolist() == [least] * 2
 
 
 def test_a_campaign_is_repeatable_and_counts_its_seeds(run: Run) -> None:

@@ -77,7 +77,7 @@ def bounds_lines(record: Mapping[str, Any]) -> Iterator[str]:
 
 def answer(record: Mapping[str, Any]) -> str:
     """Sentence that answers the claim, such as `certified: at least 99 % of drives satisfy everything …`."""
-    noun = {"trace": "traces", "simulation": "simulations"}.get(record["unit"], "drives")
+    noun = _observed(record)
     overall, sure = record["overall"], f"with {percent(record['confidence'])} confidence"
     if record["answer"] == "measured":
         low, high = overall["interval"]
@@ -91,6 +91,11 @@ def answer(record: Mapping[str, Any]) -> str:
                 f"refuted: at most {raised(overall['upper_deployed'])} of {noun} satisfy everything, {sure}"
             )
     return f"undecided, {sure}, whether {least}"
+
+
+def _observed(record: Mapping[str, Any]) -> str:
+    """Plural of what is judged: drives, of which a unit may have several, traces or simulations."""
+    return {"trace": "traces", "simulation": "simulations"}.get(record["unit"], "drives")
 
 
 def _row(one: Mapping[str, Any]) -> tuple[str, ...]:
@@ -112,6 +117,9 @@ def _more(record: Mapping[str, Any]) -> Iterator[str]:
     if overall["drives"] > overall["units"]:
         whole = f"{overall['whole_units']:,} of {overall['units']:,} {noun}s satisfy everything as a whole"
         yield f"  {whole}: at least {floored(overall['whole_units_lower'])} of {noun}s"
+    if overall["undecided"]:
+        some = f"{overall['undecided']:,} of {overall['drives']:,} {_observed(record)}"
+        yield f"  {some} have no verdict, as after too few steps, and count as not satisfied in lower bounds"
     needed = record["needed"]
     if record["answer"] == "undecided" and overall["units"] < needed["units"]:
         yield f"  {percent(record['share'])} needs {needed['units']:,} {noun}s without a failure"

@@ -351,7 +351,7 @@ class _Trial:
         rows = len(recording.states)
         if self.rules is None:
             executed = judge_executed(self.task, recording, viable=np.ones(rows, dtype=bool))
-            runs = judge_runs_by_plans(executed.rules, executed.viable, self.task.system.dt)
+            runs = judge_runs_by_plans(executed, self.task.system.dt)
             return runs.obeyed, executed.agents(executed.safety) if executed.safety else None
         verdict = verdict_on_runs(self.rules, self.task, recording)
         found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}

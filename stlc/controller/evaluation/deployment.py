@@ -141,7 +141,7 @@ def judged(
     """
     executed = judge_executed(guard.task, recording)
     runs = (
-        judge_runs_by_plans(executed.rules, executed.viable, guard.task.system.dt)
+        judge_runs_by_plans(executed, guard.task.system.dt)
         if rules is None
         else judge_runs(rules, guard.task, recording, executed.viable)
     )
@@ -161,7 +161,7 @@ def unsafe_agents(executed: Executed, agents: int) -> tuple[Unsafe, ...]:
 
     `agents`: number of agents per seed.
     """
-    rows = np.flatnonzero(~executed.agents(executed.safety)).tolist()
+    rows = np.flatnonzero(executed.failing(executed.safety)).tolist()
     return tuple(Unsafe(*divmod(row, agents), bool(executed.viable[row])) for row in rows)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -22,10 +22,13 @@ from stlc.controller.guard.feasibility import viable as search_safe
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
+    from stlc.compile.schedule.schedule import Boundary
     from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.problem.task import Task
 
 Mask = NDArray[np.bool_]
+Margins: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Least and greatest robustness over all continuations of what is recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +37,13 @@ class Executed:
 
     A planning window consists of the T steps of a plan. A requirement that mentions the horizon T is judged
     at every start instant from which a whole planning window is recorded. Any other requirement is judged
-    once, from the first sample.
+    once, from the first sample. If the trajectory ends before the windows of that requirement do, it may be
+    undecided: it neither holds nor fails, whatever the continuation.
 
     Attributes:
-        rules: requirement -> whether it holds, (starts, rows). There is a single start for a requirement that
-            does not mention T.
+        rules: requirement -> whether it certainly holds, (starts, rows). There is a single start for a
+            requirement that does not mention T.
+        fails: requirement -> whether it certainly does not hold, (starts, rows).
         safety: names of the requirements that are tagged `@safety`.
         consistent: (starts, rows), whether the model predicts every step in the planning window from the
             start instant, up to rounding errors.
@@ -49,6 +54,7 @@ class Executed:
     """
 
     rules: Mapping[str, Mask]
+    fails: Mapping[str, Mask]
     safety: tuple[str, ...]
     consistent: Mask
     viable: Mask
@@ -58,6 +64,11 @@ class Executed:
         """Mask of the agents for which all requirements in `names` hold at all start instants, (rows,)."""
         held = [self.rules[name].all(0) for name in names]
         return np.logical_and.reduce(held) if held else np.ones(self.consistent.shape[1], dtype=bool)
+
+    def failing(self, names: Sequence[str]) -> Mask:
+        """Mask of the agents for which a requirement in `names` certainly fails at a start, (rows,)."""
+        failed = [self.fails[name].any(0) for name in names]
+        return np.logical_or.reduce(failed) if failed else np.zeros(self.consistent.shape[1], dtype=bool)
 
     def starts(self, names: Sequence[str]) -> Mask:
         """Mask of the start instants at which all requirements in `names` hold, (starts, rows).
@@ -77,35 +88,29 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
     `viable`: (rows,), whether a safe plan from the first state is known; if None, a search for safe plans
     determines it.
     """
-    columns = dict(
-        zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
-    )
     starts = max(recording.steps + 1 - task.horizon, 0)
-    rules = {
-        rule.name: _margins(whole_run_rule(rule, task), columns, task.horizon) >= -TOLERANCE
-        for rule in task.rules
-    }
+    margins = _margins_of_rules(task, recording)
+    rules = {name: low >= -TOLERANCE for name, (low, _) in margins.items()}
+    fails = {name: high < -TOLERANCE for name, (_, high) in margins.items()}
     safety = tuple(rule.name for rule in task.compiled.safety)
     found = viable
     if found is None:
         found = search_safe(task, torch.from_numpy(recording.states[:, 0])).numpy()
     eventless = None if recording.eventless is None else _throughout(recording.eventless, task, starts)
     consistent = _throughout(model_consistent(task, recording), task, starts)
-    executed = Executed(rules, safety, consistent, found, eventless)
+    executed = Executed(rules, fails, safety, consistent, found, eventless)
     return replace(executed, viable=found | executed.agents(safety))
 
 
-def executed_robustness(task: Task, recording: DeploymentRecording) -> dict[str, NDArray[np.float64]]:
-    """Least robustness of each trajectory, requirement -> (rows,), over the start instants of `Executed`.
+def executed_robustness(task: Task, recording: DeploymentRecording) -> dict[str, Margins]:
+    """Bounds on the least robustness of each trajectory over the start instants of `Executed`.
 
-    It is -inf for a requirement without a start instant: the recording is too short.
+    requirement -> two arrays (rows,). They differ where the recording is too short: they are -inf and inf for
+    a requirement without a start instant.
     """
-    columns = dict(
-        zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
-    )
-    margins = {rule.name: _margins(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
     return {
-        name: each.min(0) if len(each) else np.full(each.shape[1], -np.inf) for name, each in margins.items()
+        name: (low.min(0) if len(low) else np.full(low.shape[1], -np.inf), high.min(0, initial=np.inf))
+        for name, (low, high) in _margins_of_rules(task, recording).items()
     }
 
 
@@ -124,28 +129,43 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
     return replace(rule, formula=written, lowered=lowered, reach=reach(written).future, windowed=False)
 
 
-def _margins(
-    rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int
-) -> NDArray[np.float64]:
-    """Robustness of one requirement, (starts, rows).
+def _margins_of_rules(task: Task, recording: DeploymentRecording) -> dict[str, Margins]:
+    """Bounds on the robustness of each requirement at the start instants of `Executed`."""
+    columns = dict(
+        zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
+    )
+    return {rule.name: _margins(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
+
+
+def _margins(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Margins:
+    """Least and greatest robustness of one requirement over all continuations, (starts, rows) each.
 
     `columns`: state -> samples, (time, rows). `horizon`: number of steps of a planning window.
     """
     samples, rows = next(iter(columns.values())).shape
     if not rule.windowed:
-        return _margin(rule, columns, 1)
+        if rule.reach >= samples:
+            return _margin(rule, columns, 1, "lower"), _margin(rule, columns, 1, "upper")
+        margin = _margin(rule, columns, 1)
+        return margin, margin
     count = samples - max(horizon, rule.reach)
     if count <= 0:
-        return np.ones((0, rows))
-    if not rule.uses_end:
-        return _margin(rule, columns, count)
-    windows = ({name: column[k : k + horizon + 1] for name, column in columns.items()} for k in range(count))
-    return np.concatenate([_margin(rule, window, 1) for window in windows])
+        margin = np.ones((0, rows))
+    elif not rule.uses_end:
+        margin = _margin(rule, columns, count)
+    else:
+        windows = ({name: each[k : k + horizon + 1] for name, each in columns.items()} for k in range(count))
+        margin = np.concatenate([_margin(rule, window, 1) for window in windows])
+    return margin, margin
 
 
-def _margin(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], count: int) -> NDArray[Any]:
-    (margin,) = evaluate([rule.formula], columns, ops=NUMPY, count=count, end="truncate")
-    return np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
+def _margin(
+    rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], count: int, end: Boundary = "truncate"
+) -> NDArray[np.float64]:
+    """Robustness at the first `count` samples, (count, rows); -inf where it is no number."""
+    (margin,) = evaluate([rule.formula], columns, ops=NUMPY, count=count, end=end)
+    whole = np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
+    return np.where(np.isnan(whole), -np.inf, whole)
 
 
 def model_consistent(task: Task, recording: DeploymentRecording) -> Mask:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stlc.controller.deployment.simulator import DeploymentRecording
+    from stlc.controller.evaluation.executed import Executed
     from stlc.controller.problem.task import Task
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.decl import SystemDecl
@@ -364,24 +365,28 @@ def _lost(
     return Lost("told" if event else "later", dt * since)
 
 
-def judge_runs_by_plans(
-    held: Mapping[str, NDArray[np.bool_]], viable: NDArray[np.bool_], dt: float
-) -> RunVerdicts:
+def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
     """Judge closed-loop runs by the specification of the plans, if there is no other specification for runs.
 
     A row is one run. A start is a sample of the run at which a requirement is evaluated. A run obeys a
-    requirement if the requirement holds at every start. Otherwise the run breaks the requirement at the first
-    start at which it does not hold.
+    requirement if the requirement certainly holds at every start, of which there is one at least. The run
+    breaks the requirement at the first start at which it certainly fails.
 
     Args:
-        held: requirement -> whether it holds at each start of each run, (starts, rows) booleans.
-        viable: (rows,), whether the run is safe, or a safe plan from its first state is known.
+        executed: verdicts on the runs by the specification of the plans.
         dt: time step in seconds.
     """
-    rules = {name: np.where(starts.all(0), "satisfied", "violated") for name, starts in held.items()}
-    rules |= {name: np.full(len(viable), "inconclusive") for name, starts in held.items() if not len(starts)}
+    viable, fails = executed.viable, executed.fails
+    rules = {
+        name: np.where(
+            fails[name].any(0),
+            "violated",
+            np.where(held.all(0) & (len(held) > 0), "satisfied", "inconclusive"),
+        )
+        for name, held in executed.rules.items()
+    }
     names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(viable))}
-    first = {name: starts.argmin(0) * dt for name, starts in held.items() if len(starts)}
+    first = {name: failed.argmax(0) * dt for name, failed in fails.items() if len(failed)}
     broken = (
         Broken(
             row,

@@ -162,6 +162,13 @@ def test_a_share_that_is_too_high_is_refuted(there: RunDir, capsys: pytest.Captu
 
 
 @pytest.mark.usefixtures("there")
+def test_drives_that_end_before_a_window_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["certify", "latest", "--seeds", "0..2", "--steps", "4"]) == 4
+    out = capsys.readouterr().out
+    assert "30 of 30 drives have no verdict, as after too few steps, and count as not satisfied" in out
+
+
+@pytest.mark.usefixtures("there")
 def test_the_width_decides_when_to_stop(capsys: pytest.CaptureFixture[str]) -> None:
     result = certified(capsys, "--width", ".3", "--set", "limit=0 m")
     low, high = result["overall"]["interval"]

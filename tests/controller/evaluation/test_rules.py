@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from stlc.controller.deployment.simulator import DeploymentRecording
+from stlc.controller.evaluation.executed import Executed
 from stlc.controller.evaluation.rules import Lost, Rules, judge_runs, judge_runs_by_plans, rules_of, runs_json
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
@@ -293,8 +294,13 @@ def text_of(home: Path, text: str):  # type: ignore[no-untyped-def]
 
 
 def test_without_rules_every_start_counts() -> None:
-    held = {"a": np.array([[True, True], [True, False], [False, False]]), "b": np.ones((0, 2), dtype=bool)}
-    drives = judge_runs_by_plans({"a": held["a"]}, viable(2, 1), 0.5)
+    def executed(held: np.ndarray, fails: np.ndarray, able: np.ndarray) -> Executed:
+        return Executed({"a": held}, {"a": fails}, (), np.ones((1, 2), dtype=bool), able)
+
+    held = np.array([[True, True], [True, False], [False, False]])
+    drives = judge_runs_by_plans(executed(held, ~held, viable(2, 1)), 0.5)
     assert [each.rules for each in drives.broken] == [{"a": 1.0}, {"a": 0.5}]
     assert drives.viable.tolist() == [True, False]
-    assert runs_json(judge_runs_by_plans({"b": held["b"]}, viable(2), 0.5), (0,), 2)["undecided"] == 2
+    for none in (held[:0], np.zeros((1, 2), dtype=bool)):  # no start, and no verdict
+        drives = judge_runs_by_plans(executed(none, none, viable(2)), 0.5)
+        assert runs_json(drives, (0,), 2)["undecided"] == 2
