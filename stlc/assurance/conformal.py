@@ -118,6 +118,12 @@ def rank(drives: int, miss: float, shift: DistributionShift = SAME) -> int:
     return low
 
 
+def _known(values: ArrayLike) -> NDArray[np.float64]:
+    """Values of which those that are no numbers are the least, so that they loosen every bound."""
+    given = np.asarray(values, dtype=np.float64)
+    return np.where(np.isnan(given), -np.inf, given)
+
+
 def lower_bound(values: ArrayLike, confidence: float = 0.95, shift: DistributionShift = SAME) -> float:
     """Split conformal lower bound on the next value; -inf if there are too few values.
 
@@ -125,7 +131,7 @@ def lower_bound(values: ArrayLike, confidence: float = 0.95, shift: Distribution
     one, if all are exchangeable, or if the next one is drawn from a distribution within `shift` of theirs.
 
     Args:
-        values: recorded values such as the robustness of drives, (n,); -inf is allowed.
+        values: recorded values such as the robustness of drives, (n,); NaN counts as -inf.
         confidence: probability that the bound holds.
         shift: distance of the next drive's distribution from that of the recorded drives.
 
@@ -133,7 +139,7 @@ def lower_bound(values: ArrayLike, confidence: float = 0.95, shift: Distribution
     Cauchois et al., 2024, and Y. Zhao, B. Hoxha, G. Fainekos, J. V. Deshmukh and L. Lindemann, Robust
     conformal prediction for STL runtime verification under distribution shift, ICCPS 2024.
     """
-    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    ordered = np.sort(_known(values))
     k = rank(len(ordered), 1.0 - confidence, shift)
     return float(ordered[k - 1]) if k else -math.inf
 
@@ -162,12 +168,12 @@ def tolerance_bound(
     at the unknown true quantile is one fixed test, and the test at any greater value has less capital.
 
     Args:
-        values: robustness of independent drives, (n,); -inf is allowed.
+        values: robustness of independent drives, (n,); NaN counts as -inf.
         share: share of drives, in (0, 1).
         confidence: probability that the bound holds, over the recorded drives.
         any_time: whether the drives are stopped by their results; see `bounds.certifies`.
     """
-    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    ordered = np.sort(_known(values))
     n = len(ordered)
     low, high = 0, n
     while low < high:  # the greatest number of values that may be lost
@@ -221,14 +227,12 @@ def calibrate_online(
 
     Args:
         predicted: robustness predicted at each step, (drives, agents, steps); one bound covers all agents.
-        final: robustness of the whole drives, (drives, agents).
+        final: robustness of the whole drives, (drives, agents); NaN counts as -inf.
         confidence: probability that all bounds of a drive hold.
         shift: distance of the next drive's distribution from that of the recorded drives.
     """
-    before = np.nan_to_num(
-        np.asarray(predicted, dtype=np.float64), nan=-np.inf, posinf=np.inf, neginf=-np.inf
-    )
-    after = np.asarray(final, dtype=np.float64)[:, :, None]
+    before = _known(predicted)
+    after = _known(final)[:, :, None]
     with np.errstate(invalid="ignore"):
         loss = np.where(np.isneginf(before) | np.isposinf(after), -np.inf, before - after)
     first = len(loss) // 3
@@ -268,14 +272,14 @@ def adaptive_bound(values: Sequence[float], confidence: float = 0.95, rate: floa
     """Follow recorded values in their order, and return the bound on the next one.
 
     Args:
-        values: robustness of drives in the order in which they were driven.
+        values: robustness of drives in the order in which they were driven; NaN counts as -inf.
         confidence: share of bounds that hold in the long run.
         rate: step by which the level changes; large rates follow faster and vary more.
     """
     miss = 1.0 - confidence
     level, missed = miss, 0
     known: list[float] = []
-    for value in map(float, values):
+    for value in _known(values).tolist():
         wrong = value < _at_level(known, level)
         missed += wrong
         level += rate * (miss - wrong)

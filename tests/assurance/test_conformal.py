@@ -136,6 +136,15 @@ def test_a_share_is_reached_from_the_drives_needed_on() -> None:
     assert tolerance_bound(values[1:], 0.99, 0.95) == -math.inf
 
 
+def test_values_that_are_no_numbers_are_the_least() -> None:
+    values, least = np.ones(1000), np.ones(1000)
+    values[::10], least[::10] = math.nan, -math.inf
+    assert lower_bound(values, 0.95) == lower_bound(least, 0.95) == -math.inf
+    assert tolerance_bound(values, 0.95, 0.95) == tolerance_bound(least, 0.95, 0.95) == -math.inf
+    assert adaptive_bound(values.tolist()) == adaptive_bound(least.tolist())
+    assert calibrate_online(np.ones((1000, 1, 3)), values[:, None]).radius == math.inf
+
+
 def paths(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Predictions of two agents at ten steps, which approach the final robustness, and that robustness."""
     final = rng.normal(size=(count, 2))
