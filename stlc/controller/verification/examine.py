@@ -160,7 +160,7 @@ class Examiner:
         bounds = self._plans.bound(mode, [boxes[i] for i in good], samples.index[good])
         for row, i in enumerate(good):
             box, effects = replace(boxes[i], refuted=False, hopeless=False), bounds.effects[row]
-            if bounds.low[row] < -PROVED:
+            if not bounds.low[row] >= -PROVED:  # also without a number
                 share = effects / box.half
                 found.shares.append(share / share.mean())
                 found.left += box.split(int(np.argmax(effects)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from helpers.small_policies import policy
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, LostCall
 from stlc.controller.verification.boxes import Box, whole
 from stlc.controller.verification.examine import BatchResult, BoxBatch, Examiner, SharedExaminer
+from stlc.controller.verification.judged import BoxVerdicts
 from stlc.controller.verification.plans import ProposedPlans
 from stlc.controller.verification.verify import HOPELESS, Verification, Verifier, _Front
 
@@ -82,6 +83,18 @@ def test_the_boxes_of_a_result_cover_the_batch(mode: int, dive: bool) -> None:
         assert (plans.choices(plans.states(plans.modes[mode], box.centre[None])).max() >= -1e-6).all()
     if not dive:
         assert len(found.left) == 2 * (60 - len(found.proved))
+
+
+def test_bounds_that_are_no_numbers_prove_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans, given = Source().load(), batch(3, 0.02)
+    bound = plans.bound
+
+    def unknown(*args: Any) -> BoxVerdicts:
+        found = bound(*args)
+        return replace(found, low=np.full_like(found.low, np.nan))
+
+    monkeypatch.setattr(plans, "bound", unknown)
+    assert not Examiner(plans).examined(given).proved
 
 
 def test_a_witness_is_the_worst_sample_that_the_policy_violates() -> None:
