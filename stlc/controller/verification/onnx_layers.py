@@ -15,6 +15,9 @@ from stlc.controller.verification.forms import Floats
 from stlc.controller.verification.network import NetworkLayer
 from stlc.diagnostics import Diagnostic, MissingError, usage
 
+_REAL = (1, 11)
+"""Types of ONNX to which a cast is no operation of the network: float32 and float64."""
+
 
 def read_onnx(path: Path) -> list[NetworkLayer]:
     """Read a feed-forward network: one input, one output, and a chain of layers.
@@ -42,13 +45,13 @@ def read_onnx(path: Path) -> list[NetworkLayer]:
     shape = [each.dim_value for each in inputs[0].type.tensor_type.shape.dim]
     chain.size = max([each for each in shape if each > 0], default=0)
     for node in graph.node:
-        if node.op_type == "Constant":
-            constants[node.output[0]] = numpy_helper.to_array(node.attribute[0].t)
-            continue
-        if here not in node.input:
+        if node.op_type != "Constant" and here not in node.input:
             raise usage(f"`{path}` is not a chain of layers: `{node.op_type}` reads another value")
         try:
             options = {each.name: onnx.helper.get_attribute_value(each) for each in node.attribute}
+            if node.op_type == "Constant":
+                constants[node.output[0]] = numpy_helper.to_array(options["value"])
+                continue
             values = [np.asarray(constants[name], dtype=np.float64) for name in node.input if name != here]
             chain.add(node.op_type, values, options, first=node.input[0] == here)
         except (KeyError, ValueError, IndexError) as error:
@@ -71,12 +74,14 @@ class _Chain:
 
     def add(self, kind: str, values: Sequence[Floats], options: Mapping[str, Any], *, first: bool) -> None:
         """Add an operation; `values` are its constant operands, `first` says that the chain comes first."""
+        if kind == "Cast" and options.get("to") not in _REAL:
+            raise ValueError("to a type other than float32 and float64")
         if kind in ("Identity", "Flatten", "Reshape", "Squeeze", "Unsqueeze", "Dropout", "Cast"):
             return
         if kind in ("Relu", "Tanh", "Sigmoid"):
             self._layers.append(NetworkLayer(*self._linear(self.size), kind.lower()))
             self._map = None
-        elif kind == "Gemm" and first:
+        elif kind == "Gemm" and first and not options.get("transA", 0):
             weight = values[0] if options.get("transB", 0) else values[0].T
             bias = values[1].reshape(-1) if len(values) > 1 else np.zeros(len(weight))
             self._compose(weight * options.get("alpha", 1.0), bias * options.get("beta", 1.0))

@@ -106,8 +106,10 @@ def test_states_that_the_network_does_not_see_keep_their_symbols(tmp_path: Path,
 # ---------------------------------------------------------------------------------- networks
 
 
-def written(path: Path, layers: list[NetworkLayer], scale: float = 1.0) -> Path:
-    """Write a network with Gemm, MatMul, Add and an activation; its inputs are multiplied by `scale`."""
+def written(
+    path: Path, layers: list[NetworkLayer], scale: float = 1.0, *, cast: int = 1, transposed: int = 0
+) -> Path:
+    """Write a network with Gemm, MatMul, Add, an activation and a cast; inputs are multiplied by `scale`."""
     onnx = pytest.importorskip("onnx")
     helper, arrays = onnx.helper, onnx.numpy_helper
 
@@ -117,10 +119,11 @@ def written(path: Path, layers: list[NetworkLayer], scale: float = 1.0) -> Path:
     first, last = layers
     nodes = [
         helper.make_node("Mul", ["x", "scale"], ["s"]),
-        helper.make_node("Gemm", ["s", "W", "b"], ["h"], transB=1),
+        helper.make_node("Gemm", ["s", "W", "b"], ["h"], transA=transposed, transB=1),
         helper.make_node(first.activation.capitalize(), ["h"], ["a"]),
         helper.make_node("MatMul", ["a", "V"], ["m"]),
-        helper.make_node("Add", ["m", "c"], ["u"]),
+        helper.make_node("Add", ["m", "c"], ["y"]),
+        helper.make_node("Cast", ["y"], ["u"], to=cast),
     ]
     values = [
         constant([scale], "scale"),
@@ -198,6 +201,13 @@ def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:
         read_onnx(tmp_path / "net.onnx")
     with pytest.raises(UsageError, match="not a network"):
         read_onnx(tmp_path / "absent.onnx")
+
+
+@pytest.mark.parametrize("options", [{"cast": 7}, {"cast": 10}, {"transposed": 1}])
+def test_operations_that_are_no_linear_map_are_refused(tmp_path: Path, options: dict[str, int]) -> None:
+    path = written(tmp_path / "net.onnx", random_layers("relu"), **options)  # to int64, to float16, transA
+    with pytest.raises(UsageError, match=r"not supported: (Cast|Gemm)"):
+        read_onnx(path)
 
 
 def test_a_network_of_other_sizes_is_refused() -> None:
