@@ -29,7 +29,7 @@ from stlc.rundir import now
 SEED = 1 << 41
 """First seed of certificates; those of `simulate` begin at 0, those after a training at 2^40."""
 FIRST = 100
-"""Number of units in the first batch, which calibrates the conformal bounds."""
+"""Number of units in the first batch; the first one with units in scope calibrates the conformal bounds."""
 BATCH = 50
 """Number of units in each further batch."""
 
@@ -118,7 +118,7 @@ def campaign(order: Campaign) -> Iterator[Progress]:
     claim = replace(
         order.claim,
         any_time=not fixed,
-        calibration=None if fixed else first,
+        calibration=None,
         further=tuple(order.subject.assumptions),
     )
     every = order.seeds or tuple(range(SEED, SEED + max(1, order.most // each)))
@@ -131,7 +131,7 @@ def campaign(order: Campaign) -> Iterator[Progress]:
         known, batches = known + len(seeds), batches + 1
         if not parts:
             continue
-        if batches == 1 and claim.calibration is not None:  # the same units, however many follow
+        if not fixed and claim.calibration is None:  # the same units, however many follow
             claim = replace(claim, calibration=min(first, sum(part.count for part in parts)))
         assessment = assess(joined(parts), claim)
         done = known == len(every) or _answered(assessment, order.width)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from stlc.assurance.campaign import FIRST, SEED, Campaign, campaign
-from stlc.assurance.certificate import Claim
+from stlc.assurance.campaign import BATCH, FIRST, SEED, Campaign, campaign
+from stlc.assurance.certificate import Claim, Judged, Sample
 from stlc.assurance.drives import PolicyDrives, sample_of
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
@@ -123,6 +125,29 @@ def test_a_campaign_is_repeatable_and_counts_its_seeds(run: Run) -> None:
     assert last.seeds == tuple(range(SEED, SEED + last.assessment.overall.units // 4))
     assert all(not each.done for each in first[:-1])
     assert last.assessment.claim.calibration == FIRST
+
+
+class Late:
+    """A subject whose first batch is out of scope; it satisfies every other observation."""
+
+    doing, per_seed, packages, assumptions = "observing", 1, (), ()
+
+    def observed(self, seeds: Sequence[int]) -> Iterator[Sample]:
+        if seeds[0] > SEED:
+            good = np.arange(len(seeds)) % 2 == 0
+            judged = Judged("r", "", good, ~good, np.where(good, 1.0, -1.0))
+            yield Sample(judged, (judged,), np.arange(len(seeds)), "simulation")
+
+    def record(self, seeds: Sequence[int]) -> dict[str, Any]:  # noqa: ARG002
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+def test_units_of_the_first_batch_in_scope_calibrate_whatever_follows() -> None:
+    found = list(campaign(Campaign(Late(), Claim(0.5), most=FIRST + 4 * BATCH)))
+    assert [each.assessment.calibration for each in found] == [BATCH] * 4
 
 
 class Derived(ModelWorld):
