@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import children
 from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.verification.forms import FORMS, Bools, Floats, Forms, in_use, picked, spread, together
 from stlc.controller.verification.network import UNIT, PlanBounds
 from stlc.controller.verification.subject import History, Indices, VerificationSubject
 from stlc.diagnostics import usage
+from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
+    from stlc.dynamics.declaration.decl import SystemDecl
 
 _GROUP = 256
 """Boxes whose network is bounded at once."""
@@ -61,6 +65,11 @@ class ProposedPlans(VerificationSubject):
         except ValueError as error:
             raise usage(f"this cannot be verified: {error}") from None
         self._policy = policy
+        self._wrapped = {
+            control.name: control.low
+            for control in task.system.decl.controls
+            if control.squash == "angle" and not _as_direction(control.name, task.system.decl)
+        }
 
     # ---------------------------------------------------------------------------- samples
 
@@ -116,11 +125,18 @@ class ProposedPlans(VerificationSubject):
         return [self._unfolded(step, swapped) for step in plan], decided
 
     def _unfolded(self, step: Sequence[Forms], swapped: Bools) -> list[Forms]:
-        """Controls of one step, mirrored where the states were."""
+        """Controls of one step, mirrored where the states were.
+
+        Angles are wrapped as by `Mirror.plans`. Those that are read as directions alone are not: the states
+        are the same, and an angle near the end of the turn would be any.
+        """
         mirror = self._policy.network.mirror
         assert mirror is not None
         given = dict(zip(self._controls, step, strict=True))
         image = given | mirror.image_of_controls(given, FORMS)
+        for name, low in self._wrapped.items():
+            form = image[name].widened(0.0, 16.0 * UNIT * (1.0 + np.abs(image[name].centre)))
+            image[name] = FORMS.add(FORMS.mod(FORMS.sub(form, low), 2.0 * np.pi), low)
         return [
             picked(swapped, image[name], form).widened(0.0, 4.0 * UNIT * (1.0 + np.abs(form.centre)))
             for name, form in given.items()
@@ -142,3 +158,16 @@ class ProposedPlans(VerificationSubject):
             [together(forms).at(home) for forms in zip(*steps, strict=True)]
             for steps in zip(*parts, strict=True)
         ]
+
+
+def _as_direction(name: str, decl: SystemDecl) -> bool:
+    """True if the motion reads a control as `sin(name)` and `cos(name)` alone."""
+    step, read = build_step(decl, soft=False), ir.Signal(name)
+    stack: list[Any] = [*(num for _, num in step.lets), *step.next.values()]
+    while stack:
+        part = stack.pop()
+        if part == read:
+            return False
+        if part not in (ir.Op("sin", (read,)), ir.Op("cos", (read,))):
+            stack.extend(children(part))
+    return True

@@ -14,6 +14,7 @@ from helpers.small_policies import half_seen_task, policy, task_of
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.controller.policies.policy import BestOfKPolicy, ModelRollout, PlanNetwork
+from stlc.controller.problem.task import Task
 from stlc.controller.verification.boxes import Box, Unsupported, modes_of
 from stlc.controller.verification.forms import Forms
 from stlc.controller.verification.network import PlanBounds
@@ -22,6 +23,9 @@ from stlc.controller.verification.verify import Verification, Verifier
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.init import GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
+from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
+from stlc.source import Source
 
 
 @cache
@@ -222,6 +226,43 @@ def test_a_mirrored_box_is_the_image_of_its_mirror_image() -> None:
     found = plans.bound(mode, [Box(at, half), Box(image, half)], 0)
     assert np.isfinite(found.low).all()
     assert found.low[0] == pytest.approx(found.low[1])
+
+
+TURNING = """
+stlc: 1
+name: turning
+time: {dt: 1 s, horizon: 1 steps, discrete: true}
+state:
+  x: {range: [-1, 1]}
+  h: {range: [-9, 9]}
+control:
+  a: {range: [-3.141592653589793, 3.141592653589793], squash: angle}
+flow:
+  h: a
+init:
+  mixture:
+    - draw: {x: "uniform(-1, 1)", h: 0}
+policy:
+  mirror: {x: -x, a: 3.141592653589793 - a}
+"""
+
+
+@pytest.mark.parametrize("angle", [-2.0, 0.0, 1.0])
+def test_mirrored_angles_are_wrapped_into_a_turn(tmp_path: Path, angle: float) -> None:
+    (tmp_path / "turning.yaml").write_text(TURNING)
+    text = Source("turning.stl", "signal x, h\nrequire r: always[0 s, 1 s] h < 2")
+    task = Task.of(parse(text), System.load(tmp_path / "turning.yaml"))
+    network = PlanNetwork(task, hidden=(2,), plans=1).eval()
+    with torch.no_grad():
+        network.body[-1].weight.zero_()
+        network.body[-1].bias.copy_(torch.tensor([np.cos(angle), np.sin(angle)]))
+    plans = ProposedPlans(task, BestOfKPolicy(task, network))
+    at = np.array([[0.25], [0.75]])  # one is seen in the mirror
+    bounds = plans.bound(plans.modes[0], [Box(each, np.full(1, 0.1)) for each in at], 0)
+    rho = plans.robustness(plans.states(plans.modes[0], at))
+    assert (bounds.low <= rho).all()
+    assert (bounds.high >= rho).all()
+    assert (bounds.high - bounds.low < (1e-3 if angle else 7.0)).all()  # 0 is mirrored to the end of the turn
 
 
 def test_a_box_on_both_sides_of_a_mirror_is_not_proved() -> None:
