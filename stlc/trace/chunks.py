@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.trace.enums import instants_of
 from stlc.trace.formats.registry import SUFFIXES, format_of, unreadable
+from stlc.trace.formats.table import several_traces
 from stlc.trace.recording import CLOCK, ClockGroup, Recording
 from stlc.trace.time_grid import TOLERANCE, resample_advice
 from stlc.trace.trace import Reading, Trace, trace_of
@@ -62,8 +63,7 @@ def _recordings(path: Path, samples: int) -> Iterator[Recording]:
 
 def _single(trace: Trace) -> Trace:
     if trace.traces > 1:
-        message = f"`{trace.name}` holds {trace.traces} traces; in pieces only one can be read"
-        raise TraceError(Diagnostic("E605", message, help=("put each trace into a file of its own",)))
+        raise several_traces(trace.name, f"{trace.traces} traces")
     return trace
 
 

@@ -19,7 +19,7 @@ from stlc.jsontext import loads
 from stlc.trace.enums import instant_of_word, number_of_word
 from stlc.trace.formats.cells import bare, value_of
 from stlc.trace.formats.csv import delimiter_of, head_cells, split_head
-from stlc.trace.formats.table import clock_scale
+from stlc.trace.formats.table import OneTrace, clock_scale, group_among
 from stlc.trace.recording import CLOCK, absent, clock_among
 from stlc.trace.resample import FIRST, MAX_SAMPLES, Spacing, usual_step, values_on
 from stlc.trace.time_grid import (
@@ -72,13 +72,18 @@ class SampleStream:
     _scale: float = 1.0
     _begin: np.datetime64 | None = None
     _signals: dict[str, str] = field(default_factory=dict)
+    _only: OneTrace = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._only = OneTrace(self.name)
 
     def moments(self, lines: Iterable[bytes]) -> Iterator[TimedSample]:
         """Yield one sample per line; empty lines are skipped.
 
         Raises:
             TraceError: E601, a requested signal or time column is missing; E603, a line is not a sample, or a
-                word is not a value of its signal; E605, an invalid header or a wrong number of cells.
+                word is not a value of its signal; E605, an invalid header, a wrong number of cells, or
+                several traces.
         """
         is_json: bool | None = None
         for number, raw in enumerate(lines, 1):
@@ -135,7 +140,7 @@ class SampleStream:
         if all(value_of(name) is not None for name in names):
             raise self._bad(number, "has numbers where the columns are named", "E605")
         self._heads = names
-        self._named(names)
+        self._named(name for name in names if name != group_among(names))
         unit_of = dict(zip(names, units, strict=True))
         self.units = {signal: unit_of[name] for name, signal in self._signals.items()}
         if self._clock is not None:
@@ -150,7 +155,7 @@ class SampleStream:
             raise self._bad(number, what, "E605")
         if self._delimiter != ",":
             cells = [_with_point(cell) for cell in cells]
-        return self._moment(dict(zip(self._heads, cells, strict=True)), number)
+        return self._moment(self._of_one_trace(dict(zip(self._heads, cells, strict=True))), number)
 
     def _object(self, text: str, number: int) -> TimedSample:
         try:
@@ -163,11 +168,23 @@ class SampleStream:
         for name, value in found.items():
             many = isinstance(value, list)
             flat |= {f"{name}[{i}]": each for i, each in enumerate(value)} if many else {name: value}
+        flat = self._of_one_trace(flat)
         if not self._signals:
             self._named(flat)
         elif new := [name for name in flat if name not in self._signals and name != self._clock]:
             self._signals |= {name: name for name in new if name not in self.reading.names}
         return self._moment(flat, number)
+
+    def _of_one_trace(self, values: dict[str, object]) -> dict[str, object]:
+        """Remove the cell that names the trace of a line. Raises TraceError (E605) for a second trace."""
+        group = group_among(values)
+        if group is None:
+            return values
+        key = values.pop(group)
+        if key is not None:
+            number = _plain(key)
+            self._only.require(group, key if number is None else number)
+        return values
 
     def _moment(self, values: Mapping[str, object], number: int) -> TimedSample:
         time = None if self._clock is None else self._seconds(values.get(self._clock), number)

@@ -42,3 +42,28 @@ def test_pieces_of_what_cannot_be_cut(tmp_path: Path) -> None:
     (tmp_path / "a.mat").write_bytes(b"")
     with pytest.raises(StlcError, match="cannot be read in pieces"):
         list(pieces(tmp_path / "a.mat", 7, Reading()))
+
+
+@pytest.mark.parametrize("group", ["trace", "agent"])
+@pytest.mark.parametrize("keys", ["0011", "0001", "aabb", "0 1 "])
+def test_pieces_of_several_traces_are_not_taken_for_one(tmp_path: Path, group: str, keys: str) -> None:
+    rows = [f"{key.strip()},{k}" for k, key in enumerate(keys)]
+    (tmp_path / "a.csv").write_text("\n".join([f"{group},x", *rows]))
+    for samples in (1, 2, 3, 9):
+        with pytest.raises(TraceError, match="holds the traces") as caught:
+            list(pieces(tmp_path / "a.csv", samples, Reading(dt=1.0)))
+        assert caught.value.diagnostics[0].code == "E605"
+
+
+def test_pieces_of_one_trace_that_has_a_name(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("trace,x\n7,0\n7,1\n7.0,2\n")
+    parts = list(pieces(tmp_path / "a.csv", 2, Reading(dt=1.0)))
+    assert [part.data["x"].tolist() for part in parts] == [[[0.0, 1.0]], [[2.0]]]
+
+
+def test_pieces_of_several_traces_in_parquet(tmp_path: Path) -> None:
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    table = arrow.table({"agent": [0, 0, 1, 1], "x": [1.0, 9.0, 1.0, 1.0]})
+    parquet.write_table(table, tmp_path / "a.parquet")
+    with pytest.raises(TraceError, match="the traces 0 and 1"):
+        list(pieces(tmp_path / "a.parquet", 2, Reading(dt=1.0)))

@@ -26,7 +26,7 @@ from stlc.files import write_atomic
 from stlc.source import Source, Span
 from stlc.trace.formats.cells import NUMBER, STRETCH, TableText, bare, load, read_lines, value_of
 from stlc.trace.formats.registry import opened, unreadable
-from stlc.trace.formats.table import GROUPS, Table, is_unit, of_table
+from stlc.trace.formats.table import GROUPS, OneTrace, Table, is_unit, of_table
 from stlc.trace.recording import Recording
 
 if TYPE_CHECKING:
@@ -71,12 +71,16 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """Yield the trace of a file in chunks of `samples` lines. Raises the errors of `read`."""
+    """Yield the trace of a file in chunks of `samples` lines.
+
+    Raises the errors of `read`, and E605 if the file contains several traces.
+    """
+    only = OneTrace(str(path))
     with path.open("rb") as file:
         header = next((line for line in file if line.strip()), b"")
         while lines := list(islice(file, samples)):
             if any(map(bytes.strip, lines)):
-                yield of_table(path, table_of_text(path, header + b"".join(lines)))
+                yield of_table(path, table_of_text(path, header + b"".join(lines)), only=only)
 
 
 def read_csv(path: Path) -> Table:

@@ -17,7 +17,7 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import atomic_path
 from stlc.trace.formats.csv import split_head
 from stlc.trace.formats.registry import MAX_BYTES, damage, needed, room_for, unreadable
-from stlc.trace.formats.table import Table, of_table
+from stlc.trace.formats.table import OneTrace, Table, of_table
 from stlc.trace.recording import Recording
 
 Floats = NDArray[np.float64]
@@ -75,7 +75,11 @@ def size(path: Path) -> int:
 
 
 def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """Yield the trace of a file in chunks of `samples` rows. Raises the errors of `read`."""
+    """Yield the trace of a file in chunks of `samples` rows.
+
+    Raises the errors of `read`, and E605 if the file contains several traces.
+    """
+    only = OneTrace(str(path))
     file = open_parquet(path, whole=False)
     with damage(path):
         batches = file.iter_batches(batch_size=samples, columns=_names(file))
@@ -84,7 +88,7 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
             batch = next(batches, None)
         if batch is None:
             return
-        yield of_table(path, _table(path, needed("pyarrow").Table.from_batches([batch])))
+        yield of_table(path, _table(path, needed("pyarrow").Table.from_batches([batch])), only=only)
 
 
 def _names(file: Any) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,15 +47,60 @@ class Table:
         return len(next(iter(self.columns.values())))
 
 
-def of_table(path: Path, table: Table, meta: TraceMeta | None = None) -> Recording:
+@dataclass(slots=True)
+class OneTrace:
+    """Check of a table that is read in pieces: all of its lines belong to one trace.
+
+    Attributes:
+        name: name of the table, for messages.
+    """
+
+    name: str
+    _key: object = None
+
+    def require(self, group: str, key: object) -> None:
+        """Check a line whose cell in the column `group` is `key`, a number or a word.
+
+        Raises TraceError (E605) if an earlier line belongs to another trace.
+        """
+        if self._key is None:
+            self._key = key
+        elif str(key) != str(self._key):  # as texts: an empty cell, NaN, equals itself
+            raise several_traces(self.name, f"the traces {_label(self._key)} and {_label(key)} ({group})")
+
+
+def several_traces(name: str, traces: str) -> TraceError:
+    """Return the error E605: a recording that is read in pieces holds several traces.
+
+    `traces` says which or how many.
+    """
+    message = f"`{name}` holds {traces}; in pieces only one can be read"
+    return TraceError(Diagnostic("E605", message, help=("put each trace into a file of its own",)))
+
+
+def group_among(names: Iterable[str]) -> str | None:
+    """Return the name of the column that gives the trace of each line; None if there is none."""
+    known = set(names)
+    return next((name for name in GROUPS if name in known), None)
+
+
+def of_table(
+    path: Path, table: Table, meta: TraceMeta | None = None, *, only: OneTrace | None = None
+) -> Recording:
     """Convert a table to signals with one time column.
+
+    If the table is one piece of a file, `only` checks that all pieces belong to one trace.
 
     Raises:
         TraceError: E605, traces that differ in length or in their times, or an invalid unit.
     """
-    group = next((name for name in GROUPS if name in table.columns), None)
-    columns = {name: values for name, values in table.columns.items() if name != group}
-    arrays = columns if group is None else _grouped(path, columns, group, table.columns[group])
+    group = group_among(table.columns)
+    arrays = {name: values for name, values in table.columns.items() if name != group}
+    if group is not None and only is not None:
+        for key in np.unique(table.columns[group]):
+            only.require(group, key)
+    elif group is not None:
+        arrays = _grouped(path, arrays, group, table.columns[group])
     named = clock_among(arrays)
     clock = None if named is None else arrays.pop(named)
     if clock is not None and clock.ndim == 2:

@@ -1,0 +1,39 @@
+"""Lines of a stream: the same samples as those of a file with these lines, or a diagnostic."""
+
+from __future__ import annotations
+
+import pytest
+
+from stlc.diagnostics import TraceError
+from stlc.trace import Reading
+from stlc.trace.live import Sample, SampleStream, on_grid
+
+
+def samples_of(text: str, reading: Reading) -> list[Sample]:
+    lines = text.encode().splitlines(keepends=True)
+    return list(on_grid(SampleStream("standard input", reading).moments(lines), reading, "input").samples)
+
+
+def code_of(text: str, reading: Reading) -> str:
+    with pytest.raises(TraceError) as caught:
+        samples_of(text, reading)
+    return caught.value.diagnostics[0].code
+
+
+TRACES = {
+    "numbers": "trace,x\n0,1\n0,9\n1,1\n",
+    "words": "agent;x\na;1\nb;9\n",
+    "an empty cell": "agent,x\n0,1\n,9\n",
+    "objects": '{"trace": 0, "x": 1}\n{"trace": "b", "x": 2}\n',
+    "a later name": '{"x": 0}\n{"agent": 0, "x": 1}\n{"agent": 1, "x": 2}\n',
+}
+
+
+@pytest.mark.parametrize("name", TRACES)
+def test_several_traces_are_not_taken_for_one(name: str) -> None:
+    assert code_of(TRACES[name], Reading(dt=1.0)) == "E605"
+
+
+@pytest.mark.parametrize("text", ["trace,x\n1,1\n1.0,9\n", '{"trace": null, "x": 1}\n{"trace": 1, "x": 9}\n'])
+def test_the_name_of_the_one_trace_is_no_signal(text: str) -> None:
+    assert samples_of(text, Reading(dt=1.0)) == [{"x": 1.0}, {"x": 9.0}]
