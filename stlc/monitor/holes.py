@@ -1,12 +1,14 @@
-"""Bounds on the robustness of a formula on a trace with unknown samples.
+"""Bounds on the robustness of a formula on a trace with unknown values.
 
-An unknown sample is NaN in the arrays. A predicate that reads it counts as -inf in the lower bound, and as
-+inf in the upper bound. The robustness of a formula never falls if the value of a predicate rises. Therefore
-a verdict that follows from the bounds is true for all values that the unknown samples may have.
+An unknown sample is NaN in the arrays. A function outside of its domain, such as `sqrt(-1)` or `0 / 0`, is
+NaN too. A predicate that reads such a value counts as -inf in the lower bound, and as +inf in the upper
+bound. The robustness of a formula never falls if the value of a predicate rises. Therefore a verdict that
+follows from the bounds is true for all values that are possible in these places.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -15,16 +17,20 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.analysis.ranges import has_value
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import leaves, map_children
+from stlc.compile.ir.traverse import leaves, map_children, numbers, subexpressions
 
 Floats: TypeAlias = NDArray[np.float64]
+Names: TypeAlias = frozenset[str]
 
 KNOWN = "@known "
 """Prefix of the column that is 1 where the signal of that name is known, else -1."""
 
+_NAN = ir.Const(math.nan)
 
-def holes_in(env: Mapping[str, Floats]) -> frozenset[str]:
+
+def holes_in(env: Mapping[str, Floats]) -> Names:
     """Return the names of the signals that contain NaN."""
     return frozenset(name for name, values in env.items() if np.isnan(values).any())
 
@@ -45,29 +51,52 @@ def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, 
 
 
 @lru_cache(maxsize=512)
-def unsure(formula: ir.Formula, holes: frozenset[str], *, least: bool) -> ir.Formula:
-    """Return a formula whose value is a bound on `formula` for all values of the unknown samples.
+def partial(formula: ir.Formula) -> bool:
+    """True if a formula calls a function outside of whose domain the signals may be."""
+    return any(_is_partial(num, frozenset()) for num in numbers(formula))
+
+
+@lru_cache(maxsize=512)
+def unsure(formula: ir.Formula, holes: Names, *, least: bool, computed: bool = True) -> ir.Formula:
+    """Return a formula whose value is a bound on `formula` for all values that are unknown.
 
     Args:
         formula: in negation normal form (negations occur only in predicates).
         holes: names of the signals with unknown values. A `freeze` may store such a signal under a name; this
             name then also counts as a signal with unknown values.
         least: True for the lower bound, False for the upper bound.
+        computed: whether NaN that a function gives outside of its domain is unknown too.
+    """
+    return _unsure(formula, holes, frozenset() if computed else None, least=least)
+
+
+def _unsure(formula: ir.Formula, holes: Names, nans: Names | None, *, least: bool) -> ir.Formula:
+    """Return the bound that `unsure` returns.
+
+    `nans` are the names under which an enclosing `freeze` stores a number that may be NaN; None if computed
+    NaN does not count as unknown.
     """
     match formula:
         case ir.Predicate(num=num):
-            return _guarded(formula, _known(num, holes), least=least)
+            return _guarded(_decided(formula, nans, least=least), _known(num, holes), least=least)
         case ir.Freeze(bindings=bindings, body=body):
             known = {name: found for name, num in bindings if (found := _known(num, holes)) is not None}
             bound = frozenset(name for name, _ in bindings)
-            inner = unsure(body, (holes - bound) | frozenset(known), least=least)
+            if nans is not None:
+                lost = frozenset(name for name, num in bindings if _is_partial(num, nans))
+                bindings = tuple((name, _with_nan(num, nans)) for name, num in bindings)
+                nans = (nans - bound) | lost
+            inner = _unsure(body, (holes - bound) | frozenset(known), nans, least=least)
             more = tuple((KNOWN + name, num) for name, num in known.items())
             return replace(formula, bindings=(*bindings, *more), body=inner)
         case _:
-            return map_children(formula, formulas=lambda part: unsure(part, holes, least=least))
+            return map_children(formula, formulas=lambda part: _unsure(part, holes, nans, least=least))
 
 
-def _known(num: ir.Num, holes: frozenset[str]) -> ir.Num | None:
+# ------------------------------------------------------------------------- unknown samples
+
+
+def _known(num: ir.Num, holes: Names) -> ir.Num | None:
     """Return an expression that is 1 where all signals in `num` are known, else -1.
 
     None is returned if `num` reads no signal in `holes`, because `num` is then known everywhere.
@@ -90,3 +119,75 @@ def _guarded(atom: ir.Predicate, known: ir.Num | None, *, least: bool) -> ir.For
         known if least is (atom.sign > 0) else ir.Op("neg", (known,)), sign=atom.sign, guard=True
     )
     return ir.BoolOp("and" if least else "or", (atom, test))
+
+
+# ------------------------------------------------------------------------- computed NaN
+
+
+def _is_partial(num: ir.Num, nans: Names) -> bool:
+    """True if a number may be NaN, or depend on NaN, although the signals that it reads are known.
+
+    `nans` are the names of frozen values that may be NaN.
+    """
+    return any(
+        (isinstance(part, ir.Op) and not has_value(part))
+        or (isinstance(part, ir.FrozenVar) and part.name in nans)
+        or (isinstance(part, ir.Extern) and _returns_nan(part))
+        for part in subexpressions(num)
+    )
+
+
+def _returns_nan(call: ir.Extern) -> bool:
+    """True if a function of the system may return NaN; that of a Python function is not known."""
+    body = call.function
+    if not isinstance(body, ir.Body):
+        return True
+    return any(_is_partial(num, frozenset()) for num in (*(num for _, num in body.lets), *body.outputs))
+
+
+def _decided(atom: ir.Predicate, nans: Names | None, *, least: bool) -> ir.Predicate:
+    """Return the predicate with the margin -inf (`least`) or +inf in place of NaN."""
+    if nans is None or not _is_partial(atom.num, nans):
+        return atom
+    num = _with_nan(atom.num, nans)
+    other = ir.Const(-math.inf if least is (atom.sign > 0) else math.inf)
+    return replace(atom, num=ir.Where(_is_number(num), num, other))
+
+
+def _is_number(num: ir.Num) -> ir.Formula:
+    """Return a condition that is false where a number is NaN, since no comparison with NaN is true."""
+    return ir.Predicate(ir.Op("abs", (num,)))
+
+
+def _with_nan(num: ir.Num, nans: Names) -> ir.Num:
+    """Return the number with NaN wherever it depends on NaN.
+
+    A condition on NaN is false, and so a number with conditions (`if`, `ind`) may have a value where it has
+    none. Arguments of functions of the system are treated alike.
+    """
+    if not _is_partial(num, nans):
+        return num
+    num = map_children(num, numbers=lambda part: _with_nan(part, nans))
+    match num:
+        case ir.Where(cond, yes, no):
+            return _chosen(cond, yes, no, nans)
+        case ir.Indicator(cond):
+            return _chosen(cond, ir.Const(1.0), ir.Const(0.0), nans) if _tests_nan(cond, nans) else num
+        case ir.Extern(args=args):
+            for arg in args:
+                num = ir.Where(_is_number(arg), num, _NAN) if _is_partial(arg, nans) else num
+            return num
+        case _:
+            return num
+
+
+def _tests_nan(cond: ir.Formula, nans: Names) -> bool:
+    return any(_is_partial(num, nans) for num in numbers(cond))
+
+
+def _chosen(cond: ir.Formula, yes: ir.Num, no: ir.Num, nans: Names) -> ir.Num:
+    """Return `yes` where a condition holds, `no` where it does not, and NaN where that is unknown."""
+    holds, may_hold = (_unsure(cond, frozenset(), nans, least=least) for least in (True, False))
+    if holds is may_hold:
+        return ir.Where(cond, yes, no)
+    return ir.Where(holds, yes, ir.Where(may_hold, _NAN, no))

@@ -23,7 +23,6 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import Boundary
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.monitor.holes import unsure
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 At: TypeAlias = int | Literal["all"] | None
@@ -100,8 +99,9 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
     if `end` is "lower" or "upper". A requirement with absolute operators (`always@[a, b]`) has the same value
     at all samples.
     """
-    if record.holes:
-        least, most = (rule_signal(each, record.sure, horizon, end) for each in _sides(rule, record))
+    sides = _sides(rule, record)
+    if sides is not None:
+        least, most = (rule_signal(each, record.sure, horizon, end) for each in sides)
         return _agreed(least, most, record, end)
     if rule.absolute:
         (value,) = rules_at([rule], record, 0, horizon, end)
@@ -139,10 +139,10 @@ def rules_at(
     `end` is the treatment of windows that extend beyond the trace, as in `rule_signal`. `horizon` is the
     length of a planning window in steps.
     """
-    if record.holes:
-        sides = [_sides(rule, record) for rule in rules]
-        least = rules_at([side[0] for side in sides], record.sure, at, horizon, end)
-        most = rules_at([side[1] for side in sides], record.sure, at, horizon, end)
+    sides = [_sides(rule, record) for rule in rules]
+    if any(sides):
+        pairs = [side or (rule, rule) for rule, side in zip(rules, sides, strict=True)]
+        least, most = (rules_at(each, record.sure, at, horizon, end) for each in zip(*pairs, strict=True))
         return [_agreed(*pair, record, end) for pair in zip(least, most, strict=True)]
     starts_of_all = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at) for rule in rules]
     formulas = [rule.under(record.semantics) for rule in rules]
@@ -159,13 +159,17 @@ def rules_at(
     ]
 
 
-def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, CompiledRequirement]:
+def _sides(
+    rule: CompiledRequirement, record: Record
+) -> tuple[CompiledRequirement, CompiledRequirement] | None:
     """Return two copies of a requirement, for a lower and an upper bound on its robustness.
 
-    The bounds hold for all values of the unknown samples.
+    The bounds hold for all unknown values. None is returned if no value that the requirement reads can be
+    unknown.
     """
-    formula = rule.under(record.semantics)
-    least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
+    least, most = record.sides(rule.under(record.semantics))
+    if least is most:
+        return None
     return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)
 
 

@@ -87,7 +87,7 @@ def uncertain_record(
     for name, values in record.env.items():
         known = _of(name, uncertain)
         env[name] = Intervals.point(values) if known is None else _around(values, known, columns[name])
-    return replace(record, env=env, ops=INTERVALS)
+    return replace(record, env=env, ops=INTERVALS, computed=False)
 
 
 def outer(low: Array, high: Array) -> tuple[Floats, Floats]:

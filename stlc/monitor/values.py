@@ -17,7 +17,7 @@ from stlc.compile.ir.support import columns_of, history
 from stlc.compile.ir.traverse import map_children, subexpressions
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Exact, Semantics
-from stlc.monitor.holes import holes_in, unsure, without_holes
+from stlc.monitor.holes import holes_in, partial, unsure, without_holes
 
 Ends: TypeAlias = Literal["open", "truncate"]
 """`open`: the trace may continue, values are bounds over all continuations; `truncate`: windows are cut."""
@@ -35,26 +35,39 @@ class Record:
         ops: the array library.
         semantics: definition of minimum and maximum.
         holes: names of the signals with unknown values (`stlc.monitor.holes`).
+        computed: whether NaN that a function gives outside of its domain is unknown too.
     """
 
     env: Mapping[str, Array]
     ops: Ops
     semantics: Semantics = Exact()  # noqa: RUF009 - frozen
     holes: frozenset[str] = frozenset()
+    computed: bool = False
 
     @staticmethod
     def of(env: Mapping[str, Array], ops: Ops) -> Record:
         """Return a record of the signals `env`; in NumPy arrays, NaN is an unknown value."""
         holes = holes_in(env) if ops is NUMPY else frozenset[str]()
-        return Record(without_holes(env, holes) if holes else env, ops, holes=holes)
+        return Record(without_holes(env, holes) if holes else env, ops, holes=holes, computed=ops is NUMPY)
 
     @property
     def sure(self) -> Record:
-        """Copy of this record in which no signal counts as unknown anywhere (`holes` is empty).
+        """Copy of this record in which nothing counts as unknown.
 
         Formulas that account for unknown values themselves are evaluated on this copy.
         """
-        return replace(self, holes=frozenset()) if self.holes else self
+        return replace(self, holes=frozenset(), computed=False)
+
+    def sides(self, formula: ir.Formula) -> tuple[ir.Formula, ir.Formula]:
+        """Return two formulas, for a lower and an upper bound on `formula`, to be evaluated on `sure`.
+
+        Both are `formula` itself if no value that it reads can be unknown.
+        """
+        if not self.holes and not (self.computed and partial(formula)):
+            return formula, formula
+        least = unsure(formula, self.holes, least=True, computed=self.computed)
+        most = unsure(formula, self.holes, least=False, computed=self.computed)
+        return (formula, formula) if least == most else (least, most)
 
     @property
     def samples(self) -> int:
@@ -95,23 +108,20 @@ def bounds(
     beyond the trace: "open" computes bounds, "truncate" clips the windows. `stop` is the number of samples in
     the complete trace, if the record contains fewer.
     """
-    if record.holes:
-        least, most = (unsure(formula, record.holes, least=least) for least in (True, False))
-        low, high = bounds(least, record.sure, starts, ends, stop)
-        return low, (high if least == most else bounds(most, record.sure, starts, ends, stop)[1])
-
-    def at(end: Boundary, stop: int | None = None) -> Array:
-        return record.values([formula], starts, end, stop)[0]
-
-    if ends == "truncate":
-        value = at("truncate")
+    least, most = record.sides(formula)
+    end: Boundary | None = "truncate" if ends == "truncate" else None
+    stop = None if end is not None or stop is None or stop <= record.samples else stop
+    if end is None and stop is None and defined(formula, record.samples)[starts.start : starts.stop].all():
+        end = "strict"
+    if end is None:
+        (low,) = record.values([least], starts, "lower", stop)
+        (high,) = record.values([most], starts, "upper", stop)
+        return low, high
+    if least is most:
+        (value,) = record.values([formula], starts, end)
         return value, value
-    if stop is not None and stop > record.samples:
-        return at("lower", stop), at("upper", stop)
-    if defined(formula, record.samples)[starts.start : starts.stop].all():
-        value = at("strict")
-        return value, value
-    return at("lower"), at("upper")
+    low, high = record.values([least, most], starts, end)
+    return low, high
 
 
 def window_bounds(

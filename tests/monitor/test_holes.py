@@ -15,6 +15,7 @@ from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import TraceError
 from stlc.monitor.explain.report import explain
+from stlc.monitor.holes import partial
 from stlc.monitor.online.bounds import TrackingOptions
 from stlc.monitor.online.online import How
 from stlc.monitor.online.trackers import Trackers
@@ -164,3 +165,96 @@ def test_infinite_values_are_refused_with_a_way_out() -> None:
     with pytest.raises(TraceError, match=r"E604.*`x` is inf at sample 1"):
         online.push({"x": np.inf})
     assert online.gaps["x"].samples == 1
+
+
+COMPUTED = {
+    "eventually": "eventually R > 1.5",
+    "always": "always[0 s, 0.3 s] (R < 2 or b > 0)",
+    "windowed": "R > 1 -> eventually[0, T] b > R",
+    "window_to_end": "always[0, T] (R > 1 or eventually[0, end] b > 0)",
+    "since": "(b >= R) since[0.3 s, inf] (R < shift(b, 1 steps))",
+    "frozen": "freeze z = R in eventually[0 s, 0.2 s] b > z",
+    "not": "not (R + b > 1 until[0 s, 0.2 s] b > 1)",
+    "under_a_window": "eventually[0 s, 0.4 s] always R > 0",
+}
+
+
+@pytest.mark.parametrize("name", COMPUTED)
+@settings(max_examples=6, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    samples=st.integers(1, 20),
+    end=st.sampled_from(["open", "truncate"]),
+    tolerance=st.sampled_from([1e-6, 0.0]),
+)
+def test_a_function_outside_of_its_domain_is_a_hole(
+    name: str, seed: int, samples: int, end: Any, tolerance: float
+) -> None:
+    computed, holed = (
+        Monitor(f"signal a\nsignal b\nrequire r: {COMPUTED[name].replace('R', number)}\n", 0.1, 0.6)
+        for number in ("sqrt(a)", "a")
+    )
+    rng = np.random.default_rng(seed)
+    a, b = rng.integers(-1, 5, samples), rng.integers(-16, 16, samples) / 8
+    roots = [np.sqrt(x) if x >= 0 else NAN for x in a]
+    wanted = holed.check({"a": roots, "b": b}, end=end, tolerance=tolerance)["r"]
+    judged = computed.check({"a": a, "b": b}, end=end, tolerance=tolerance)["r"]
+    np.testing.assert_array_equal(judged.low, wanted.low)
+    np.testing.assert_array_equal(judged.high, wanted.high)
+    assert judged.overall == wanted.overall
+    online = computed.online(How(end=end, tolerance=tolerance))
+    decided = [each for k in range(samples) for each in online.push({"a": float(a[k]), "b": float(b[k])})]
+    tally = online.finish()["r"]
+    assert tally.status == judged.overall
+    assert (tally.low, tally.high) == (judged.low.min(), judged.high.min())
+    for each in (early for early in decided if early.start < judged.instants):
+        assert (judged.fails if each.status == "violated" else judged.holds)[each.start, 0]
+
+
+@pytest.mark.parametrize(
+    ("number", "a", "bounds"),
+    [
+        ("(if a < 0 then 0 else sqrt(a))", -1.0, (0.0, 0.0)),
+        ("(if sqrt(a) > 1 then 1 else 2)", -1.0, (-np.inf, np.inf)),
+        ("(if a < 0 or sqrt(a) > 1 then 1 else 2)", -1.0, (1.5, 1.5)),
+        ("ind(a > 0 and log(a) > 1)", -1.0, (0.5, 0.5)),
+        ("ind(log(a) > 1)", -1.0, (-np.inf, np.inf)),
+        ("a / a", 0.0, (-np.inf, np.inf)),
+        ("a % a", 0.0, (-np.inf, np.inf)),
+        ("a ^ 0.5", -1.0, (-np.inf, np.inf)),
+        ("acos(a)", 2.0, (-np.inf, np.inf)),
+        ("exp(a) - exp(a)", 1e4, (-np.inf, np.inf)),
+        ("sqrt(a * a)", -2.0, (2.0, 2.0)),
+    ],
+)
+def test_what_a_number_outside_of_a_domain_is_worth(
+    number: str, a: float, bounds: tuple[float, float]
+) -> None:
+    monitor = Monitor(f"signal a\nrequire r: {number} >= 0\nrequire s: not ({number} < 0)", dt=0.1)
+    verdict = monitor.check({"a": [a]})
+    assert verdict["r"].bounds == verdict["s"].bounds == bounds
+    online = monitor.online()
+    online.push({"a": a})
+    assert [(tally.low, tally.high) for tally in online.finish().values()] == [bounds, bounds]
+    wanted = bounds[0] if bounds[0] == bounds[1] else NAN
+    np.testing.assert_array_equal(monitor.requirement_robustness({"a": [a]})["r"], [wanted])
+
+
+def test_a_cause_beside_a_number_outside_of_a_domain() -> None:
+    monitor = Monitor("signal a\nsignal b\nrequire r: freeze z = sqrt(a) in always (b > z or b > 1)", dt=0.1)
+    verdict = monitor.check({"a": [4.0, -1.0], "b": [3.0, 0.5]})
+    cause = explain(verdict, "r")
+    assert verdict.overall == "violated"
+    assert cause is not None
+    assert cause.sample == 1
+    assert explain(monitor.check({"a": [-4.0, -1.0], "b": [3.0, 0.5]}), "r") is None
+
+
+def test_which_formulas_call_a_function_outside_of_its_domain() -> None:
+    def is_partial(number: str) -> bool:
+        monitor = Monitor(f"signal a\nsignal b\nrequire r: {number} > 0", dt=0.1)
+        return partial(monitor.compiled.requirements[0].formula)
+
+    assert all(map(is_partial, ["sqrt(a)", "a / b", "b % a", "log(a + 1)", "asin(b)", "exp(a)", "a ^ b"]))
+    total = ["a / 2", "a ^ 3", "sqrt(a ^ 2 + b ^ 2)", "b / (abs(a) + 1)", "asin(clip(a, -1, 1))", "tan(a)"]
+    assert not any(map(is_partial, [*total, "norm([a, b])", "exp(-abs(clip(a, -9, 9)))", "a % 2"]))

@@ -136,7 +136,8 @@ def _row(
     elif tally.status == "inconclusive":
         needed = columns(rule.formula)
         why = ", ".join(text for signal, text in gaps.items() if signal in needed)
-        why = why or "the trace is too short to say"
+        short = tally.first + tally.instants - 1 + rule.reach >= online.samples
+        why = why or ("the trace is too short to say" if short else "it has no value where it was judged")
     least = tally.low if tally.status == "inconclusive" else tally.robustness
     return VerdictRow(name, tally.status, value, share, where, why, least, unit)
 

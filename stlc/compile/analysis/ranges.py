@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, Bounds
+from stlc.compile.ir.traverse import leaves
 
 _DEVIATIONS = 3.0
 """Standard deviations around the mean that hold nearly all draws."""
@@ -72,6 +73,21 @@ def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
             return None
         case leaf:
             return facts.get(leaf.name)
+
+
+def has_value(num: ir.Op) -> bool:
+    """True if a function gives a number for all values of the signals that its arguments read.
+
+    False for `sqrt(x)`, which is NaN for x < 0, and for `1 / x`, but not for `sqrt(x^2 + 1)`.
+    """
+    rule = FUNCTIONS[num.name].domain
+    if rule is None:
+        return True
+    facts = {leaf.name: _ANYTHING for leaf in leaves(num) if not isinstance(leaf, ir.Const)}
+    return rule([bounds(arg, facts) or _ANYTHING for arg in num.args])
+
+
+_ANYTHING = (-math.inf, math.inf)
 
 
 def _hull(left: Bounds | None, right: Bounds | None) -> Bounds | None:

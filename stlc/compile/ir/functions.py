@@ -24,6 +24,7 @@ UnitRule: TypeAlias = Literal["same", "mul", "div", "pow", "sqrt", "square", "pl
 FunctionKind: TypeAlias = Literal["operator", "function", "sampler"]
 Bounds: TypeAlias = tuple[float, float]
 RangeRule: TypeAlias = Callable[[Sequence[Bounds]], Bounds]
+DomainRule: TypeAlias = Callable[[Sequence[Bounds]], bool]
 
 SHARED: Final = "shared"
 """Derivative of `min`, `max` and `clip`: operands that are equal share it."""
@@ -60,6 +61,8 @@ class Function:
             name of the function that reduces the results (`norm1` is `abs`, then `add`).
         bounds: range of the result: a constant pair, or a function of the ranges of the arguments that raises
             ValueError, OverflowError or ZeroDivisionError where it is undefined.
+        domain: function from the ranges of the arguments to True if all finite arguments in them give a
+            number, neither NaN nor infinite; None if every argument does, up to overflow.
         exact: whether rational arguments give a rational result.
         whole: whether integer arguments give an integer result.
         integral: whether the result is always an integer.
@@ -81,6 +84,7 @@ class Function:
     slopes: Callable[..., Sequence[str]] | Literal["shared"] | None = None
     of_each: tuple[str, str] | None = None
     bounds: RangeRule | Bounds | None = None
+    domain: DomainRule | None = None
     exact: bool = False
     whole: bool = False
     integral: bool = False
@@ -173,6 +177,39 @@ def _powers(args: Sequence[Bounds]) -> Bounds:
     return _corners(math.pow)(args)
 
 
+# ----------------------------------------------------------------------------------- domains
+
+
+def _divides(args: Sequence[Bounds]) -> bool:
+    low, high = args[1]
+    return low > 0 or high < 0
+
+
+def _has_power(args: Sequence[Bounds]) -> bool:
+    (base, _), (low, high) = args
+    return base > 0 or (low == high >= 0 and low == math.floor(low))
+
+
+def _has_root(args: Sequence[Bounds]) -> bool:
+    return args[0][0] >= 0
+
+
+def _has_logarithm(args: Sequence[Bounds]) -> bool:
+    return args[0][0] > 0
+
+
+def _is_sine(args: Sequence[Bounds]) -> bool:
+    return args[0][0] >= -1 and args[0][1] <= 1
+
+
+def _has_exponential(args: Sequence[Bounds]) -> bool:
+    return max(map(abs, args[0])) < _OVERFLOW
+
+
+_OVERFLOW = 700.0
+"""Magnitude below which the exponential of a number and of its negative are finite."""
+
+
 # --------------------------------------------------------------------------------- the table
 
 
@@ -235,14 +272,21 @@ def _step(name: str, doc: str, fold: Callable[..., Any], kernel: str, c: str, ru
     return _function(name, doc, rule, fold, c, ("0.0",), **flags)
 
 
-def _smooth(name: str, doc: str, slope: str, bounds: RangeRule | Bounds | None, kernel: str = "") -> Function:
+def _smooth(
+    name: str,
+    doc: str,
+    slope: str,
+    bounds: RangeRule | Bounds | None,
+    kernel: str = "",
+    domain: DomainRule | None = None,
+) -> Function:
     """Return the table entry of a smooth function of one argument.
 
     `slope` is the C expression of its derivative, in the argument `{0}` and the result `{r}`. `kernel` is the
-    name of the function in NumPy, if it differs from `name`.
+    name of the function in NumPy, if it differs from `name`. `domain` is as in `Function`.
     """
-    fold, c = getattr(math, name), f"{name}({{0}})"
-    return _function(name, doc, "plain", fold, c, (slope,), bounds, numpy=kernel or name, torch=name)
+    fold, c, numpy = getattr(math, name), f"{name}({{0}})", kernel or name
+    return _function(name, doc, "plain", fold, c, (slope,), bounds, domain=domain, numpy=numpy, torch=name)
 
 
 def _variadic(name: str, doc: str, fold: Callable[..., Any], bounds: RangeRule, **rest: Any) -> Function:
@@ -272,6 +316,7 @@ _OPERATORS = (
         "({0} / {1})",
         ("(1.0 / {1})", "(-{r} / {1})"),
         _quotient,
+        domain=_divides,
         whole=False,
     ),
     _operator(
@@ -282,6 +327,7 @@ _OPERATORS = (
         "floored_mod({0}, {1})",
         ("1.0", "(-floor({0} / {1}))"),
         _modulo,
+        domain=_divides,
         numpy="mod",
         torch="remainder",
     ),
@@ -293,6 +339,7 @@ _OPERATORS = (
         "pow({0}, {1})",
         ("({1} * pow({0}, {1} - 1.0))", "({0} > 0.0 ? {r} * log({0}) : 0.0)"),
         _powers,
+        domain=_has_power,
         whole=False,
     ),
     _operator("neg", "-", "same", operator.neg, "(-{0})", ("(-1.0)",), linear=True),
@@ -383,24 +430,44 @@ _FUNCTIONS = (
         math.sqrt,
         "sqrt({0})",
         ("({r} > 0.0 ? 0.5 / {r} : 0.0)",),
+        domain=_has_root,
         numpy="sqrt",
     ),
-    _smooth("exp", "`exp(x)` of a plain number.", "{r}", None),
-    _smooth("log", "`log(x)`: the natural logarithm of a plain number.", "(1.0 / {0})", None),
+    _smooth("exp", "`exp(x)` of a plain number.", "{r}", None, domain=_has_exponential),
+    _smooth(
+        "log",
+        "`log(x)`: the natural logarithm of a plain number.",
+        "(1.0 / {0})",
+        None,
+        domain=_has_logarithm,
+    ),
     _smooth(
         "log10",
         "`log10(x)`: the logarithm of a plain number to the base 10.",
         f"({1.0 / math.log(10.0)!r} / {{0}})",
         None,
+        domain=_has_logarithm,
     ),
     _smooth("sin", "`sin(x)` of an angle.", "cos({0})", (-1.0, 1.0)),
     _smooth("cos", "`cos(x)` of an angle.", "(-sin({0}))", (-1.0, 1.0)),
     _smooth("tan", "`tan(x)` of an angle.", "(1.0 + {r} * {r})", (-math.inf, math.inf)),
-    _smooth("sinh", "`sinh(x)`: the hyperbolic sine of a plain number.", "cosh({0})", None),
-    _smooth("cosh", "`cosh(x)`: the hyperbolic cosine of a plain number.", "sinh({0})", _catenary),
+    _smooth(
+        "sinh",
+        "`sinh(x)`: the hyperbolic sine of a plain number.",
+        "cosh({0})",
+        None,
+        domain=_has_exponential,
+    ),
+    _smooth(
+        "cosh",
+        "`cosh(x)`: the hyperbolic cosine of a plain number.",
+        "sinh({0})",
+        _catenary,
+        domain=_has_exponential,
+    ),
     _smooth("tanh", "`tanh(x)`: the hyperbolic tangent of a plain number.", "(1.0 - {r} * {r})", (-1.0, 1.0)),
-    _smooth("asin", "`asin(x)`: an angle.", "(1.0 / sqrt(1.0 - {0} * {0}))", None, "arcsin"),
-    _smooth("acos", "`acos(x)`: an angle.", "(-1.0 / sqrt(1.0 - {0} * {0}))", None, "arccos"),
+    _smooth("asin", "`asin(x)`: an angle.", "(1.0 / sqrt(1.0 - {0} * {0}))", None, "arcsin", _is_sine),
+    _smooth("acos", "`acos(x)`: an angle.", "(-1.0 / sqrt(1.0 - {0} * {0}))", None, "arccos", _is_sine),
     _smooth("atan", "`atan(x)`: an angle.", "(1.0 / (1.0 + {0} * {0}))", None, "arctan"),
     _function(
         "atan2",

@@ -37,7 +37,7 @@ from stlc.compile.ir.traverse import (
     substitute_frozen,
 )
 from stlc.compile.lowering.lower import lower
-from stlc.monitor.holes import KNOWN, unsure
+from stlc.monitor.holes import KNOWN
 from stlc.monitor.values import Record, assume_missing_true, bounds
 from stlc.source import Span
 
@@ -336,12 +336,12 @@ class CauseFinder:
         values: dict[str, ir.Num] = {}
         last = self.record.samples - 1
         for name, num in formula.bindings:
+            values[name] = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
             given = columns_of(num) <= self.record.env.keys()
             if given and sample <= last and defined(ir.Predicate(num), last + 1)[sample]:
-                value, _ = bounds(ir.Predicate(num), self.record, range(sample, sample + 1), "open")
-                values[name] = ir.Const(float(value[0, 0]))
-            else:
-                values[name] = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
+                low, high = bounds(ir.Predicate(num), self.record, range(sample, sample + 1), "open")
+                if low[0, 0] == high[0, 0]:
+                    values[name] = ir.Const(float(low[0, 0]))
         return values
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
@@ -354,7 +354,7 @@ class CauseFinder:
         if key not in self.cache:
             goal = formula if wanted else typed.Not(formula.span, formula)
             given = assume_missing_true(lower(goal, self.grid, []), self.record.env)
-            self.cache[key] = unsure(given, self.record.holes, least=False) if self.record.holes else given
+            self.cache[key] = self.record.sides(given)[1]
         return self.cache[key]
 
     def _margins(self, formula: typed.Formula, wanted: bool, instants: range) -> Floats:

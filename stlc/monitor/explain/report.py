@@ -120,7 +120,8 @@ def _cause(
 ) -> Cause:
     rule, (trace, start) = judgement.rule, judgement.worst if at is None else at
     one_trace = {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()}
-    record = Record(one_trace, subject.record.ops, holes=subject.record.holes)
+    given = subject.record
+    record = Record(one_trace, given.ops, holes=given.holes, computed=given.computed)
     window = window_of(rule, subject.horizon)
     stop = None if window is None else start + window + 1
     record = record if stop is None else record.cut(stop)

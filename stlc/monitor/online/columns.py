@@ -23,7 +23,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns as names_of_columns
 from stlc.compile.schedule.schedule import TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact
-from stlc.monitor.holes import holes_in, unsure, without_holes
+from stlc.monitor.holes import holes_in, partial, unsure, without_holes
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.streams import (
     ColumnPlan,
@@ -70,7 +70,8 @@ class ColumnReader:
         self.formulas = tuple(formulas)
         self.end = end
         self.back = back
-        self._unsure: dict[tuple[frozenset[str], bool], ColumnReader] = {}
+        self._partial = any(map(partial, self.formulas))
+        self._unsure: dict[tuple[frozenset[str], bool | None], ColumnReader] = {}
         self._stop = FAR if going_on else None
         self.names = frozenset().union(*map(names_of_columns, self.formulas))
         self._known: dict[tuple[int, int, int], ArrayPlan] = {}
@@ -98,29 +99,32 @@ class ColumnReader:
     ) -> list[Floats]:
         """Return bounds on each formula at `count` rows, the first of which is `start`.
 
-        The bounds hold for all values that the unknown entries (NaN) of the columns may have. `least` selects
-        the lower (True) or the upper (False) bound, (count, traces). If `least` is None, the columns have one
-        trace, and both bounds are returned side by side, (count, 2).
+        The bounds hold for all values that the unknown entries (NaN) of the columns may have, and functions
+        outside of their domains. `least` selects the lower (True) or the upper (False) bound, (count,
+        traces). If `least` is None, the columns have one trace, and both bounds are returned side by side,
+        (count, 2).
         """
         rows = {name: env[name] for name in self.names}
         near = {name: values[max(start - self.back, 0) :] for name, values in rows.items()}
         holes = holes_in(near)
-        if not holes:
+        if not holes and not self._partial:
             return self(env, start, count)
-        known = {**env, **without_holes(rows, holes)}
+        found = self._sides(holes, least)({**env, **without_holes(rows, holes)}, start, count)
         if least is not None:
-            return self._sides(holes, least=least)(known, start, count)
-        both = (self._sides(holes, least=end)(known, start, count) for end in (True, False))
+            return found
+        both = found[: len(self.formulas)], found[len(self.formulas) :]
         return [np.concatenate(pair, axis=1) for pair in zip(*both, strict=True)]
 
-    def _sides(self, holes: frozenset[str], *, least: bool) -> ColumnReader:
+    def _sides(self, holes: frozenset[str], least: bool | None) -> ColumnReader:
         """Return an evaluator of bounds on all formulas: of lower bounds if `least`, else of upper bounds.
 
-        The columns named in `holes` contain unknown values.
+        If `least` is None, it evaluates all lower bounds, and then all upper bounds. The columns named in
+        `holes` contain unknown values.
         """
         key = (holes, least)
         if key not in self._unsure:
-            formulas = [unsure(formula, holes, least=least) for formula in self.formulas]
+            sides = (True, False) if least is None else (least,)
+            formulas = [unsure(formula, holes, least=side) for side in sides for formula in self.formulas]
             self._unsure[key] = ColumnReader(formulas, self.end, going_on=self._stop is not None)
         return self._unsure[key]
 

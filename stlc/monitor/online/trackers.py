@@ -16,7 +16,6 @@ from stlc.compile.ir.support import history, reach, uses_end
 from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.monitor.holes import unsure
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.online.bounds import Ending, Floats, RobustnessBounds, Tracker, TrackingOptions
 from stlc.monitor.online.columns import Beyond, ColumnPlans, ColumnReader, End, Side, shareable
@@ -557,8 +556,7 @@ class RecomputeTracker(_CutTracker):
             if self._long[0] != self.samples:
                 self._long = self.samples, lengthened(lower, self.samples), lengthened(upper, self.samples)
             least, most = self._long[1:]
-            if record.holes:
-                least, most = unsure(least, record.holes, least=True), unsure(most, record.holes, least=False)
+            least, most = record.sides(least)[0], record.sides(most)[1]
             low = record.values([least], starts, "lower", FAR)[0]
             high = record.values([most], starts, "upper", FAR)[0]
             return np.asarray(low), np.asarray(high)

@@ -8,6 +8,7 @@ an array library, and each call executes them in order.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -241,7 +242,7 @@ class _TapeWriter(NumberEvaluator[Operand]):
     def _choice(self, cond: ir.Formula, yes: Operand, no: Operand) -> Operand:
         if type(yes) is type(no) and yes == no:
             return yes
-        if isinstance(yes, float) and isinstance(no, float):
+        if isinstance(yes, float) and isinstance(no, float) and math.isfinite(yes - no):
             return self.tape.add(self.tape.mul(self._indicator(cond, None), yes - no), no)
         choice = self._truth(cond) if self._exact else self._weight(cond, None)
         if isinstance(choice, (bool, float)):
