@@ -19,6 +19,8 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
+from stlc.compile.schedule.schedule import IndexRange, TraceDomain, spanning
+from stlc.diagnostics import TraceError
 
 Env = dict[str, np.ndarray]
 
@@ -137,3 +139,30 @@ def test_gradients_are_central_differences(formula: typed.Formula, seed: int) ->
             slope = (value(name, t, 1e-6) - value(name, t, -1e-6)) / 2e-6
             own = 0.0 if tensor.grad is None else tensor.grad[t, 0].item()
             assert own == pytest.approx(slope, abs=1e-6)
+
+
+def test_instants_beyond_the_trace_are_not_counted_one_by_one() -> None:
+    """Two bound values, one of them defined a sample longer; everything after is one call."""
+    asked: list[tuple[int, int]] = []
+
+    def judge(_: ir.Formula, env: Env, run: IndexRange, __: TraceDomain) -> np.ndarray:
+        asked.append((run.start, run.last))
+        return np.zeros((run.count if run.count < 10 else 1, next(iter(env.values())).shape[1]))
+
+    later = ir.ShiftedSignal("x", 1)
+    body = ir.Predicate(ir.Op("sub", (ir.FrozenVar("y"), ir.FrozenVar("z"))))
+    node = ir.Freeze((("y", ir.Signal("x")), ("z", later)), body)
+    env = {"x": np.zeros((5, 1))}
+    freezer = frozen.Freezer(TraceDomain(5, "lower"), env, NUMPY, judge)
+    freezer.values(node, spanning(3, 1 << 40))
+    assert asked[-1] == (5, (1 << 40) + 2)
+    assert len(asked) == 3
+
+
+def test_a_freeze_inside_another_looks_no_farther_than_a_formula_may() -> None:
+    far = ir.Window(0, 1 << 40)
+    later = ir.Predicate(ir.Op("sub", (ir.Signal("x"), ir.FrozenVar("y"))))
+    inner = ir.Freeze((("y", ir.Signal("x")),), ir.Temporal("eventually", ir.Window(0, 2), later))
+    node = ir.Freeze((("z", ir.Signal("x")),), ir.Temporal("always", far, inner))
+    with pytest.raises(TraceError, match="E306"):
+        evaluate([node], {"x": np.zeros((5, 1))}, ops=NUMPY, end="lower")

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from stlc.compile.backends.array.graph import MAX_BEYOND, evaluate, planned
+from stlc.compile.backends.array.graph import evaluate, planned
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.array.steps import MAX_BEYOND
 from stlc.compile.ir import nodes as ir
 from stlc.compile.schedule import schedule
 from stlc.compile.schedule.schedule import TraceDomain, spanning

@@ -11,8 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import groupby
+from itertools import pairwise
 from typing import TypeAlias, final
 
 import numpy as np
@@ -69,25 +68,20 @@ class Freezer:
         this value is unknown if the trace is open (continues beyond its last sample). Otherwise the predicate
         is false, and its negation is true.
         """
-        for missing, instants in groupby(
-            range(run.start, run.start + run.count), partial(self._undefined, node)
-        ):
-            first, *more = instants
-            kept = tuple((name, num) for name, num in node.bindings if name not in missing)
+        if run.count <= 0:
+            return
+        known = {name: within(reads(num, self.domain), run, self.domain) for name, num in node.bindings}
+        starts = {edge for its in known.values() for edge in (its.start, its.last + 1) if its.count > 0}
+        edges = sorted({run.start, *starts, run.last + 1})
+        for part in (IndexRange(start, stop - 1) for start, stop in pairwise(edges)):
+            there = {name for name, its in known.items() if its.start <= part.start <= its.last}
+            missing = frozenset(known) - there
+            kept = tuple((name, num) for name, num in node.bindings if name in there)
             body = without(node.body, missing, self.domain)
             if kept:
-                yield from self._bound(
-                    replace(node, bindings=kept, body=body), spanning(first, 1 + len(more))
-                )
+                yield from self._bound(replace(node, bindings=kept, body=body), part)
             else:
-                yield self.judge(body, self.env, spanning(first, 1 + len(more)), self.domain)
-
-    def _undefined(self, node: ir.Freeze, instant: int) -> frozenset[str]:
-        """Names of the values that `freeze` cannot bind at `instant`: they need samples outside the trace."""
-        domain, run = self.domain, spanning(instant, 1)
-        return frozenset(
-            name for name, num in node.bindings if within(reads(num, domain), run, domain).count <= 0
-        )
+                yield self.judge(body, self.env, part, self.domain)
 
     def _bound(self, node: ir.Freeze, run: IndexRange) -> Iterator[Array]:
         back, ahead = _neighbourhood(node.body)

@@ -22,14 +22,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.schedule.schedule import Boundary, End, IndexRange, TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
-from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Signature
-
-MAX_BEYOND = 1 << 24
-"""Maximum number of instants beyond the last sample, summed over all sub-formulas."""
-
-MAX_VALUES = 1 << 27
-"""Maximum number of values beyond the last sample over all traces: a gigabyte."""
 
 
 def evaluate(
@@ -89,7 +82,7 @@ def evaluate_parts(
     """
     windows = Windows(Exact(), ops)
     plan = planned((formula,), spanning(instants.start, len(instants)), _domain(env, end, windows, stop))
-    for step, values in zip(plan.schedule.steps, _checked(plan, env, windows), strict=True):
+    for step, values in zip(plan.schedule.steps, all_values(plan, env, windows), strict=True):
         yield step.node, range(step.run.start, step.run.last + 1), values
 
 
@@ -154,37 +147,8 @@ def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list
         TraceError: E306, a lower or upper bound on the robustness needs values at too many instants beyond
             the trace.
     """
-    values = _checked(plan, env, windows)
+    values = all_values(plan, env, windows)
     return [values[root] for root in plan.schedule.roots]
-
-
-def _checked(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps of an evaluation plan, `(instants, batch)` each.
-
-    A step is one sub-formula at a range of instants.
-
-    Raises:
-        TraceError: E306, more than `MAX_BEYOND` instants or more than `MAX_VALUES` values lie beyond the
-            trace.
-    """
-    batch = math.prod(next(iter(env.values())).shape[1:])
-    if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * batch > MAX_VALUES):
-        raise TraceError(_too_far(plan))
-    return all_values(plan, env, windows)
-
-
-def _too_far(plan: ArrayPlan) -> Diagnostic:
-    """Return finding E306: a formula needs values at too many instants beyond the trace."""
-    step = max(plan.schedule.steps, key=lambda step: step.run.last)
-    return Diagnostic(
-        "E306",
-        f"this looks {step.run.last - plan.schedule.domain.samples + 1:,} samples beyond the last one",
-        step.node.span,
-        help=(
-            "record more, or shorten the intervals: a trace that ends so early says nothing certain here",
-            "`--end truncate` evaluates on what there is",
-        ),
-    )
 
 
 class Weighed(Protocol):

@@ -33,12 +33,19 @@ from stlc.compile.schedule.schedule import (
     spanning,
     within,
 )
+from stlc.diagnostics import Diagnostic, TraceError
 
 Kernel: TypeAlias = Callable[[Sequence[Array], Array], Array]
 """Existing operand values, and any column for shape, dtype and device -> `(count, batch)`."""
 
 Runner: TypeAlias = Callable[..., Array]
 """Previous values, program outputs, columns, and any column for shape, dtype and device -> a step's value."""
+
+MAX_BEYOND = 1 << 24
+"""Maximum number of instants beyond the last sample, summed over all sub-formulas."""
+
+MAX_VALUES = 1 << 27
+"""Maximum number of values beyond the last sample over all traces: a gigabyte."""
 
 _ENDLESS = 1 << 60
 """Width of a window to the end of the trace, in rows."""
@@ -329,8 +336,14 @@ def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> l
     """Return the values of all steps of an evaluation plan, `(count, batch)` each.
 
     A step is one sub-formula at a range of instants. `env` maps a signal name to an array `(time, batch)`.
+
+    Raises:
+        TraceError: E306, more than `MAX_BEYOND` instants or more than `MAX_VALUES` values lie beyond the
+            trace.
     """
     ops, like = windows.ops, next(iter(env.values()))
+    if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * math.prod(like.shape[1:]) > MAX_VALUES):
+        raise TraceError(_too_far(plan))
     runners = plan.runners.get(windows)
     if runners is None:
         machine = Machine(plan.schedule.domain, windows)
@@ -341,6 +354,20 @@ def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> l
     for runner in runners:
         values.append(runner(values, outputs, env, like))
     return values
+
+
+def _too_far(plan: ArrayPlan) -> Diagnostic:
+    """Return finding E306: a formula needs values at too many instants beyond the trace."""
+    step = max(plan.schedule.steps, key=lambda step: step.run.last)
+    return Diagnostic(
+        "E306",
+        f"this looks {step.run.last - plan.schedule.domain.samples + 1:,} samples beyond the last one",
+        step.node.span,
+        help=(
+            "record more, or shorten the intervals: a trace that ends so early says nothing certain here",
+            "`--end truncate` evaluates on what there is",
+        ),
+    )
 
 
 def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
