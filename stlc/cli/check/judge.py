@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 End = Literal["open", "strict", "truncate"]
 
+_DIGITS = 18
+"""Digits of the greatest sample number."""
+_SHOWN = 40
+"""Characters of a text that a message shows."""
 _INSTANT = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
 
 
@@ -242,22 +246,23 @@ def instant_of(text: str | None, name: str, dt: float, t0: float, samples: int |
     if text is None or text == "all":
         return "all" if text else None
     match = _INSTANT.fullmatch(text.strip())
+    shown = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
     help_ = "a sample (0, 46), a time (4.6s) or all"
     if match is None:
-        raise usage(f"`--at {text}` is not an instant", help_)
+        raise usage(f"`--at {shown}` is not an instant", help_)
     if not match["unit"]:
-        if not match["number"].isdigit():
-            raise usage(f"`--at {text}` is not a whole number of samples", help_)
+        if not match["number"].isdigit() or len(match["number"]) > _DIGITS:
+            raise usage(f"`--at {shown}` is not a whole number of samples", help_)
         return int(match["number"])
     if not dt:
         raise usage(
-            f"`--at {text}` is a time, and `{name}` has no time step", "a number counts samples: --at 46"
+            f"`--at {shown}` is a time, and `{name}` has no time step", "a number counts samples: --at 46"
         )
     steps = (_seconds("--at", text, help_) - t0) / dt
     sample = round(steps) if math.isfinite(steps) else -1
     if abs(steps - sample) > 0.01 or sample < 0 or (samples is not None and sample >= samples):
         last = "" if samples is None else f" to {t0 + (samples - 1) * dt:g} s"
-        raise usage(f"`{name}` has no sample at {text}", f"it runs from {t0:g} s{last} every {dt:g} s")
+        raise usage(f"`{name}` has no sample at {shown}", f"it runs from {t0:g} s{last} every {dt:g} s")
     return sample
 
 

@@ -193,7 +193,7 @@ def test_at(at: str, code: int) -> None:
     assert check(saved(bad_drive()), "-q", "--at", at) == code
 
 
-@pytest.mark.parametrize("at", ["x", "-1", "99", "9.9s", "0.55s", "1 m", "1.5", "1 q"])
+@pytest.mark.parametrize("at", ["x", "-1", "99", "9.9s", "0.55s", "1 m", "1.5", "1 q", "1" * 5000])
 def test_instants_that_are_none(capsys: pytest.CaptureFixture[str], at: str) -> None:
     assert check(saved(drive()), f"--at={at}") == 2
     assert "error[U101]" in capsys.readouterr().err
