@@ -18,7 +18,7 @@ from stlc.diagnostics import Diagnostic, TraceError
 from stlc.jsontext import loads
 from stlc.trace.enums import instant_of_word, number_of_word
 from stlc.trace.formats.cells import bare, value_of
-from stlc.trace.formats.csv import delimiter_of, head_cells, split_head
+from stlc.trace.formats.csv import delimiter_of, filled, head_cells, split_head
 from stlc.trace.formats.table import OneTrace, clock_scale, group_among
 from stlc.trace.recording import CLOCK, absent, clock_among
 from stlc.trace.resample import FIRST, MAX_SAMPLES, Spacing, usual_step, values_on
@@ -78,7 +78,7 @@ class SampleStream:
         self._only = OneTrace(self.name)
 
     def moments(self, lines: Iterable[bytes]) -> Iterator[TimedSample]:
-        """Yield one sample per line; empty lines are skipped.
+        """Yield one sample per line; empty lines, and lines of empty cells, are skipped.
 
         Raises:
             TraceError: E601, a requested signal or time column is missing; E603, a line is not a sample, or a
@@ -96,7 +96,7 @@ class SampleStream:
                 yield self._object(text, number)
             elif not self._heads:
                 self._header(text, number)
-            else:
+            elif filled(text, self._delimiter):
                 yield self._row(text, number)
 
     def _text(self, raw: bytes, number: int) -> str:

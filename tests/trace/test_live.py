@@ -37,3 +37,8 @@ def test_several_traces_are_not_taken_for_one(name: str) -> None:
 @pytest.mark.parametrize("text", ["trace,x\n1,1\n1.0,9\n", '{"trace": null, "x": 1}\n{"trace": 1, "x": 9}\n'])
 def test_the_name_of_the_one_trace_is_no_signal(text: str) -> None:
     assert samples_of(text, Reading(dt=1.0)) == [{"x": 1.0}, {"x": 9.0}]
+
+
+def test_lines_of_empty_cells_are_skipped() -> None:
+    found = samples_of("t,x\n0,1\n,\n , \n1,2\n", Reading())
+    assert found == [{"x": 1.0}, {"x": 2.0}]

@@ -274,7 +274,8 @@ def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> l
         return None
     numbers = [i for i in range(width) if i not in texts]
     values = load(body, sheet.delimiter, numbers if texts else None)
-    words = [line.split(sheet.delimiter) for line in body.split("\n") if texts and _filled(line, sheet)]
+    lines = [line for line in body.split("\n") if texts and filled(line, sheet.delimiter)]
+    words = [line.split(sheet.delimiter) for line in lines]
     if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
         return None
     columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
@@ -282,9 +283,9 @@ def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> l
     return [columns[i] for i in range(width)]
 
 
-def _filled(line: str, sheet: _Sheet) -> bool:
+def filled(line: str, delimiter: str) -> bool:
     """True if any cell of a line is not empty."""
-    return bool(line.strip(f" \t{sheet.delimiter}"))
+    return bool(line.strip(f" \t{delimiter}"))
 
 
 def _read_strict(
@@ -293,7 +294,7 @@ def _read_strict(
     """Read the lines of a block cell by cell, and append the location of every error to `findings`."""
     rows: list[list[float | str]] = []
     for line in sheet.source.text[start:end].removesuffix("\n").split("\n"):
-        if _filled(line, sheet):
+        if filled(line, sheet.delimiter):
             placed = _placed(sheet.source, start, line.split(sheet.delimiter))
             cells = [(bare(raw), span) for raw, span in placed]
             rows.append(_read_row(sheet, cells, width, texts, findings))
