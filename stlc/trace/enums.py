@@ -94,11 +94,12 @@ def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
 
 
 def instant_of_word(word: str) -> np.datetime64 | None:
-    """Return the date and time (ISO 8601) in a word; None if the word is not a date."""
+    """Return the date and time (ISO 8601) in a word; None if the word is not a date, or not a time (NaT)."""
     try:
-        return np.datetime64(word.rstrip("Zz"), "ns")
+        instant = np.datetime64(word.rstrip("Zz"), "ns")
     except ValueError:
         return None
+    return None if np.isnat(instant) else instant
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:

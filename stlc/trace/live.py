@@ -27,6 +27,7 @@ from stlc.trace.time_grid import (
     NO_STEP,
     TOLERANCE,
     gap_advice,
+    require_span,
     require_step,
     resample_advice,
     snapped,
@@ -197,8 +198,8 @@ class SampleStream:
 
     def _seconds(self, value: object, number: int) -> float:
         found = _plain(value)
-        if found is not None and math.isfinite(found):
-            return found * self._scale
+        if found is not None and math.isfinite(seconds := found * self._scale):
+            return seconds
         if isinstance(value, str) and found is None:
             instant = instant_of_word(value)
             if instant is not None:
@@ -294,6 +295,7 @@ def _steady(first: TimedSample, rest: Iterator[TimedSample], dt: float | None, n
     if not step > 0:
         message = f"time in the {name} does not increase: {first.time:g} s, {second.time:g} s"
         raise TraceError(Diagnostic("E602", message))
+    require_step(name, step)
     return Uniform(first.time, step, _checked(first, second, rest, step, name, measured=dt is None))
 
 
@@ -323,7 +325,7 @@ def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) 
     if now is None:
         return ()
     missed = (now - wanted) / step
-    if missed > 0.5 and abs(missed - round(missed)) <= TOLERANCE:
+    if 0.5 < missed < math.inf and abs(missed - round(missed)) <= TOLERANCE:
         return (gap_advice(step),)
     advice = ("--dt TIME  says what the step is; without it the first two samples do",) if measured else ()
     return (resample_advice(step), *advice)
@@ -418,6 +420,7 @@ class Gridded:
             raise TraceError(Diagnostic("E602", message))
         if not self._came:
             self.t0 = time
+        require_span(self.name, self.t0, time)
         self._came, self._last = self._came + 1, time
         for signal, value in moment.sample.items():
             if signal not in self._tracks:
@@ -446,7 +449,8 @@ class Gridded:
 
     def _rest(self) -> Iterator[Sample]:
         """Yield the remaining samples on the time grid at the end of the stream."""
-        count = math.floor((self._last - self.t0) / self.dt + self._slack / self.dt) + 1
+        steps = (self._last - self.t0) / self.dt + self._slack / self.dt
+        count = math.floor(min(steps, MAX_SAMPLES)) + 1
         yield from self._upto(lambda grid: np.ones(len(grid), dtype=np.bool_), count, self._last)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from fractions import Fraction
 from typing import Any
@@ -104,13 +105,25 @@ def require_same_step(name: str, found: float, said: float) -> None:
         raise TraceError(Diagnostic("E602", message, help=help_))
 
 
+def require_span(name: str, first: float, last: float) -> None:
+    """Raise TraceError (E602) if the time between two samples is too long for a number."""
+    if not math.isfinite(last - first):
+        message = f"time in `{name}` runs from {first:g} s to {last:g} s, which is too long to be measured"
+        raise TraceError(Diagnostic("E602", message))
+
+
 def check_finite(name: str, times: Floats) -> None:
-    """Raise TraceError if there are no times (E605), or if any of them is not finite (E604)."""
+    """Check the times of a trace, and the time between the earliest and the latest.
+
+    Raises TraceError if there are no times (E605), if any of them is not finite (E604), or if they are too
+    far apart (E602).
+    """
     if not len(times):
         raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
     bad = np.flatnonzero(~np.isfinite(times))
     if len(bad):
         raise TraceError(Diagnostic("E604", f"time in `{name}` is {times[bad[0]]} at t[{bad[0]}]"))
+    require_span(name, float(times.min()), float(times.max()))
 
 
 def _step(name: str, times: Floats, dt: float | None) -> float:

@@ -39,6 +39,35 @@ def test_the_name_of_the_one_trace_is_no_signal(text: str) -> None:
     assert samples_of(text, Reading(dt=1.0)) == [{"x": 1.0}, {"x": 9.0}]
 
 
+GRIDS = [Reading(), Reading(dt=1.0), Reading(resample=1.0), Reading(max_gap=1.0)]
+
+
+@pytest.mark.parametrize("reading", GRIDS)
+@pytest.mark.parametrize("times", [("NaT", "NaT", "2026-01-01"), ("2026-01-01", "NaT", "2026-01-03")])
+def test_a_time_that_is_none_is_refused(times: tuple[str, ...], reading: Reading) -> None:
+    rows = [f"{time},{k}" for k, time in enumerate(times)]
+    assert code_of("\n".join(["t,x", *rows]), reading) == "E603"
+
+
+@pytest.mark.parametrize("reading", GRIDS)
+@pytest.mark.parametrize("times", [(-1e308, 1e308), (-1e308, -1e308, 1e308)])
+def test_times_that_are_too_far_apart(times: tuple[float, ...], reading: Reading) -> None:
+    assert code_of("\n".join(["t,x", *(f"{time!r},1" for time in times)]), reading) == "E602"
+
+
+@pytest.mark.parametrize("reading", [Reading(), Reading(max_gap=1.0)])
+def test_times_that_are_too_close(reading: Reading) -> None:
+    assert code_of("t,x\n0,1\n1e-20,1\n2e-20,1\n", reading) == "E602"
+
+
+def test_a_grid_that_is_too_fine() -> None:
+    assert code_of("t,x\n0,1\n1e300,1\n", Reading(resample=1e-15)) == "E605"
+
+
+def test_a_time_that_is_infinite_in_seconds() -> None:
+    assert code_of("t [h],x\n0,1\n1e308,1\n", Reading()) == "E603"
+
+
 def test_lines_of_empty_cells_are_skipped() -> None:
     found = samples_of("t,x\n0,1\n,\n , \n1,2\n", Reading())
     assert found == [{"x": 1.0}, {"x": 2.0}]

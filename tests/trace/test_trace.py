@@ -627,3 +627,10 @@ def test_a_csv_of_empty_cells_is_a_diagnostic(tmp_path: Path) -> None:
     (tmp_path / "gaps.csv").write_text("t,x\n,\n,\n,,")
     with pytest.raises(TraceError):
         load_trace(tmp_path / "gaps.csv")
+
+
+@pytest.mark.parametrize("reading", [Reading(), Reading(resample=1.0)])
+def test_times_that_are_too_far_apart(tmp_path: Path, reading: Reading) -> None:
+    (tmp_path / "a.csv").write_text("t,x\n-1e308,1\n1e308,1\n")
+    with pytest.raises(TraceError, match="too long to be measured"):
+        load_trace(tmp_path / "a.csv", reading)
