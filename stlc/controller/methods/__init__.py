@@ -248,10 +248,12 @@ class Learner(ABC):
         """Find the cause of a step whose loss or gradient was not finite on at least one rank (process).
 
         Returns:
-            The error that describes the cause; and whether the weights before the step gave finite plans.
+            The error that describes the cause; and whether the present weights are those before the step and
+            give finite plans, so that they may be saved. By default they may not: a step of several updates
+            has made some of them by the time its loss is known.
         """
         message = f"training diverged: the loss or its gradient is not finite at step {self.step}"
-        return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), True
+        return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), False
 
     def torch_reasons(self) -> Mapping[str, str]:
         """For each part of the training, the reason why this part runs in torch; "" if it runs in C.

@@ -95,6 +95,11 @@ class ActorLearner(Learner):
         return {"verdicts": reasons["verdicts"]}
 
 
+def finite_weights(network: torch.nn.Module) -> bool:
+    """True if all weights of a network are finite."""
+    return all(bool(torch.isfinite(weight).all()) for weight in network.parameters())
+
+
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
     """State of an optimiser as tensors, whose names begin with `prefix.`."""
     states = optimizer.state_dict()["state"].items()

@@ -22,6 +22,7 @@ from torch import Tensor
 from stlc.controller.methods._actor import (
     ActorLearner,
     ActorPolicy,
+    finite_weights,
     optimizer_tensors,
     restore_optimizer,
 )
@@ -33,7 +34,6 @@ from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.diagnostics import StlcError
 
 SAMPLED = 4096
 """Initial states for the scale of the observations."""
@@ -223,8 +223,22 @@ class SacLearner(ActorLearner):
         """Play one episode in every environment; after each step of the episodes, make gradient steps.
 
         Returns:
-            The mean loss of the critics; NaN if it is not finite.
+            The mean loss of the critics; NaN if it, or a weight of the actor, is not finite.
         """
+        try:
+            loss = self._played()
+        except ValueError:  # torch refuses to draw from a distribution with NaN
+            if finite_weights(self.model.actor):
+                raise
+            return math.nan
+        if not math.isfinite(loss) or not finite_weights(self.model.actor):
+            return math.nan
+        self.step += 1
+        self.loss = loss
+        return loss
+
+    def _played(self) -> float:
+        """Play and train as `advance` does; return the mean loss of the critics, 0 before the first."""
         model, losses = self.model, []
         with self._random.used():
             for _ in range(self.environments.steps):
@@ -239,21 +253,7 @@ class SacLearner(ActorLearner):
                     model.train(gradient_steps=self.config.updates, batch_size=self.config.batch)
                     losses.append(float(model.logger.name_to_value["train/critic_loss"]))
                     model.logger.name_to_value.clear()
-        loss = sum(losses) / len(losses) if losses else 0.0
-        if not math.isfinite(loss):
-            return math.nan
-        self.step += 1
-        self.loss = loss
-        return loss
-
-    def diagnose(self) -> tuple[StlcError, bool]:
-        """Find the cause of a step whose loss was not finite.
-
-        Returns:
-            The error that describes the cause; and False, since the weights before the step are lost, so that
-            their plans cannot be shown to be finite.
-        """
-        return super().diagnose()[0], False
+        return sum(losses) / len(losses) if losses else 0.0
 
     # ------------------------------------------------------------- checkpoints
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.methods import Method
-from stlc.controller.methods._actor import ActorPolicy
+from stlc.controller.methods._actor import ActorPolicy, finite_weights
 from stlc.controller.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
 from stlc.controller.methods._soft_actor_critic import BOUND, SacOptions, SoftActorCritic, TransitionBatch
 from stlc.controller.options import bounded
@@ -146,8 +146,8 @@ class MbpoLearner(ModelLearner):
         """Simulate one episode per environment; then train actor and critics.
 
         Returns:
-            The mean loss of the critics; NaN if it is not finite, or if the first training of the ensemble
-            diverged.
+            The mean loss of the critics; NaN if it, a weight of the actor, or every imagined transition is
+            not finite, or if the first training of the ensemble diverged.
         """
         before = self.environment_steps
 
@@ -161,12 +161,14 @@ class MbpoLearner(ModelLearner):
             self._normalise()
         fresh = self.config.environments * self.task.horizon
         imagined = self._imagined(max(1, round(self.config.imagined * fresh)))
+        if not len(imagined.rewards):
+            return math.nan
         total = torch.zeros(())
         updates = max(1, round(self.config.updates * fresh))
         for _ in range(updates):
             total += self.actor_critic.learn(self._mixed(imagined), self.generator)
         loss = float(total) / updates
-        if not math.isfinite(loss):
+        if not math.isfinite(loss) or not finite_weights(self.actor_critic.actor):
             return math.nan
         self.step, self.loss = self.step + 1, loss
         return loss

@@ -159,6 +159,22 @@ def test_an_unlearnt_reward_ends_the_training_as_diverged(car_task: Task) -> Non
     assert learner.step == 0
 
 
+@pytest.mark.parametrize("lr", [1e4, 1e8, 1e12])
+def test_weights_of_a_diverged_step_are_not_saved(car_task: Task, lr: float) -> None:
+    """Whether the loss shows it at once, or only the weights do, or no imagined transition is finite."""
+    learner = learner_of(car_task, "mbpo", lr=lr, updates=0.02)
+    for _ in range(8):
+        if math.isnan(learner.advance()):
+            break
+        assert all(bool(weight.isfinite().all()) for weight in learner.policy.network.parameters())
+        learner.settle()
+    else:
+        pytest.fail("it did not diverge")
+    error, good = learner.diagnose()
+    assert error.diagnostics[0].code == "R401"
+    assert not good
+
+
 # ------------------------------------------------------------------ the exact model instead of a learnt one
 
 

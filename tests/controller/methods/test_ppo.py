@@ -114,7 +114,9 @@ def test_a_broken_step_changes_nothing(car_task: Task) -> None:
     assert math.isnan(ppo.advance())
     assert ppo.step == 1
     assert all(torch.equal(value, kept[name]) for name, value in ppo.network.named_parameters())
-    assert ppo.diagnose()[0].diagnostics[0].code == "R401"
+    error, good = ppo.diagnose()
+    assert error.diagnostics[0].code == "R401"
+    assert not good  # a later minibatch may be the broken one
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,17 @@ def test_it_goes_on_bit_for_bit(
     assert torch.equal(Run.open(part["run"]).policy(x), whole.policy(x))
 
 
+def test_a_divergence_is_a_finding(car_task: Task) -> None:
+    """The library itself raises an error for a distribution with NaN."""
+    sac = learner(car_task, updates="2")
+    with torch.no_grad():
+        sac.model.actor.mu.weight.fill_(math.nan)
+    assert math.isnan(sac.advance())
+    assert sac.step == 0
+    error, good = sac.diagnose()
+    assert (error.diagnostics[0].code, good) == ("R401", False)
+
+
 def test_without_the_package(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     monkeypatch.delitem(sys.modules, "stlc.controller.methods._sb3", raising=False)
