@@ -1,7 +1,8 @@
 """Checkpoints: tensors as safetensors, scalars as JSON, and a pointer to the latest checkpoint.
 
-The pointer `ckpt/last.json` is replaced only once `ckpt/step-NNNNNN.safetensors` and its `.json` are
-complete, so a kill or a full disk at any moment leaves the last good checkpoint in place. No pickle is used.
+The pointer `ckpt/last.json` is replaced only once `ckpt/step-NNNNNN-HASH.safetensors` and its `.json` are
+complete, so a kill or a full disk at any moment leaves the last good checkpoint in place. The hash of the
+tensors in the name keeps two checkpoints of one step apart. No pickle is used.
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ FOLDER = "ckpt"
 POINTER = "last.json"
 _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RuntimeError)
 """Errors raised by damaged JSON or tensor files."""
-_NAME = re.compile(r"step-\d{6,}\.safetensors")
+_HASH = 8
+"""Number of digits of the hash in the name of a file."""
+_NAME = re.compile(rf"step-\d{{6,}}(-[0-9a-f]{{{_HASH}}})?\.safetensors")
+"""Names of tensor files; older ones have no hash."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,21 +58,24 @@ def save_checkpoint(
     folder = run.path / FOLDER
     folder.mkdir(exist_ok=True)
     data = save_tensors({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
-    path = folder / f"step-{step:06d}.safetensors"
+    digest = sha256(data)
+    path = folder / f"step-{step:06d}-{digest[:_HASH]}.safetensors"
     write_atomic(path, data)
-    text = json.dumps({**facts, "file": path.name, "sha256": sha256(data)}, indent=1)
+    text = json.dumps({**facts, "file": path.name, "sha256": digest}, indent=1)
     write_atomic(path.with_suffix(".json"), text)
     write_atomic(folder / POINTER, text)
-    for old in folder.glob("step-*"):
-        if old.stem != path.stem:
-            with suppress(OSError):
-                old.unlink()
+    for pattern in ("step-*", ".step-*", ".last.*"):  # the hidden ones are of a save that was killed
+        for old in folder.glob(pattern):
+            if old.stem != path.stem:
+                with suppress(OSError):
+                    old.unlink()
     return path
 
 
 def never_saved(run: RunDir) -> bool:
-    """True if no checkpoint of the run was ever written: it has no folder `ckpt`."""
-    return not (run.path / FOLDER).exists()
+    """True if no checkpoint of the run was ever written, except for a part of the first one."""
+    folder = run.path / FOLDER
+    return not (folder / POINTER).exists() and not any(folder.glob("step-*.json"))
 
 
 def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpoint:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
@@ -11,7 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.training.checkpoint import load_checkpoint, restoring, save_checkpoint
+from stlc.controller.training import checkpoint
+from stlc.controller.training.checkpoint import (
+    load_checkpoint,
+    never_saved,
+    restoring,
+    save_checkpoint,
+)
 from stlc.controller.training.run import load_config
 from stlc.diagnostics import MissingError, RunError
 from stlc.provenance import sha256
@@ -32,15 +39,20 @@ def _value(run: RunDir) -> list[float]:
     return load_checkpoint(run, **HASHES).tensors["w"].tolist()
 
 
+def _tensors(folder: Path) -> Path:
+    return next(folder.glob("step-000001-*.safetensors"))
+
+
 def test_what_is_saved_is_loaded_and_older_ones_go(run: RunDir) -> None:
     save_checkpoint(run, {"w": torch.ones(2)}, {**HASHES, "step": 2}, step=2)
     loaded = load_checkpoint(run, **HASHES)
     assert loaded.facts["step"] == 2
     assert _value(run) == [1.0, 1.0]
+    name = loaded.facts["sha256"][:8]
     assert sorted(path.name for path in (run.path / "ckpt").iterdir()) == [
         "last.json",
-        "step-000002.json",
-        "step-000002.safetensors",
+        f"step-000002-{name}.json",
+        f"step-000002-{name}.safetensors",
     ]
 
 
@@ -66,6 +78,54 @@ def test_a_full_disk_at_any_moment_keeps_the_last_good_one(
     assert not [path for path in (run.path / "ckpt").iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.parametrize("files", [0, 1, 2])
+def test_a_second_save_at_one_step_keeps_the_first_until_it_is_whole(
+    run: RunDir, monkeypatch: pytest.MonkeyPatch, files: int
+) -> None:
+    real, written = checkpoint.write_atomic, itertools.count()
+
+    def killed(path: Path, data: bytes | str) -> None:
+        if next(written) >= files:
+            raise KeyboardInterrupt
+        real(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "write_atomic", killed)
+        with pytest.raises(KeyboardInterrupt):
+            save_checkpoint(run, {"w": torch.zeros(1)}, HASHES, step=1)
+    assert _value(run) == [0.0, 1.0, 2.0]
+    save_checkpoint(run, {"w": torch.zeros(1)}, HASHES, step=1)
+    assert _value(run) == [0.0]
+    assert len(list((run.path / "ckpt").iterdir())) == 3
+
+
+def test_checkpoints_without_a_hash_in_their_names_are_loaded(run: RunDir) -> None:
+    pointer = run.path / "ckpt" / "last.json"
+    facts = json.loads(pointer.read_text())
+    (run.path / "ckpt" / facts["file"]).rename(run.path / "ckpt" / "step-000001.safetensors")
+    pointer.write_text(json.dumps({**facts, "file": "step-000001.safetensors"}))
+    assert _value(run) == [0.0, 1.0, 2.0]
+
+
+def test_what_a_killed_save_leaves_is_removed_by_the_next(run: RunDir) -> None:
+    for name in (".step-000002-01234567.89abcdef.safetensors", ".last.89abcdef.json"):
+        (run.path / "ckpt" / name).write_bytes(b"part")
+    save_checkpoint(run, {"w": torch.zeros(1)}, HASHES, step=2)
+    assert len(list((run.path / "ckpt").iterdir())) == 3
+
+
+def test_a_first_save_that_was_killed_is_none(tmp_path: Path) -> None:
+    run = RunDir.create(tmp_path, "traffic", "test")
+    assert never_saved(run)
+    (run.path / "ckpt").mkdir()
+    (run.path / "ckpt" / "step-000001-01234567.safetensors").write_bytes(b"")
+    assert never_saved(run)
+    save_checkpoint(run, {"w": torch.zeros(1)}, HASHES, step=1)
+    assert not never_saved(run)
+    (run.path / "ckpt" / "last.json").unlink()
+    assert not never_saved(run), "its weights may be wanted"
+
+
 def test_another_task_is_refused(run: RunDir) -> None:
     with pytest.raises(RunError) as caught:
         load_checkpoint(run, spec_hash="c" * 64, system_hash=HASHES["system_hash"])
@@ -80,9 +140,9 @@ def test_another_task_is_refused(run: RunDir) -> None:
         lambda folder: (folder / "last.json").write_text("[]"),
         lambda folder: (folder / "last.json").write_text('{"file": "../../run.json"}'),
         lambda folder: (folder / "last.json").unlink(),
-        lambda folder: (folder / "step-000001.safetensors").write_bytes(b"short"),
-        lambda folder: (folder / "step-000001.safetensors").write_bytes(pickle.dumps({"w": 1})),
-        lambda folder: (folder / "step-000001.safetensors").unlink(),
+        lambda folder: _tensors(folder).write_bytes(b"short"),
+        lambda folder: _tensors(folder).write_bytes(pickle.dumps({"w": 1})),
+        lambda folder: _tensors(folder).unlink(),
     ],
 )
 def test_damage_is_diagnosed(run: RunDir, spoil: object) -> None:
