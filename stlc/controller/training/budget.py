@@ -205,8 +205,13 @@ class StepSchedule:
         return ",".join((str(first.steps), *(text for _, text in merged)))
 
     def with_steps(self, step: int, steps: int) -> StepSchedule:
-        """This schedule with a further entry: after `step`, the total number of steps is `steps`."""
-        return replace(self, plannings=(*self.plannings, Planned(step, steps)))
+        """This schedule up to `step`, after which the total number of steps is `steps`.
+
+        Later entries, of a schedule that is followed again, no longer apply.
+        """
+        plannings = tuple(each for each in self.plannings if each.step <= step)
+        rounds = tuple(each for each in self.rounds if each.step <= step)
+        return StepSchedule((*plannings, Planned(step, steps)), rounds)
 
     def with_round(self, step: int, simulations: int) -> StepSchedule:
         """This schedule with a further round of falsification after `step`."""

@@ -17,7 +17,7 @@ from stlc.controller.evaluation.held_out import silent
 from stlc.controller.parallel.ddp import ALONE, Ranks, find_device
 from stlc.controller.problem.load import require_controls
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
-from stlc.controller.training.checkpoint import load_checkpoint, never_saved, restoring
+from stlc.controller.training.checkpoint import Checkpoint, load_checkpoint, never_saved, restoring
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
 from stlc.controller.training.diagnose import check_mirror, refuted
 from stlc.controller.training.failures import SHARE
@@ -214,7 +214,7 @@ def resume(
 
     Args:
         folder: folder of the run.
-        steps: new total number of steps.
+        steps: new total number of steps, at least as many as the run has made.
         budget: additional seconds. If neither `steps` nor `budget` is given, the run uses the rest of its
             budget, or completes its step schedule if it has no budget.
         device: torch device.
@@ -225,7 +225,8 @@ def resume(
     Raises:
         RunError: R101, the run is damaged or was never saved; R102, its checkpoint belongs to another
             specification or system; R103, nothing is left to do.
-        UsageError: R104, the run was trained with another number of ranks.
+        UsageError: R104, the run was trained with another number of ranks; U101, more than `steps` steps have
+            been made.
     """
     keep_freed_memory()
     config = load_config(folder)
@@ -239,48 +240,103 @@ def resume(
     if config.threads:
         torch.set_num_threads(config.threads)
     place = find_device(ranks.device(device))
-    facts: Mapping[str, Any] = folder.record()
-    saved = None
-    if not never_saved(folder) or "schedule" not in facts:
-        saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
-        facts = saved.facts
-    seconds = (row.get("seconds") for row in folder.rows())
-    before = max((spent for spent in seconds if isinstance(spent, int | float)), default=0.0)
+    past = _Past.of(folder).of_length(folder, steps, budget)
     with restoring(folder):
-        schedule = StepSchedule.parse(str(facts.get("schedule") or facts.get("steps") or PROVISIONAL))
-        before = float(facts.get("seconds", before))
-        allowed = 0.0 if steps is not None else float(folder.record().get("seconds_allowed") or 0.0)
-        planned = schedule.at(0) if saved is None else int(facts["steps"])
-        if saved is None and allowed:  # nothing was saved: the run begins again, and plans its steps anew
-            schedule = StepSchedule.of(planned)
-        learner = method.learner(task, config, steps=planned, device=place, ranks=ranks)
-        if learner is not None and saved is not None:
-            learner.restore(saved.tensors, saved.facts)
+        learner = method.learner(task, config, steps=past.planned, device=place, ranks=ranks)
+        if learner is not None and past.saved is not None:
+            learner.restore(past.saved.tensors, past.saved.facts)
     late = watch.late if config.clock == "wall" else None
     if learner is None:
-        return _without_steps(method, task, config, writer, TimeBudget.of(now, started, allowed, late), watch)
-    if steps is not None:
-        schedule = schedule.with_steps(learner.step, steps)
-        learner.steps = steps
-    if budget is not None:
-        allowed = before + budget
-        schedule = schedule.with_steps(learner.step, learner.step + PROVISIONAL)
-    if learner.step >= schedule.steps and folder.status == "finished":
+        time_ = TimeBudget.of(now, started, past.allowed, late)
+        return _without_steps(method, task, config, writer, time_, watch)
+    learner.steps = steps or learner.steps
+    if learner.step >= past.schedule.steps and folder.status == "finished":
         raise RunError(
             Diagnostic(
                 "R103",
-                f"run `{folder.name}` is finished: {learner.step} of {schedule.steps} steps",
+                f"run `{folder.name}` is finished: {learner.step} of {past.schedule.steps} steps",
                 help=(f"stlc train --resume {folder.name} --budget 60s goes on",),
             )
         )
     writer.before(learner.next_validation)
-    time_ = TimeBudget.of(now, started - before, allowed, late)
-    falsified = float(facts.get("falsified") or 0.0)
-    session = _Session(writer, learner, watch, time_, schedule, failures, falsified)
-    if saved is not None and (steps is not None or budget is not None):
+    time_ = TimeBudget.of(now, started - past.seconds, past.allowed, late)
+    session = _Session(writer, learner, watch, time_, past.schedule, failures, past.falsified)
+    if past.saved is not None and (steps is not None or budget is not None):
         session.save()  # the longer schedule first: a run that is killed now still has its steps to make
-    writer.note({"status": "running", "seconds_allowed": allowed or None})
+    writer.note({"status": "running", "seconds_allowed": past.allowed or None})
     return session.finish()
+
+
+@dataclass(frozen=True, slots=True)
+class _Past:
+    """Past of a run that is resumed: its latest checkpoint, and the length that it was to have.
+
+    Attributes:
+        saved: the checkpoint; None if there is none, so that the run begins again.
+        made: number of steps made until then.
+        planned: total number of steps planned then.
+        schedule: record of all plannings until then.
+        seconds: time spent until then.
+        allowed: budget in seconds; 0 if the schedule alone decides.
+        falsified: seconds that rounds of falsification have taken.
+    """
+
+    saved: Checkpoint | None
+    made: int
+    planned: int
+    schedule: StepSchedule
+    seconds: float
+    allowed: float
+    falsified: float
+
+    @classmethod
+    def of(cls, folder: RunDir) -> _Past:
+        """Read the past of a run.
+
+        Raises:
+            RunError: R101, the run is damaged; R102, its checkpoint belongs to another specification or
+                system.
+        """
+        saved, record = None, folder.record()
+        if not never_saved(folder) or "schedule" not in record:
+            saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
+        facts: Mapping[str, Any] = record if saved is None else saved.facts
+        spent = (row.get("seconds") for row in folder.rows())
+        before = max((seconds for seconds in spent if isinstance(seconds, int | float)), default=0.0)
+        with restoring(folder):
+            schedule = StepSchedule.parse(str(facts.get("schedule") or facts.get("steps") or PROVISIONAL))
+            return cls(
+                saved,
+                0 if saved is None else int(facts["step"]),
+                schedule.at(0) if saved is None else int(facts["steps"]),
+                schedule,
+                float(facts.get("seconds", before)),
+                float(record.get("seconds_allowed") or 0.0),
+                float(facts.get("falsified") or 0.0),
+            )
+
+    def of_length(self, folder: RunDir, steps: int | None, budget: float | None) -> _Past:
+        """This past with a new total number of steps, or `budget` additional seconds, if one is given.
+
+        Without a checkpoint, the steps of a budget are planned anew.
+
+        Raises:
+            UsageError: U101, more than `steps` steps have been made.
+        """
+        if steps is not None and steps < self.made:
+            message = f"run `{folder.name}` has made {self.made} steps, more than {steps}"
+            raise usage(message, f"stlc train --resume {folder.name} --steps {self.made + steps}")
+        if budget is not None:
+            total, allowed = self.made + PROVISIONAL, self.seconds + budget
+        elif steps is not None:
+            total, allowed = steps, 0.0
+        elif self.saved is None and self.allowed:
+            total, allowed = self.planned, self.allowed
+        else:
+            return self
+        if self.saved is None:
+            return replace(self, planned=total, schedule=StepSchedule.of(total), allowed=allowed)
+        return replace(self, schedule=self.schedule.with_steps(self.made, total), allowed=allowed)
 
 
 def _without_steps(

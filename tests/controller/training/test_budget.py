@@ -32,6 +32,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import Watch, resume, train
 from stlc.controller.training.run import spec_hash, system_hash
+from stlc.diagnostics import UsageError
 from stlc.rundir import RunDir, every_run
 
 EVERY = 50
@@ -350,6 +351,39 @@ def test_a_continuation_that_is_killed_at_once_still_has_its_steps_to_make(
     assert folder.status == "running"
     resume(folder)
     assert (folder.record()["steps"] == 80) if "steps" in more else (folder.record()["steps"] > 60)
+
+
+@pytest.mark.usefixtures("ticking")
+@pytest.mark.parametrize("more", [{"steps": 12}, {"budget": 4.0}])
+@pytest.mark.parametrize("config", [BUDGET, replace(BUDGET, steps=StepSchedule.parse("60,20@11,14@12"))])
+def test_a_new_length_before_the_first_checkpoint_begins_anew(
+    config: TrainConfig, more: dict[str, Any], car_task: Task, tmp_path: Path
+) -> None:
+    folder, steps = _folder(car_task, tmp_path, config), itertools.count(1)
+    train(car_task, config, folder, Watch(stop=lambda: next(steps) == 25))
+    shutil.rmtree(folder.path / "ckpt")
+    again = itertools.count(1)
+    assert resume(folder, **more, watch=Watch(stop=lambda: next(again) == 5)).interrupted
+    begun = StepSchedule.parse(folder.record()["schedule"])
+    assert begun.at(0) == more.get("steps", PROVISIONAL)
+    resume(folder)
+    assert folder.record()["steps"] == StepSchedule.parse(folder.record()["schedule"]).steps
+
+
+@pytest.mark.usefixtures("ticking")
+def test_a_schedule_that_is_followed_again_can_be_changed_on_the_way(car_task: Task, tmp_path: Path) -> None:
+    """The entries that lie ahead no longer apply; fewer steps than were made are refused."""
+    config = replace(BUDGET, budget=None, drives=0, steps=StepSchedule.parse("60,20@11,14@12"))
+    folder, steps = _folder(car_task, tmp_path, config), itertools.count(1)
+    assert train(car_task, config, folder, Watch(stop=lambda: next(steps) == 5)).interrupted
+    before = folder.record()
+    with pytest.raises(UsageError, match="has made 5 steps, more than 4") as caught:
+        resume(folder, steps=4)
+    assert caught.value.diagnostics[0].code == "U101"
+    assert folder.record() == before
+    assert resume(folder, steps=8).steps == 8
+    assert folder.record()["schedule"] == "60,8@5"
+    assert resume(folder, steps=9).steps == 9
 
 
 @pytest.mark.bench
