@@ -262,7 +262,7 @@ def resume(
     time_ = TimeBudget.of(now, started - past.seconds, past.allowed, late)
     session = _Session(writer, learner, watch, time_, past.schedule, failures, past.falsified)
     if past.saved is not None and (steps is not None or budget is not None):
-        session.save()  # the longer schedule first: a run that is killed now still has its steps to make
+        session.save()  # the new length first: a run that is killed now still has its steps to make
     writer.note({"status": "running", "seconds_allowed": past.allowed or None})
     return session.finish()
 
@@ -311,7 +311,7 @@ class _Past:
                 schedule.at(0) if saved is None else int(facts["steps"]),
                 schedule,
                 float(facts.get("seconds", before)),
-                float(record.get("seconds_allowed") or 0.0),
+                float(facts.get("seconds_allowed", record.get("seconds_allowed")) or 0.0),
                 float(facts.get("falsified") or 0.0),
             )
 
@@ -598,6 +598,7 @@ class _Session:
             **self.learner.facts(),
             "schedule": str(self.schedule),
             "seconds": began - self.time.started,
+            "seconds_allowed": self.time.allowed or None,
             "falsified": self.falsified,
         }
         self.writer.checkpoint(self.learner.tensors(), facts, step=self.learner.step)

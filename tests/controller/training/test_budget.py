@@ -354,6 +354,20 @@ def test_a_continuation_that_is_killed_at_once_still_has_its_steps_to_make(
 
 
 @pytest.mark.usefixtures("ticking")
+def test_steps_instead_of_a_budget_hold_although_the_continuation_is_killed_at_once(
+    car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, steps = _folder(car_task, tmp_path, BUDGET), itertools.count(1)
+    train(car_task, BUDGET, folder, Watch(stop=lambda: next(steps) == 5))
+    with monkeypatch.context() as patch:
+        patch.setattr("stlc.controller.training.loop.RunWriter.note", lambda *_: sys.exit(137))
+        with pytest.raises(SystemExit):
+            resume(folder, steps=8)
+    assert resume(folder).steps == 8
+    assert folder.record()["seconds_allowed"] is None
+
+
+@pytest.mark.usefixtures("ticking")
 @pytest.mark.parametrize("more", [{"steps": 12}, {"budget": 4.0}])
 @pytest.mark.parametrize("config", [BUDGET, replace(BUDGET, steps=StepSchedule.parse("60,20@11,14@12"))])
 def test_a_new_length_before_the_first_checkpoint_begins_anew(
