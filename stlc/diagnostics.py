@@ -267,6 +267,7 @@ CODES: dict[str, str] = {
     "R106": "an exported controller whose files are missing, damaged or mixed",
     "R107": "a state that an exported controller cannot decide in",
     "R108": "a file that is no certificate, or a damaged one",
+    "R109": "a run that another process is training",
     "R201": "no room on the disk, or a file that cannot be written",
     "R202": "not enough memory",
     "R301": "a package that is not installed",

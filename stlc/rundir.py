@@ -183,6 +183,34 @@ class RunDir:
         ended = {"status": status, "finished": now()}
         self.update(ended if result is None else {**ended, "result": result})
 
+    @contextmanager
+    def claimed(self) -> Iterator[bool]:
+        """Context in which this process alone trains the run; yields False if another process does.
+
+        The lock lies on the folder itself: it ends with the process, and no copy of the folder has it. Where
+        folders have no locks (on Windows, on some network drives), True is yielded.
+        """
+        try:
+            import fcntl
+
+            descriptor = os.open(self.path, os.O_RDONLY)
+        except (ImportError, OSError):
+            yield True
+            return
+        try:
+            own = True
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                own = False
+            except OSError:
+                pass
+            yield own
+        finally:
+            with suppress(OSError):
+                fcntl.flock(descriptor, fcntl.LOCK_UN)  # although a worker process may have a copy
+            os.close(descriptor)
+
     def _damaged(self, name: str, error: Exception) -> Diagnostic:
         if isinstance(error, FileNotFoundError):
             return Diagnostic("R101", f"`{self.shown}` is not a run: it has no {name}")

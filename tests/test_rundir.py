@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -24,6 +26,37 @@ def made(root: Path, spec: str, words: str) -> RunDir:
 
 
 # ---------------------------------------------------------------------- making
+
+
+def test_one_process_at_a_time_trains_a_run(root, monkeypatch):
+    run = made(root, "traffic", "quiet-heron")
+    with run.claimed() as first, run.claimed() as second:
+        assert (first, second) == (True, False)
+        with RunDir.create(root, "traffic").claimed() as other:
+            assert other
+        assert [path.name for path in run.path.iterdir()] == ["run.json"]
+        monkeypatch.setitem(sys.modules, "fcntl", None)  # as on Windows
+        with run.claimed() as unguarded:
+            assert unguarded
+
+
+def test_a_claim_ends_with_its_process(root):
+    run = made(root, "traffic", "quiet-heron")
+    script = f"""
+from pathlib import Path
+from stlc.rundir import RunDir
+with RunDir(Path({str(run.path)!r})).claimed() as own:
+    print(own, flush=True)
+    input()
+"""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", script], **pipes) as process:
+        assert process.stdout.readline() == b"True\n"
+        with run.claimed() as own:
+            assert not own
+        process.kill()
+    with run.claimed() as own:
+        assert own
 
 
 def test_numbers_count_per_spec(root):

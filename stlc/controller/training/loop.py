@@ -6,7 +6,7 @@ import ctypes
 import math
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ from stlc.native import never
 from stlc.registry import METHODS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from contextlib import AbstractContextManager
 
     from stlc.controller.methods import Learner, Method, Validation
@@ -185,19 +185,22 @@ def run(prepared: Preparation, folder: RunDir, watch: Watch | None = None) -> Tr
     Raises:
         MissingError: R201, a checkpoint cannot be written; R403, the process of another rank has ended or
             does not answer.
-        RunError: R401, the loss or its gradient is not finite.
+        RunError: R401, the loss or its gradient is not finite; R109, another process trains in the folder.
     """
     watch, resolved, learner = watch or Watch(), prepared.config, prepared.learner
     budget, schedule = prepared.budget, prepared.schedule
-    writer = RunWriter(folder, writes=prepared.ranks.first)
-    writer.config(resolved)
-    writer.note({"engine": asdict(resolved), "schedule": str(schedule), "seconds_allowed": budget or None})
-    late = watch.late if resolved.clock == "wall" else None
-    allowed = TimeBudget.of(prepared.now, prepared.started, budget, late)
-    if learner is None:
-        return _without_steps(METHODS.get(resolved.method), prepared.task, resolved, writer, allowed, watch)
-    writer.note({"margin": learner.margin})
-    return _Session(writer, learner, watch, allowed, schedule, prepared.failures).finish()
+    with _alone(folder, prepared.ranks):
+        writer = RunWriter(folder, writes=prepared.ranks.first)
+        writer.config(resolved)
+        chosen = {"engine": asdict(resolved), "schedule": str(schedule)}
+        writer.note({**chosen, "seconds_allowed": budget or None})
+        late = watch.late if resolved.clock == "wall" else None
+        allowed = TimeBudget.of(prepared.now, prepared.started, budget, late)
+        if learner is None:
+            method: Method = METHODS.get(resolved.method)
+            return _without_steps(method, prepared.task, resolved, writer, allowed, watch)
+        writer.note({"margin": learner.margin})
+        return _Session(writer, learner, watch, allowed, schedule, prepared.failures).finish()
 
 
 def resume(
@@ -224,47 +227,63 @@ def resume(
 
     Raises:
         RunError: R101, the run is damaged or was never saved; R102, its checkpoint belongs to another
-            specification or system; R103, nothing is left to do.
+            specification or system; R103, nothing is left to do; R109, another process trains the run.
         UsageError: R104, the run was trained with another number of ranks; U101, more than `steps` steps have
             been made.
     """
     keep_freed_memory()
-    config = load_config(folder)
-    _require_as_many(config.ranks, ranks.size)
-    _require_search(config, failures)
-    now = clock_of(config.clock)
-    started = now()
-    task = task_of_run(folder)
-    method: Method = METHODS.get(config.method)
-    watch, writer = watch or Watch(), RunWriter(folder, writes=ranks.first)
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    place = find_device(ranks.device(device))
-    past = _Past.of(folder).of_length(folder, steps, budget)
-    with restoring(folder):
-        learner = method.learner(task, config, steps=past.planned, device=place, ranks=ranks)
-        if learner is not None and past.saved is not None:
-            learner.restore(past.saved.tensors, past.saved.facts)
-    late = watch.late if config.clock == "wall" else None
-    if learner is None:
-        time_ = TimeBudget.of(now, started, past.allowed, late)
-        return _without_steps(method, task, config, writer, time_, watch)
-    learner.steps = steps or learner.steps
-    if learner.step >= past.schedule.steps and folder.status == "finished":
-        raise RunError(
-            Diagnostic(
-                "R103",
-                f"run `{folder.name}` is finished: {learner.step} of {past.schedule.steps} steps",
-                help=(f"stlc train --resume {folder.name} --budget 60s goes on",),
+    with _alone(folder, ranks):
+        config = load_config(folder)
+        _require_as_many(config.ranks, ranks.size)
+        _require_search(config, failures)
+        now = clock_of(config.clock)
+        started = now()
+        task = task_of_run(folder)
+        method: Method = METHODS.get(config.method)
+        watch, writer = watch or Watch(), RunWriter(folder, writes=ranks.first)
+        if config.threads:
+            torch.set_num_threads(config.threads)
+        place = find_device(ranks.device(device))
+        past = _Past.of(folder).of_length(folder, steps, budget)
+        with restoring(folder):
+            learner = method.learner(task, config, steps=past.planned, device=place, ranks=ranks)
+            if learner is not None and past.saved is not None:
+                learner.restore(past.saved.tensors, past.saved.facts)
+        late = watch.late if config.clock == "wall" else None
+        if learner is None:
+            time_ = TimeBudget.of(now, started, past.allowed, late)
+            return _without_steps(method, task, config, writer, time_, watch)
+        learner.steps = steps or learner.steps
+        if learner.step >= past.schedule.steps and folder.status == "finished":
+            raise RunError(
+                Diagnostic(
+                    "R103",
+                    f"run `{folder.name}` is finished: {learner.step} of {past.schedule.steps} steps",
+                    help=(f"stlc train --resume {folder.name} --budget 60s goes on",),
+                )
             )
-        )
-    writer.before(learner.next_validation)
-    time_ = TimeBudget.of(now, started - past.seconds, past.allowed, late)
-    session = _Session(writer, learner, watch, time_, past.schedule, failures, past.falsified)
-    if past.saved is not None and (steps is not None or budget is not None):
-        session.save()  # the new length first: a run that is killed now still has its steps to make
-    writer.note({"status": "running", "seconds_allowed": past.allowed or None})
-    return session.finish()
+        writer.before(learner.next_validation)
+        time_ = TimeBudget.of(now, started - past.seconds, past.allowed, late)
+        session = _Session(writer, learner, watch, time_, past.schedule, failures, past.falsified)
+        if past.saved is not None and (steps is not None or budget is not None):
+            session.save()  # the new length first: a run that is killed now still has its steps to make
+        writer.note({"status": "running", "seconds_allowed": past.allowed or None})
+        return session.finish()
+
+
+@contextmanager
+def _alone(folder: RunDir, ranks: Ranks) -> Iterator[None]:
+    """Context in which no other process trains the run in `folder`. Raises RunError (R109) if one does."""
+    with folder.claimed() if ranks.first else nullcontext(True) as own:
+        if ranks.any(not own):
+            raise RunError(
+                Diagnostic(
+                    "R109",
+                    f"run `{folder.name}` is being trained by another process",
+                    help=("wait for its end, or end that process: its last checkpoint is kept",),
+                )
+            )
+        yield
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import shutil
+from contextlib import ExitStack
 from datetime import timedelta
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from stlc.cli.framework.app import main
 from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
 from stlc.grammar.parse.tables import load_parser
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = {code: read_page(code) for code in CODES}
@@ -208,6 +210,7 @@ def no_number(policy, x0):
 @pytest.fixture
 def machine(monkeypatch, tmp_path):
     """Machine that a wrong example needs."""
+    others = ExitStack()
 
     def arrange(code: str) -> None:
         if code == "W701":
@@ -215,6 +218,8 @@ def machine(monkeypatch, tmp_path):
             load_parser.cache_clear()
             (tmp_path / "cache/stlc").mkdir(parents=True)
             (tmp_path / "cache/stlc").chmod(0o770)
+        elif code == "R109":
+            others.enter_context(RunDir.open("first").claimed())
         elif code == "R406":
             monkeypatch.setattr("stlc.cli.check.many.outcome_of", ends_its_process)
         elif code == "W702":
@@ -223,7 +228,8 @@ def machine(monkeypatch, tmp_path):
             monkeypatch.setenv("CC", str(tmp_path / "cc"))
             monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    return arrange
+    with others:
+        yield arrange
 
 
 @pytest.fixture

@@ -173,6 +173,22 @@ def test_resuming_a_finished_run_says_so(car_task: Task, tmp_path: Path) -> None
     assert resume(folder, steps=8).run.dir.record()["steps"] == 8
 
 
+def test_a_run_that_is_being_trained_is_not_resumed(car_task: Task, tmp_path: Path) -> None:
+    config = TrainConfig(held_out=50, drives=0, steps=3, seed=3, batch=16)
+    folder, refused = _folder(car_task, tmp_path, config), []
+
+    def another() -> bool:
+        for _ in range(2):
+            with pytest.raises(RunError) as caught:
+                resume(folder)
+            refused.append(caught.value.diagnostics[0].code)
+        return len(refused) == 4
+
+    assert train(car_task, config, folder, Watch(stop=another)).interrupted
+    assert resume(folder).steps == 3
+    assert refused == ["R109"] * 4
+
+
 def test_a_changed_spec_is_refused(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=50, drives=0, steps=5, batch=32)
     folder = _folder(car_task, tmp_path, config)
