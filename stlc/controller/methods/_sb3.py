@@ -6,6 +6,7 @@ states of the random generators are stored as tensors in the run's checkpoint.
 
 from __future__ import annotations
 
+import json
 import math
 import random
 from collections.abc import Iterator, Mapping
@@ -270,7 +271,7 @@ class SacLearner(ActorLearner):
         """Tensors from which training resumes exactly.
 
         They contain networks, optimisers, entropy coefficient, replay buffer, the states of the episodes, and
-        the states of the random number generators.
+        the states of the random number generators; the one of `warmup` draws the first actions.
         """
         found = super().tensors()
         found |= {f"policy.{name}": value for name, value in self.policy.network.actor.state_dict().items()}
@@ -283,6 +284,8 @@ class SacLearner(ActorLearner):
         found |= {f"replay.{name}": torch.from_numpy(getattr(buffer, name)[:filled]) for name in STORED}
         found["entropy"] = self.model.log_ent_coef.detach()
         found["starts"] = self.environments.states
+        drawn = json.dumps(self.model.action_space.np_random.bit_generator.state)
+        found["warmup"] = torch.tensor(list(drawn.encode()), dtype=torch.uint8)
         return found | {f"random.{name}": value for name, value in self._random.tensors().items()}
 
     def facts(self) -> dict[str, float | int]:
@@ -312,3 +315,6 @@ class SacLearner(ActorLearner):
         self.environments.reset(tensors["starts"])
         model._last_obs = model.env.observed()
         self._random.restore(below(tensors, "random"))
+        if "warmup" in tensors:  # checkpoints of older versions lack it
+            drawn = json.loads(bytes(tensors["warmup"].tolist()))
+            model.action_space.np_random.bit_generator.state = drawn

@@ -108,6 +108,16 @@ def test_it_goes_on_bit_for_bit(
     assert torch.equal(Run.open(part["run"]).policy(x), whole.policy(x))
 
 
+def test_it_goes_on_bit_for_bit_while_actions_are_drawn_at_random(car_task: Task) -> None:
+    whole = learner(car_task, environments="4", warmup_transitions="150")
+    whole.advance()
+    kept = {name: value.clone() for name, value in whole.tensors().items()}
+    resumed = learner(car_task, environments="4", warmup_transitions="150")
+    resumed.restore(kept, whole.facts())
+    assert whole.advance() == resumed.advance()
+    assert all(torch.equal(value, resumed.tensors()[name]) for name, value in whole.tensors().items())
+
+
 def test_a_divergence_is_a_finding(car_task: Task) -> None:
     """The library itself raises an error for a distribution with NaN."""
     sac = learner(car_task, updates="2")
