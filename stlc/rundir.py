@@ -259,8 +259,12 @@ class RunDir:
 
 def every_run(root: Path = RUNS) -> list[RunDir]:
     """Runs below `root` that have a record (`run.json`), ordered by specification and number."""
-    paths = (path for path in root.glob("*/*") if not path.is_symlink() and _NUMBERED.fullmatch(path.name))
-    return [RunDir(path) for path in sorted(paths) if (path / RECORD).is_file()]
+    numbered = [
+        (path.parent.name, int(match[1]), path)
+        for path in root.glob("*/*")
+        if (match := _NUMBERED.fullmatch(path.name)) and not path.is_symlink()
+    ]
+    return [RunDir(path) for _, _, path in sorted(numbered) if (path / RECORD).is_file()]
 
 
 def remove_run(run: RunDir) -> None:
@@ -349,12 +353,14 @@ def _folder_of(path: Path) -> Path:
 
 
 def _slug(name: str) -> str:
-    return file_part(name, empty="spec")
+    """Part of a path for the name of a specification or run; never that of the link `latest`."""
+    part = file_part(name, empty="spec")
+    return f"{part}-spec" if part.lower() == LATEST else part
 
 
 def require_name(words: str) -> str:
     """Return the name of a run; raise UsageError (U101) if no folder can have it."""
-    if _slug(words) != words or words == LATEST:
+    if _slug(words) != words:
         raise usage(f"`{words}` cannot name a run", "use letters, digits, `-`, `_` and `.`")
     return words
 

@@ -105,6 +105,15 @@ def test_a_spec_name_cannot_leave_the_root(root):
     assert run.path.parent.parent == root
 
 
+def test_a_spec_may_be_called_as_the_link(root):
+    first = made(root, "traffic", "quiet-heron")
+    for name in ("latest", "Latest"):
+        run = made(root, name, "bold-fox")
+        assert run.path.resolve().parent.parent == root.resolve()
+        assert RunDir.newest(root).path == run.path.resolve()
+    assert [path.name for path in first.path.iterdir()] == ["run.json"]
+
+
 def test_an_unwritable_root_is_the_environments_fault(root, monkeypatch):
     def full(*_arguments, **_options):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -209,6 +218,13 @@ def test_a_damaged_record_is_a_diagnostic(root, text):
 def test_a_folder_without_a_record_is_no_run(tmp_path):
     with pytest.raises(RunError, match=r"it has no run\.json"):
         RunDir.open(tmp_path)
+
+
+def test_runs_are_in_the_order_of_their_numbers(root):
+    for name in ("10000-b", "9999-a", "0010-c"):
+        RunDir(root / "traffic" / name).write_json("run.json", {})
+    assert [run.name for run in every_run(root)] == ["0010-c", "9999-a", "10000-b"]
+    assert RunDir.open("traffic", root).name == "10000-b"
 
 
 def test_only_runs_are_listed(root):
