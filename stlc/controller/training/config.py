@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
@@ -170,8 +171,10 @@ _MOST = {
     **dict.fromkeys(("batch", "hard", "pool", "most", "held_out", "samples", "drives"), 10**8),
     **dict.fromkeys(("warmup", "average"), 1.0),
     "hold": 0.999,
+    "lr": sys.float_info.max,
+    "seed": 2**63 - 1,
 }
-"""Upper bounds on shares and on options that determine memory use."""
+"""Upper bounds other than `MOST`: on shares, on options that determine memory use, and larger ones."""
 MOST_TEXT = 1000
 
 
@@ -254,10 +257,11 @@ def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
             advice = did_you_mean(name, own, known)
             raise usage(f"method `{found.method}` has no option `{name}`", *advice)
         changed[name] = _number(name, text, str(own[name])) if own[name] not in ("str", str) else text
+    advice = ("stlc train SPEC --option NAME=VALUE",) if changed else ()
     try:
-        return checked_config(replace(found, **changed)) if changed else found
+        return checked_config(replace(found, **changed))
     except ValueError as error:
-        raise usage(f"method `{found.method}`: {error}", "stlc train SPEC --option NAME=VALUE") from None
+        raise usage(f"method `{found.method}`: {error}", *advice) from None
 
 
 def _number(name: str, text: str, kind: str) -> int | float:

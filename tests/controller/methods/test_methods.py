@@ -20,8 +20,10 @@ from stlc.controller.policies.policy import ModelRollout
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import PlannerChoice, TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder, open_planner
+from stlc.controller.training.run import load_config, save_config
 from stlc.diagnostics import RunError, SystemFileError, UsageError
 from stlc.registry import METHODS
+from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]
 SPEC, CAR = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
@@ -220,6 +222,23 @@ def test_a_refused_option_leaves_no_run_behind(car_task: Task, tmp_path: Path) -
     with pytest.raises(UsageError):
         open_folder(car_task, config, Launch(root=tmp_path / "runs"))
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("option", [{"plans": 70_000}, {"batch": 10**9}, {"threads": 10**6}])
+def test_an_option_that_a_run_could_not_be_opened_with_is_refused(
+    option: dict[str, int], car_task: Task
+) -> None:
+    with pytest.raises(UsageError, match=next(iter(option))):
+        resolve_config(car_task, TrainConfig(**option))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("option", [{"lr": 1e38}, {"seed": 2**63 - 1}])
+def test_an_option_that_is_accepted_is_read_again(
+    option: dict[str, float], car_task: Task, car_run: RunDir
+) -> None:
+    config = resolve_config(car_task, TrainConfig(**option))  # type: ignore[arg-type]
+    save_config(car_run, config)
+    assert load_config(car_run) == config
 
 
 def test_options_of_a_planner_are_kept_and_damaged_ones_are_a_finding(car_task: Task, tmp_path: Path) -> None:
