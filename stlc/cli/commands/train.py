@@ -68,11 +68,12 @@ def train(
         ),
     ] = None,
     clock: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="wall|processor", help="Clock of the budget; processor time is that of an idle machine."
+            metavar="wall|processor",
+            help="Clock of the budget, wall by default; processor time is that of an idle machine.",
         ),
-    ] = "wall",
+    ] = None,
     steps: Annotated[
         str | None,
         typer.Option(metavar="N", help="Steps of the optimiser instead of a budget, or a recorded schedule."),
@@ -146,7 +147,7 @@ def train(
     given = {
         **{"--system": system, "--seed": seed, "--seeds": seeds, "--method": method, "--name": name},
         **{"--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch, "--set": set_},
-        **{"--held-out": held_out, "--drives": drives, "--cluster": cluster},
+        **{"--held-out": held_out, "--drives": drives, "--cluster": cluster, "--clock": clock},
         **{"--reward": reward, "--option": option, "--falsify": falsify or None},
     }
     _check_together(specs, jobs, {**given, "--budget": budget, "--steps": steps})
@@ -172,7 +173,7 @@ def train(
         lr=_rate(lr) if lr is not None else None,
         batch=batch,
         held_out=held_out or HELD_OUT,
-        clock=parse_clock(clock),
+        clock=parse_clock(clock or "wall"),
         drives=DRIVES if drives is None else drives,
         reward=reward,
         options=parse_pairs(option, "--option", "NAME=VALUE", "environments=256"),

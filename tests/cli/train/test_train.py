@@ -57,7 +57,14 @@ def test_options_out_of_range_are_usage_errors_and_make_no_run(
 
 @pytest.mark.parametrize(
     "option",
-    [["--seed", "0"], ["--method", "gradient"], ["--lr", "1e-3"], ["--threads", "1"], ["--set", "T_red=3s"]],
+    [
+        ["--seed", "0"],
+        ["--method", "gradient"],
+        ["--lr", "1e-3"],
+        ["--threads", "1"],
+        ["--set", "T_red=3s"],
+        ["--clock", "processor"],
+    ],
 )
 def test_what_a_resumed_run_cannot_change_is_refused(
     option: list[str], capsys: pytest.CaptureFixture[str]
