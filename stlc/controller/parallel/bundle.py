@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import os
 import secrets
+import shutil
 import socket
 import subprocess
 import tarfile
@@ -134,10 +135,26 @@ def import_run(job: Job, bundle: JobBundle, found: BundleResult) -> JobResult:
         else:
             _, _, words = sent.name.partition("-")
             home = RunDir.create(Path(bundle.runs), sent.parent.name, words)
-        unpack(found.files, home.path)
+        _replace(home, found.files)
         if document is not None and isinstance(document.get("result"), dict):
             document["result"]["run"] = home.shown
     return JobResult(job, found.code, document, found.said, found.cores)
+
+
+def _replace(run: RunDir, files: bytes) -> None:
+    """Move the files of an archive into a run's folder, so that a kill at any moment leaves a whole run.
+
+    The archive is extracted beside the folder. Files that the run does not have yet come first, such as the
+    tensors of a checkpoint; then those that replace one, such as the pointer to it; then the run's record.
+    """
+    beside = run.path.with_name(f".{run.name}.received")
+    shutil.rmtree(beside, ignore_errors=True)
+    unpack(files, beside)
+    moves = [(path, run.path / path.relative_to(beside)) for path in beside.rglob("*") if path.is_file()]
+    for path, target in sorted(moves, key=lambda move: (move[1].name == RECORD, move[1].exists())):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        path.replace(target)
+    shutil.rmtree(beside)
 
 
 # ---------------------------------------------------------------------- worker

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import io
+import itertools
+import shutil
 import tarfile
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from stlc.controller.parallel.bundle import (
     BundleResult,
@@ -20,6 +24,7 @@ from stlc.controller.parallel.bundle import (
     unpack,
 )
 from stlc.controller.parallel.jobs import Job, core_shares
+from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
 from stlc.rundir import RunDir, every_run
 
 ROOT = Path(__file__).parents[3]
@@ -98,6 +103,41 @@ def test_a_run_that_was_sent_is_written_over(project: Path) -> None:
     files = pack({"run.json": project / "later.json"})
     import_run(going, sent, BundleResult(0, "", "", 1, str(project.resolve() / run.path), files))
     assert [(each.name, each.status) for each in every_run(Path("runs"))] == [("0001-old", "finished")]
+
+
+@pytest.mark.parametrize("killed_after", range(5))
+def test_a_run_that_was_sent_is_whole_at_any_moment(
+    killed_after: int, project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, after = RunDir.create(Path("runs"), "drive", "old"), project / "after"
+    run.update({"status": "interrupted"})
+    hashes = {"spec_hash": "a", "system_hash": "b"}
+    save_checkpoint(run, {"w": torch.zeros(1)}, hashes, step=1)
+    shutil.copytree(run.path, after)
+    save_checkpoint(RunDir(after), {"w": torch.ones(1)}, hashes, step=2)
+    RunDir(after).finish("finished")
+    files = pack({path.name: path for path in sorted(after.iterdir(), reverse=True)})
+    going = Job("on", ("--resume", str(run.path)), (run.path,), Path("runs"))
+    sent = JobBundle.of(going, 1)
+    back = BundleResult(0, "", "", 1, str(project.resolve() / run.path), files)
+    real, moved = Path.replace, itertools.count()
+
+    def killed(path: Path, target: Path) -> Path:
+        if next(moved) >= killed_after:
+            raise KeyboardInterrupt
+        return real(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", killed)
+        with suppress(KeyboardInterrupt):
+            import_run(going, sent, back)
+    # two files of the checkpoint, the pointer to it, the record
+    assert load_checkpoint(run, **hashes).tensors["w"].tolist() == [float(killed_after >= 3)]
+    assert run.status == ("finished" if killed_after >= 4 else "interrupted")
+    import_run(going, sent, back)
+    assert run.status == "finished"
+    assert load_checkpoint(run, **hashes).tensors["w"].tolist() == [1.0]
+    assert [path.name for path in run.path.parent.glob(".*")] == []
 
 
 @pytest.mark.usefixtures("project")
