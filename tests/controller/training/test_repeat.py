@@ -21,9 +21,9 @@ SPECS = ["traffic", "reach_n_avoid", "ship_safe", "ship_track", "navigation", "m
 QUICK = ["--batch", "16", "--held-out", "20", "--threads", "1", "--no-pictures"]
 START = """
 import sys
-from stlc.controller import train, trainer
-train.SAVE_EVERY = 20
-trainer.MARGIN_STATES = 16
+from stlc.controller.training import learner, loop
+loop.SAVE_EVERY = 20
+learner.MARGIN_STATES = 16
 from stlc.cli.framework.app import main
 sys.exit(main(sys.argv[1:]))
 """
