@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from stlc.controller.methods.planners import milp
@@ -101,6 +102,77 @@ def test_proofs_and_plans_agree_with_trial(cart: System, text: str) -> None:
     assert not bool(((best >= 0.0) & encoded.infeasible).any()), text
     clear = (best > 0.01) & ("norm" not in text and "^2" not in text)
     assert bool((encoded.satisfied | ~clear).all()), text
+
+
+PIECEWISE = """
+stlc: 1
+name: piecewise
+time: {{dt: 1 s, horizon: 3 steps, {mode}}}
+state:
+  p: {{range: [0, 2], clamp: true}}
+  q: {{range: [-9, 9]}}
+control:
+  a: {{range: [-1, 1]}}
+flow:
+  p: {p}
+  q: {q}
+held:
+  h: {{value: "{h}", before: 0}}
+init:
+  mixture:
+    - {{name: any, draw: {{p: "uniform(0, 2)", q: 0}}}}
+"""
+"""A system whose states are at the ends of a clamp, or of a condition, at many plans of a grid."""
+
+_ends = st.sampled_from([-1, 0, 0.5, 1, 2])
+_read = ["p", "q", "p + q", "q - 0.5 * p", "-p", "1"]
+_steered = [*_read, "a", "2 * a", "0.5 * a", "p + a", "q - a"]
+
+
+def _pieces(terms: list[str]) -> st.SearchStrategy[str]:
+    term = st.sampled_from(terms)
+    cond = st.builds("{} {} {}".format, term, st.sampled_from(["<=", "<", ">=", ">"]), _ends)
+    return st.recursive(
+        term,
+        lambda inner: (
+            st.builds("(if {} then {} else {})".format, cond, inner, inner)
+            | st.builds("ind({})".format, cond)
+            | st.builds("clip({} + {}, 0, 1)".format, inner, term)
+            | st.builds("max({}, {})".format, inner, inner)
+        ),
+        max_leaves=3,
+    )
+
+
+_wishes = st.builds("{} {} {}".format, st.sampled_from("pqh"), st.sampled_from(["<=", ">=", ">"]), _ends)
+_windows = st.sampled_from(["always[0 s, 3 s]", "eventually[1 s, 3 s]", "eventually[3 s, 3 s]"])
+_wanted = st.builds("{} {} and eventually[0 s, 3 s] {}".format, _windows, _wishes, _wishes)
+EULER = "integrator: euler, substeps: 1"
+
+
+@example(EULER, "a", "ind(p <= 0)", "q", "eventually[0 s, 3 s] q >= 1", 1.0)
+@example(EULER, "a", "if p > 0 then 0 else 1", "q", "eventually[0 s, 3 s] q >= 1", 1.0)
+@example(EULER, "ind(q <= 0)", "a", "p", "always[0 s, 3 s] q >= 0 and eventually[0 s, 3 s] p >= 2", 0.0)
+@given(
+    *(st.sampled_from([EULER, "discrete: true"]), _pieces(_steered), _pieces(_steered), _pieces(_read)),
+    *(_wanted, st.sampled_from([0.0, 0.5, 1.0, 2.0])),
+)
+def test_no_proof_is_contradicted_at_the_boundary_of_a_condition(
+    tmp_path_factory: pytest.TempPathFactory, mode: str, p: str, q: str, h: str, text: str, start: float
+) -> None:
+    path = tmp_path_factory.mktemp("piecewise") / "piecewise.yaml"
+    path.write_text(PIECEWISE.format(mode=mode, p=p, q=q, h=h))
+    system = System.load(path)
+    task = Task.of(parse(Source("piecewise.stl", f"signal p, q, h\nrequire r: {text}")), system)
+    task.__dict__["native"] = None
+    x0 = torch.zeros(1, len(system.names), dtype=torch.float64)
+    x0[:, system.names.index("p")] = start
+    plans = torch.tensor(list(product((-1.0, -0.5, 0.0, 0.25, 1.0), repeat=3))).double()[..., None]
+    best = float(task.judge(x0.expand(len(plans), -1), plans, states=False).rho.max())
+    found = plan(task, x0, "milp", budget=PlanBudget(5.0))
+    assert not (best >= 0.0 and bool(found.infeasible)), (best, text)
+    if bool(found.satisfied):
+        assert float(task.robustness(system.rollout(x0, found.plans))) >= -1e-6
 
 
 def test_the_greatest_robustness_is_found(cart: System) -> None:

@@ -489,10 +489,14 @@ class Encoding:
     def _choice(
         self, cond: ir.Formula, k: int, yes: Callable[[], Expression], no: Callable[[], Expression]
     ) -> Expression:
+        """Value of a choice; one branch alone where the bounds exclude the other.
+
+        In a relaxed encoding, a condition at its boundary holds and fails, and both branches remain.
+        """
         holds, fails = (self._decided(cond, k, holds=each) for each in (True, False))
-        if fails is False or holds is True:
+        if fails is False or (self._tight and holds is True):
             return yes()
-        if holds is False or fails is True:
+        if holds is False or (self._tight and fails is True):
             return no()
         return Expression(ZERO, ((1.0, Conditional(yes(), no(), holds, fails)),))
 
