@@ -153,6 +153,7 @@ EULER = "integrator: euler, substeps: 1"
 @example(EULER, "a", "ind(p <= 0)", "q", "eventually[0 s, 3 s] q >= 1", 1.0)
 @example(EULER, "a", "if p > 0 then 0 else 1", "q", "eventually[0 s, 3 s] q >= 1", 1.0)
 @example(EULER, "ind(q <= 0)", "a", "p", "always[0 s, 3 s] q >= 0 and eventually[0 s, 3 s] p >= 2", 0.0)
+@example("discrete: true", "p", "2 * a", "clip(p + q, 0, 1)", "eventually[1 s, 3 s] q >= 1.5", 0.5)
 @given(
     *(st.sampled_from([EULER, "discrete: true"]), _pieces(_steered), _pieces(_steered), _pieces(_read)),
     *(_wanted, st.sampled_from([0.0, 0.5, 1.0, 2.0])),

@@ -12,7 +12,8 @@ Without norms, both encodings are exact up to `MARGIN`. For norms, circles are r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -191,7 +192,7 @@ class Encoding:
             UnencodableError: an expression has no mixed-integer linear form.
         """
         row: Row = {name: number(value) for name, value in x0.items()}
-        once = _read_once(set(bounds), [*(num for _, num in lets), *step.values()])
+        once = _read_once(set(bounds), lets, step.values())
         for k in range(horizon):
             row[ir.ELAPSED] = number(float(k))
             self._invariants(requirements, row, k)
@@ -539,9 +540,10 @@ class Encoding:
     def _held(self, args: Sequence[Expression]) -> Expression | None:
         """Encode `clip(v + c u, low, high)` without clipping, as a variable that equals `v + c u`.
 
-        Here u is a control that no other expression reads, and v lies within [low, high]. If the sum
-        `v + c u` exceeds a bound, a u closer to 0 gives exactly this bound. So no behaviour is lost if the
-        sum is constrained to [low, high]. `args` contains the three arguments of `clip`.
+        Here u is a control that no other expression reads, not even through a result, and v lies within
+        [low, high]. If the sum `v + c u` exceeds a bound, a u closer to 0 gives exactly this bound. So no
+        behaviour is lost if the sum is constrained to [low, high]. `args` contains the three arguments of
+        `clip`.
 
         The result is None if v may leave the bounds, or if the arguments have another form.
         """
@@ -647,10 +649,23 @@ _FORMS: dict[str, Callable[[Encoding, list[Expression]], Expression]] = {
 """Built-in functions that are piecewise linear in all arguments."""
 
 
-def _read_once(names: set[str], nums: Sequence[ir.Num]) -> set[str]:
-    """Those signals in `names` that the expressions `nums` together read exactly once."""
-    reads = [leaf.name for num in nums for leaf in leaves(num) if isinstance(leaf, ir.Signal)]
-    return {name for name in names if reads.count(name) == 1}
+def _read_once(names: set[str], lets: Sequence[tuple[str, ir.Num]], nums: Iterable[ir.Num]) -> set[str]:
+    """Those signals in `names` that `nums` read exactly once, directly or through the results `lets`.
+
+    A result may be encoded as a multiple of a signal, so each of its readers counts as one of that signal.
+    """
+    reads = Counter[str]()
+
+    def read(num: ir.Num, times: int) -> None:
+        for leaf in leaves(num):
+            if isinstance(leaf, ir.Signal):
+                reads[leaf.name] += times
+
+    for num in nums:
+        read(num, 1)
+    for name, num in reversed(lets):
+        read(num, max(1, reads[name]))
+    return {name for name in names if reads[name] == 1}
 
 
 def _of_state(formula: ir.Formula) -> bool:
