@@ -249,6 +249,24 @@ def test_a_value_by_hand(num: ir.Num, box: tuple[float, float], wanted: tuple[fl
     assert wanted[1] <= found[1]
 
 
+@pytest.mark.parametrize("name", ["pow", "atan2"])
+@pytest.mark.parametrize("zero", [0.0, -0.0])
+def test_the_sign_of_a_zero_is_known_for_exact_operands_only(name: str, zero: float) -> None:
+    """The power has a pole at 0, and the angle a cut beside it; operations on boxes lose the sign."""
+    num, others = call(name), np.array([-3.0, -2.0, -1.0])
+    for first in (Intervals(np.full(3, zero), np.ones(3)), Intervals(np.full(3, zero), np.full(3, zero))):
+        found = values(num, {"x": first, "y": Intervals.point(others)}, INTERVALS)
+        for sign in (1.0, -1.0):
+            with np.errstate(all="ignore"):
+                point = values(num, {"x": np.full(3, sign * 0.0), "y": others})
+            assert ((found.low <= point) & (point <= found.high)).all()
+    with np.errstate(all="ignore"):
+        exact = values(num, {"x": Intervals.point(np.full(3, zero)), "y": Intervals.point(others)}, INTERVALS)
+        point = values(num, {"x": np.full(3, zero), "y": others})
+    assert ((exact.low <= point) & (point <= exact.high)).all()
+    assert name == "pow" or (exact.high - exact.low < 1e-13).all()
+
+
 def test_every_function_has_a_tight_method() -> None:
     for name, function in FUNCTIONS.items():
         found = getattr(IntervalOps, name, None)

@@ -247,6 +247,11 @@ def ends(x: Operand) -> tuple[End, End]:
     return x, x
 
 
+def is_exact(x: Operand) -> bool:
+    """True if it is known that an operand has no width: it is then the number that NumPy computes."""
+    return not isinstance(x, Intervals) or x.is_point
+
+
 def selected_from(function: Callable[[list[Any]], Any], parts: Sequence[Intervals]) -> Intervals:
     """Return the result of a non-decreasing selection from several arrays; see `Intervals.selected`.
 

@@ -36,6 +36,7 @@ from stlc.compile.backends.array.interval import (
     ends,
     extremum,
     hull,
+    is_exact,
     known,
     magnitudes,
     mul,
@@ -101,15 +102,16 @@ class IntervalOps(FloatConstants):
         """`a ^ b`; unknown where `a` may be negative and `b` is not one whole number, and at a pole."""
         if isinstance(b, float) and b.is_integer():
             return _whole_power(a, b)
-        (a_low, _), (b_low, b_high) = ends(a), ends(b)
+        (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
         found = _widened(*corners(np.power, a, b))
+        pole = np.less_equal(a_low, 0.0) & np.greater_equal(a_high, 0.0) & np.less(b_low, 0.0)
         whole = np.equal(b_low, b_high) & np.equal(np.floor(b_low), b_low) & np.less(a_low, 0.0)
         if np.any(whole):
             powers = _whole_power(a, np.where(whole, b_low, 1.0))
             found = Intervals(
                 np.where(whole, powers.low, found.low), np.where(whole, powers.high, found.high)
             )
-        return unbounded_where(np.less(a_low, 0.0) & ~whole, found)
+        return unbounded_where(np.asarray(pole | (np.less(a_low, 0.0) & ~whole)), found)
 
     def mod(self, a: Operand, b: Operand) -> Intervals:
         """Floored modulo: unknown where `b` may be 0; the whole range of the remainder where it jumps."""
@@ -125,11 +127,15 @@ class IntervalOps(FloatConstants):
         return unbounded_where(np.less_equal(b_low, 0.0) & np.greater_equal(b_high, 0.0), known(low, high))
 
     def atan2(self, a: Operand, b: Operand) -> Intervals:
-        """Angle of the point (b, a); all angles where the box of points reaches the cut or the origin."""
-        (y_low, y_high), (x_low, x_high) = ends(a), ends(b)
+        """Angle of the point (b, a); all angles where the box of points reaches the cut or the origin.
+
+        On the cut, the sign of a zero decides between -pi and pi. It is known for exact operands only.
+        """
+        (y_low, y_high), (x_low, _) = ends(a), ends(b)
         found = _widened(*corners(np.arctan2, a, b))
+        if is_exact(a) and is_exact(b):
+            return found
         crossing = np.less_equal(y_low, 0.0) & np.greater_equal(y_high, 0.0) & np.less_equal(x_low, 0.0)
-        crossing &= np.not_equal(y_low, y_high) | np.not_equal(x_low, x_high)
         if not np.any(crossing):
             return found
         return Intervals(np.where(crossing, -_PI, found.low), np.where(crossing, _PI, found.high))
