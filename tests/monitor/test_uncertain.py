@@ -57,6 +57,24 @@ def test_amounts_are_written_as_they_are_read() -> None:
         assert str(Uncertainty.parse(text)) == text
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "abs(log(x)) >= 0",
+        "min(log(x), 5) <= 5",
+        "sin(1 / x) <= 1",
+        "(1 / x) % 2 >= 0",
+        "max(sqrt(x), 0) >= 0",
+    ],
+)
+def test_a_value_that_may_be_undefined_decides_nothing(text: str) -> None:
+    """A function with a bounded range does not make a value of what has none."""
+    monitor = Monitor(f"signal x\nrequire r: always {text}", dt=1.0)
+    errors = {"x": Uncertainty(0.01)}
+    assert monitor.check({"x": [0.5, 1.0]}, uncertain=errors).overall == "satisfied"
+    assert monitor.check({"x": [0.0, -1.0, 0.0]}, uncertain=errors).overall == "inconclusive"
+
+
 def test_bounds_by_hand() -> None:
     given = {"x": [1.0, 1.5], "v": [40.0, 30.0], "p": np.zeros((2, 2)), "on": [0.0, 1.0]}
     errors = {"x": Uncertainty.parse("10cm"), "v": Uncertainty.parse("10%"), "p": Uncertainty.parse("0.3")}

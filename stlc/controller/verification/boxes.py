@@ -118,9 +118,9 @@ class Conditions:
         effects = np.full((coordinates, len(sure)), 1e-12)
         for margin in self._margins(states, FORMS).values():
             bound = margin.range
-            crossing = (bound.low < 0.0) & (bound.high > 0.0)
+            crossing = ~((bound.low >= 0.0) | (bound.high <= 0.0))
             share = np.abs(margin.generators[:coordinates]) / np.maximum(margin.radius, 1e-300)
-            effects[: len(share)] += share * crossing
+            effects[: len(share)] += np.where(crossing, np.nan_to_num(share), 0.0)
         return Truths(sure, possible, effects.T)
 
 

@@ -49,8 +49,8 @@ class Flow:
             symbols: number of symbols of the forms in `env`. One more stands for the time within the substep.
 
         Returns:
-            State -> forms, (batch,). The remainder of an element is infinite if no enclosure of its solution
-            was found.
+            State -> forms, (batch,). The remainder of an element is NaN if no enclosure of its solution was
+            found: there may be none.
         """
         batch, length = len(next(iter(env.values())).centre), self._length
         start = {name: form.range for name, form in env.items()}
@@ -70,7 +70,7 @@ class Flow:
         for name in self._moved:
             mean = _lumped(spread(found[name], batch), symbols, linear=True).times(length)
             moved = FORMS.add(env[name], mean).widened(0.0, SLACK)
-            later[name] = Forms(moved.centre, moved.generators, np.where(contained, moved.rest, np.inf))
+            later[name] = Forms(moved.centre, moved.generators, np.where(contained, moved.rest, np.nan))
         return later
 
     def _enclosed(self, start: Mapping[str, Intervals]) -> tuple[dict[str, Intervals], Bools]:

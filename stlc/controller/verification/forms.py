@@ -41,7 +41,7 @@ class Forms:
     Attributes:
         centre: (batch,).
         generators: (symbols, batch); a form may have fewer than others, the missing ones are 0.
-        rest: radius of the remainder, (batch,).
+        rest: radius of the remainder, (batch,); NaN where the value may be undefined.
         floor: lower bounds that are known in addition to the form, (batch,); None if none are known. The
             result of `relu`, for example, is at least 0, although its form may extend below 0.
         ceiling: upper bounds that are known in addition to the form, (batch,); None if none are known.
@@ -64,9 +64,11 @@ class Forms:
 
     @staticmethod
     def between(low: Floats, high: Floats) -> Forms:
-        """Return forms without shared symbols that contain all values from `low` to `high`."""
-        finite = np.isfinite(low) & np.isfinite(high)
-        low, high = np.where(finite, low, -np.inf), np.where(finite, high, np.inf)
+        """Return forms without shared symbols that contain all values from `low` to `high`.
+
+        Where the ends are NaN, the remainder is NaN: the value may be undefined.
+        """
+        finite, low, high = _unbounded(low, high)
         centre = np.where(finite, 0.5 * np.where(finite, low, 0.0) + 0.5 * np.where(finite, high, 0.0), 0.0)
         return Forms(centre, np.zeros((0, *centre.shape)), np.maximum(high - centre, centre - low))
 
@@ -86,17 +88,14 @@ class Forms:
 
     @property
     def range(self) -> Intervals:
-        """Intervals that contain the forms."""
+        """Intervals that contain the forms; undefined where the radius is NaN."""
         reach = self.radius + SLACK * (1.0 + np.abs(self.centre))
         low, high = self.centre - reach, self.centre + reach
         if self.floor is not None:
             low = np.maximum(low, self.floor)
         if self.ceiling is not None:
             high = np.minimum(high, self.ceiling)
-        finite = np.isfinite(low) & np.isfinite(high)
-        if finite.all():
-            return Intervals(low, high)
-        return Intervals(np.where(finite, low, -np.inf), np.where(finite, high, np.inf))
+        return Intervals(*_unbounded(low, high)[1:])
 
     def times(self, factor: Any) -> Forms:
         """Product with exact numbers, one float or one per element; known bounds are kept for a float."""
@@ -136,6 +135,15 @@ class Forms:
 
 
 Operand: TypeAlias = Forms | float
+
+
+def _unbounded(low: Floats, high: Floats) -> tuple[Bools, Floats, Floats]:
+    """Which intervals have finite ends, and the ends: of the others NaN if one of them is, else infinite."""
+    finite = np.isfinite(low) & np.isfinite(high)
+    if finite.all():
+        return finite, low, high
+    most = np.where(np.isnan(low) | np.isnan(high), np.nan, np.inf)
+    return finite, np.where(finite, low, -most), np.where(finite, high, most)
 
 
 def _below(values: Floats) -> Floats:
@@ -388,12 +396,12 @@ class FormOps(FloatConstants):
     def gt(self, a: Operand, b: Operand) -> Belief:
         """`a > b`."""
         found = self.sub(a, b).range
-        return Belief(found.low > 0.0, found.high > 0.0)
+        return Belief(found.low > 0.0, ~(found.high <= 0.0))
 
     def ge(self, a: Operand, b: Operand) -> Belief:
         """`a >= b`."""
         found = self.sub(a, b).range
-        return Belief(found.low >= 0.0, found.high >= 0.0)
+        return Belief(found.low >= 0.0, ~(found.high < 0.0))
 
     def both(self, a: Belief, b: Belief) -> Belief:
         """Conjunction."""
@@ -417,7 +425,11 @@ class FormOps(FloatConstants):
         return self.add(chosen, other).widened(0.0, np.where(unsure, half, 0.0))
 
     def _scaled(self, x: Operand, factor: Floats) -> Forms:
-        return x.times(factor) if isinstance(x, Forms) else Forms.point(x * factor)
+        """`x` times a share; 0 where it is 0, even if `x` may be undefined there."""
+        if not isinstance(x, Forms):
+            return Forms.point(x * factor)
+        found = x.times(factor)
+        return Forms(found.centre, found.generators, np.where(factor == 0.0, 0.0, found.rest))
 
     def full(self, shape: tuple[int, ...], value: float, like: Forms) -> Forms:  # noqa: ARG002
         """Array of a constant."""

@@ -102,7 +102,7 @@ class Judge:
         return BoxVerdicts(low, high, effects.T)
 
     def _sample(self, history: Mapping[str, Sequence[Forms]], at: int) -> dict[str, Forms]:
-        """Forms that the numbers read at a sample; what lies outside of the signals is unknown."""
+        """Forms that the numbers read at a sample; what lies outside of the signals is undefined."""
         like = next(iter(history.values()))[0].centre
         env: dict[str, Forms] = {}
         for name in self._program.columns:
@@ -115,7 +115,7 @@ class Judge:
             if shifted is not None and shifted.clamped:
                 place = min(max(place, 0), len(forms) - 1)
             if not 0 <= place < len(forms):
-                env[name] = Forms.between(like - np.inf, like + np.inf)
+                env[name] = Forms.between(like * np.nan, like * np.nan)
             elif self._apart and place != at:
                 bound = forms[place].range
                 env[name] = Forms.between(bound.low, bound.high)
@@ -126,7 +126,7 @@ class Judge:
     def _add_effects(self, effects: Floats, forms: Sequence[Forms], bound: Intervals) -> None:
         """Add the share of each symbol in the radius of every form that may have both signs."""
         for row, form in enumerate(forms):
-            crossing = (bound.low[row] < 0.0) & (bound.high[row] > 0.0)
+            crossing = ~((bound.low[row] >= 0.0) | (bound.high[row] <= 0.0))
             if crossing.any():
                 share = np.abs(form.generators[: len(effects)]) / np.maximum(form.radius, 1e-300)
                 effects[: len(share)] += np.where(crossing, np.nan_to_num(share), 0.0)

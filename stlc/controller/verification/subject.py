@@ -177,7 +177,7 @@ class VerificationSubject(ABC):
         total = np.full((count, batch), 1e-12)
         for name in self._moved:
             for form in history[name]:
-                share = np.abs(form.generators[:count]) / self._sizes[name]
+                share = np.nan_to_num(np.abs(form.generators[:count])) / self._sizes[name]
                 total[: len(share)] += share
         return total.T
 

@@ -162,7 +162,7 @@ class TubeModel:
         low = torch.from_numpy(np.stack([each.low for each in found], 1))
         high = torch.from_numpy(np.stack([each.high for each in found], 1))
         low[broken], high[broken] = -torch.inf, torch.inf
-        return Tube({name: ranges(forms) for name, forms in history.items()}, low, high)
+        return Tube({name: INTERVALS.margin(ranges(forms)) for name, forms in history.items()}, low, high)
 
     def _history(self, x: Floats, u: Floats, steps: int) -> dict[str, list[Forms]]:
         """Forms of the states under plans `u`, (B, T, m): name -> one form (B,) per sample.
@@ -379,8 +379,8 @@ def _margins(program: ArrayProgram, env: Mapping[str, Intervals], forms: Mapping
         linear = form.range
     except ValueError:
         return plain
-    low: Floats = np.maximum(plain.low, linear.low)
-    return Intervals(low, np.maximum(np.minimum(plain.high, linear.high), low))
+    low: Floats = np.fmax(plain.low, linear.low)  # one is NaN where it alone cannot exclude undefined values
+    return Intervals(low, np.maximum(np.fmin(plain.high, linear.high), low))
 
 
 def _stacked(history: Mapping[str, list[Forms]]) -> _Env:

@@ -46,7 +46,8 @@ EXACT = ("neg", "abs", "min", "max", "clip", "relu", "floor", "ceil", "round", "
 
 
 def values(num: ir.Num, env: dict[str, Any], ops: Ops = NUMPY, **more: Any) -> Any:
-    return ArrayProgram({"out": num}, **more)(env, ops)["out"]
+    """Values of a number; as margins of predicates, all numbers where an interval may be undefined."""
+    return ops.margin(ArrayProgram({"out": num}, **more)(env, ops)["out"])
 
 
 def call(name: str) -> ir.Num:
@@ -73,6 +74,7 @@ def test_every_function_of_the_table_contains_its_values(name: str) -> None:
     rng = np.random.default_rng(len(name))
     env = {key: boxes(rng, 3000) for key in "xyz"}
     found = values(call(name), env, INTERVALS)
+    after = values(ir.Op("atan", (call(name),)), env, INTERVALS)
     assert not np.isnan(found.low).any()
     assert not np.isnan(found.high).any()
     known = 0
@@ -82,6 +84,8 @@ def test_every_function_of_the_table_contains_its_values(name: str) -> None:
         defined = ~np.isnan(point)
         known += int(defined.sum())
         assert ((found.low <= point) & (point <= found.high))[defined].all()
+        for end in (found.low, found.high, after.low, after.high):
+            assert np.isinf(end[~defined]).all()
     assert known > 300
 
 
@@ -116,7 +120,7 @@ def test_sums_products_and_quotients_contain_the_exact_values(ends: list[float],
             assert holds(found, exact)
         assert holds(INTERVALS.square(one), x * x)
         if c <= 0 <= d:
-            assert div(one, other).low[0] == -math.inf
+            assert pair(INTERVALS.margin(div(one, other))) == UNKNOWN
         else:
             assert holds(div(one, other), x / y)
 
@@ -274,19 +278,46 @@ def test_every_function_has_a_tight_method() -> None:
 
 
 def test_a_function_without_a_method_is_bounded_by_its_table_entry() -> None:
-    assert pair(_anything(None, one(0.0, 1.0))) == UNKNOWN
+    assert pair(INTERVALS.margin(_anything(None, one(0.0, 1.0)))) == UNKNOWN
+    assert pair(INTERVALS.margin(_anything((-1.0, 2.0), one(math.nan, math.nan)))) == UNKNOWN
     low, high = pair(_anything((-1.0, 2.0), one(0.0, 1.0), 3.0))
     assert (low, high) == pytest.approx((-1.0, 2.0))
     assert (low <= -1.0, high >= 2.0) == (True, True)
 
 
-def test_an_unknown_value_is_bounded_again_by_what_bounds_it() -> None:
-    root = ir.Op("sqrt", (X,))
-    for num, wanted in (
-        (ir.Op("clip", (root, ir.Const(0.0), ir.Const(1.0))), (0.0, 1.0)),
-        (ir.Op("min", (root, ir.Const(2.0))), (-math.inf, 2.0)),
-    ):
-        assert pair(values(num, {"x": one(-1.0, 4.0)}, INTERVALS)) == wanted
+ROOT = ir.Op("sqrt", (X,))
+HALVES = ir.Op("div", (ir.Const(1.0), X))
+
+
+@pytest.mark.parametrize(
+    "num",
+    [
+        *(ir.Op(name, (ROOT,)) for name in ("abs", "square", "sin", "cos", "relu", "sign", "atan", "tanh")),
+        *(ir.Op(name, (HALVES,)) for name in ("sin", "cosh", "exp", "floor")),
+        ir.Op("clip", (ROOT, ir.Const(0.0), ir.Const(1.0))),
+        *(ir.Op(name, (HALVES, ir.Const(2.0))) for name in ("min", "max", "mod", "pow", "atan2", "norm")),
+        *(ir.Op(name, (ir.Const(2.0), HALVES)) for name in ("min", "mod", "pow", "atan2", "norm", "div")),
+        ir.Op("mul", (ROOT, ROOT)),
+        ir.Where(ir.Predicate(Y), ROOT, ir.Const(1.0)),
+    ],
+)
+def test_what_is_computed_from_an_undefined_value_is_not_bounded_again(num: ir.Num) -> None:
+    box = {"x": one(-1.0, 4.0), "y": one(-1.0, 1.0)}
+    assert pair(values(num, box, INTERVALS)) == UNKNOWN
+    (found,) = evaluate([ir.Predicate(num)], box, ops=INTERVALS)
+    assert pair(found) == UNKNOWN
+
+
+def test_a_sine_of_what_may_be_infinite_is_undefined() -> None:
+    assert pair(values(ir.Op("sin", (X,)), {"x": one(0.0, math.inf)}, INTERVALS)) == UNKNOWN
+    assert pair(values(ir.Op("exp", (X,)), {"x": one(0.0, 1e9)}, INTERVALS))[1] == math.inf
+
+
+def test_a_condition_on_an_undefined_value_is_unknown_and_its_choice_is_not() -> None:
+    choice = ir.Where(ir.Predicate(ROOT), ir.Const(1.0), ir.Const(2.0))
+    assert pair(values(choice, {"x": one(-1.0, 4.0)}, INTERVALS)) == pytest.approx((1.0, 2.0))
+    aside = ir.Where(ir.Predicate(Y), ir.Const(1.0), ROOT)
+    assert pair(values(aside, {"x": one(-1.0, 4.0), "y": one(1.0, 2.0)}, INTERVALS)) == (1.0, 1.0)
 
 
 def test_a_root_of_squares_is_known_at_0() -> None:

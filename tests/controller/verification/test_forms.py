@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.compile.backends.array.arith import ArrayProgram
+from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.controller.verification.forms import FORMS, Forms, ranges, tanh
+from stlc.controller.verification.judged import Judge
 
 BATCH, SYMBOLS = 5, 3
 
@@ -102,5 +105,47 @@ def test_the_tangent_is_followed() -> None:
 
 def test_what_is_not_finite_may_be_anything() -> None:
     box = FORMS.div(Forms.point(np.ones(1)), symbol(-1.0, 1.0))
-    assert (box.range.low[0], box.range.high[0]) == (-np.inf, np.inf)
+    found = INTERVALS.margin(box.range)
+    assert (found.low[0], found.high[0]) == (-np.inf, np.inf)
     assert ranges([box, box]).shape == (2, 1)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        *(FORMS.abs, FORMS.square, FORMS.sin, FORMS.cos, FORMS.relu, FORMS.tanh, FORMS.sigmoid, FORMS.exp),
+        lambda x: FORMS.clamp(x, 0.0, 1.0),
+        lambda x: FORMS.minimum(x, Forms.point(np.ones(1))),
+        lambda x: FORMS.mod(x, 2.0),
+        lambda x: FORMS.where(FORMS.gt(symbol(-1.0, 1.0), 0.0), x, 1.0),
+    ],
+)
+def test_what_is_computed_from_an_undefined_form_is_undefined(function: Callable[[Forms], Forms]) -> None:
+    with FORMS.quiet():
+        for undefined in (
+            FORMS.div(Forms.point(np.ones(1)), symbol(-1.0, 1.0)),
+            FORMS.log(symbol(-1.0, 1.0)),
+        ):
+            found = function(undefined).range
+            assert np.isnan(found.low).all()
+            assert np.isnan(found.high).all()
+
+
+def test_a_choice_without_the_undefined_branch_is_known() -> None:
+    with FORMS.quiet():
+        undefined = FORMS.log(symbol(-1.0, 1.0))
+        assert FORMS.where(FORMS.gt(symbol(1.0, 2.0), 0.0), 3.0, undefined).range.low[0] == pytest.approx(3.0)
+        truth = FORMS.gt(undefined, 0.0)
+    assert (truth.sure.item(), truth.possible.item()) == (False, True)
+
+
+@pytest.mark.parametrize(
+    "num",
+    [
+        ir.Op("abs", (ir.Op("log", (ir.Signal("x"),)),)),
+        ir.Op("abs", (ir.ShiftedSignal("x", 1),)),  # beyond the last sample a predicate is false
+    ],
+)
+def test_a_margin_that_may_be_undefined_proves_nothing(num: ir.Num) -> None:
+    verdicts = Judge([ir.Predicate(num)], end="truncate")({"x": [symbol(-0.5, 1.0)]}, 1)
+    assert verdicts.low.tolist() == [-np.inf]

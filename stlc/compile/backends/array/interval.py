@@ -2,7 +2,8 @@
 
 Results are rounded outward, so that an interval contains the exact value, and the value that the same
 operations compute in float64, for all values of the operands (Moore, Kearfott and Cloud 2009, chapter 3).
-An undefined result, such as 0 / 0 or the root of a negative number, is the interval from -inf to +inf.
+Where a result may be undefined, such as 1 / 0 or the root of a negative number, both ends are NaN, and so
+are those of everything that is computed from it. As the margin of a predicate it is any number (`margin`).
 
 An operation rounds to nearest, and its ends are then moved outward by a bound on the rounding error (Rump,
 Zimmermann, Boldo and Melquiond 2009). Ends are moved when an operation reads them. An extremum, a window
@@ -279,11 +280,11 @@ def extremum(function: Callable[[list[Any]], Any], parts: Sequence[Intervals]) -
 
 
 def known(low: End, high: End) -> Intervals:
-    """Return the intervals from `low` to `high`; an end that is NaN becomes infinite."""
+    """Return the intervals from `low` to `high`; where one end is NaN, the other becomes NaN too."""
     same = low is high
-    if _has_nan(low) or (not same and _has_nan(high)):
+    if not same and (_has_nan(low) or _has_nan(high)):
         undefined = np.isnan(low) | np.isnan(high)
-        return Intervals(np.where(undefined, -np.inf, low), np.where(undefined, np.inf, high))
+        low, high = np.where(undefined, np.nan, low), np.where(undefined, np.nan, high)
     first = np.asarray(low, dtype=np.float64)
     return Intervals(first, first if same else np.asarray(high, dtype=np.float64))
 
@@ -316,7 +317,8 @@ def widened(low: End, high: End, error: RoundingError = SUM, bound: float | None
         first = np.asarray(low, dtype=np.float64)
         last = first if low is high else np.asarray(high, dtype=np.float64)
         return Intervals(first, last, error, bound)
-    return known(low - _slack(low, error), high + _slack(high, error))
+    least, most = low - _slack(low, error), high + _slack(high, error)
+    return known(np.where(low == np.inf, -np.inf, least), np.where(high == -np.inf, np.inf, most))
 
 
 def _slack(values: End, error: RoundingError) -> Floats:
@@ -380,11 +382,11 @@ def mul(a: Operand, b: Operand) -> Intervals:
 
 
 def div(a: Operand, b: Operand) -> Intervals:
-    """`a / b`; unknown where `b` may be 0."""
+    """`a / b`; undefined where `b` may be 0."""
     b_low, b_high = ends(b)
     through_zero = np.logical_and(np.less_equal(b_low, 0.0), np.greater_equal(b_high, 0.0))
     found = _extremes(a, b, np.true_divide, None)
-    return unbounded_where(through_zero, found) if through_zero.any() else found
+    return undefined_where(through_zero, found) if through_zero.any() else found
 
 
 def _extremes(a: Operand, b: Operand, function: Callable[[Any, Any], Any], bound: float | None) -> Intervals:
@@ -465,10 +467,18 @@ def magnitudes(x: Operand) -> Intervals:
     return Intervals(np.maximum(np.maximum(low, -high), 0.0), np.maximum(-low, high))
 
 
-def unbounded_where(undefined: Bools, x: Intervals) -> Intervals:
-    """Copy of `x` in which the elements where `undefined` is True may have any value."""
-    if not undefined.any():
+def undefined_where(mask: Bools, x: Intervals) -> Intervals:
+    """Copy of `x` whose elements may be undefined where `mask` is True."""
+    if not mask.any():
         return x
+    return Intervals(np.where(mask, np.nan, x.low), np.where(mask, np.nan, x.high))
+
+
+def margin(x: Intervals) -> Intervals:
+    """Return `x` with all numbers in place of the elements that may be undefined."""
+    if bound(x) < np.inf or not _has_nan(x.low):
+        return x
+    undefined = np.isnan(x.low)
     return Intervals(np.where(undefined, -np.inf, x.low), np.where(undefined, np.inf, x.high))
 
 

@@ -1,8 +1,9 @@
 """Array operations on intervals: bounds on every value, and so on robustness, over a box of signals.
 
-The evaluators run unchanged over this array library. A condition on intervals is true, false or unknown; a
-choice by an unknown condition is the hull of both values. Extrema over windows and `until` are monotone in
-their operands, so each end of an interval is computed by NumPy with the same algorithms as for numbers.
+The evaluators run unchanged over this array library. A condition on intervals is true, false or unknown, and
+unknown on an undefined value; a choice by an unknown condition is the hull of both values. Extrema over
+windows and `until` are monotone in their operands, so each end of an interval is computed by NumPy with the
+same algorithms as for numbers.
 
 The functions of NumPy are within 4 units in the last place (the bound that its own tests assert for the
 vectorised ones). A value computed inside an interval and the value at its end may be off in opposite
@@ -39,9 +40,10 @@ from stlc.compile.backends.array.interval import (
     is_exact,
     known,
     magnitudes,
+    margin,
     mul,
     selected_from,
-    unbounded_where,
+    undefined_where,
     widened,
     within,
 )
@@ -81,6 +83,7 @@ class IntervalOps(FloatConstants):
     mul = staticmethod(mul)
     div = staticmethod(div)
     abs = staticmethod(magnitudes)
+    margin = staticmethod(margin)
 
     # ---------------------------------------------------------------------------- arithmetic
 
@@ -95,11 +98,11 @@ class IntervalOps(FloatConstants):
         return Intervals(np.maximum(found.low, 0.0), found.high)
 
     def sqrt(self, x: Operand) -> Intervals:
-        """Square root; unknown where `x` may be negative."""
+        """Square root; undefined where `x` may be negative."""
         return widened(*_mapped(np.sqrt, x))
 
     def pow(self, a: Operand, b: Operand) -> Intervals:
-        """`a ^ b`; unknown where `a` may be negative and `b` is not one whole number, and at a pole."""
+        """`a ^ b`; undefined where `a` may be negative and `b` is not one whole number, and at a pole."""
         if isinstance(b, float) and b.is_integer():
             return _whole_power(a, b)
         (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
@@ -111,10 +114,10 @@ class IntervalOps(FloatConstants):
             found = Intervals(
                 np.where(whole, powers.low, found.low), np.where(whole, powers.high, found.high)
             )
-        return unbounded_where(np.asarray(pole | (np.less(a_low, 0.0) & ~whole)), found)
+        return undefined_where(np.asarray(pole | (np.less(a_low, 0.0) & ~whole)), found)
 
     def mod(self, a: Operand, b: Operand) -> Intervals:
-        """Floored modulo: unknown where `b` may be 0; the whole range of the remainder where it jumps."""
+        """Floored modulo: undefined where `b` may be 0; the whole range of the remainder where it jumps."""
         (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
         first, last = np.mod(a_low, b_low), np.mod(a_high, b_low)
         up = np.greater(b_low, 0.0)
@@ -124,7 +127,8 @@ class IntervalOps(FloatConstants):
         error = np.maximum(np.abs(b_low), np.abs(b_high)) * 4.0 * EPSILON
         low = np.where(smooth, first - error, np.where(up, 0.0, b_low))
         high = np.where(smooth, last + error, np.where(up, b_high, 0.0))
-        return unbounded_where(np.less_equal(b_low, 0.0) & np.greater_equal(b_high, 0.0), known(low, high))
+        through_zero = np.less_equal(b_low, 0.0) & np.greater_equal(b_high, 0.0)
+        return undefined_where(through_zero | np.isnan(first) | np.isnan(last), known(low, high))
 
     def atan2(self, a: Operand, b: Operand) -> Intervals:
         """Angle of the point (b, a); all angles where the box of points reaches the cut or the origin.
@@ -177,13 +181,13 @@ class IntervalOps(FloatConstants):
         return _wave(np.cos, x, 0.0)
 
     def tan(self, x: Operand) -> Intervals:
-        """Tangent; unknown where a pole may lie in the interval."""
+        """Tangent; undefined where a pole may lie in the interval."""
         low, high = ends(x)
         first, last = _crossed(low, high, np.pi, 0.5)
-        return unbounded_where(~(first > last), _monotone(np.tan, x))
+        return undefined_where(~(first > last), _monotone(np.tan, x))
 
     def acos(self, x: Operand) -> Intervals:
-        """Arc cosine, which falls; unknown outside of [-1, 1]."""
+        """Arc cosine, which falls; undefined outside of [-1, 1]."""
         high, low = _mapped(np.arccos, x)
         return _widened(low, high)
 
@@ -219,11 +223,11 @@ class IntervalOps(FloatConstants):
 
     def gt(self, a: Operand, b: Operand) -> Belief:
         (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
-        return Belief(np.greater(a_low, b_high), np.greater(a_high, b_low))
+        return Belief(np.greater(a_low, b_high), ~np.less_equal(a_high, b_low))
 
     def ge(self, a: Operand, b: Operand) -> Belief:
         (a_low, a_high), (b_low, b_high) = ends(a), ends(b)
-        return Belief(np.greater_equal(a_low, b_high), np.greater_equal(a_high, b_low))
+        return Belief(np.greater_equal(a_low, b_high), ~np.less(a_high, b_low))
 
     def both(self, a: Belief, b: Belief) -> Belief:
         """Conjunction."""
@@ -364,7 +368,7 @@ def _widened(low: End, high: End) -> Intervals:
 
 
 def _monotone(function: Callable[[Any], Any], x: Operand) -> Intervals:
-    """Function that rises wherever it is defined; unknown where an end is outside of its domain."""
+    """Function that rises wherever it is defined; undefined where an end is outside of its domain."""
     return _widened(*_mapped(function, x))
 
 
@@ -414,7 +418,9 @@ def _wave(function: Callable[[Any], Any], x: Operand, offset: float) -> Interval
         even = np.floor(half) == half
         least = np.where(inside & (several | ~even), -1.0, least)
         most = np.where(inside & (several | even), 1.0, most)
-    return widened(least, most, _ERROR, 1.1 if bound(x) < np.inf else None)
+    if bound(x) < np.inf:
+        return widened(least, most, _ERROR, 1.1)
+    return undefined_where(np.isnan(one) | np.isnan(other), widened(least, most, _ERROR))
 
 
 def _whole_power(a: Operand, exponent: float | Any) -> Intervals:
@@ -431,7 +437,7 @@ def _whole_power(a: Operand, exponent: float | Any) -> Intervals:
     positive = np.asarray(even | np.greater_equal(a_low, 0.0))
     found = Intervals(np.where(positive, np.maximum(found.low, 0.0), found.low), found.high)
     pole = np.less(exponent, 0.0) & np.less_equal(a_low, 0.0) & np.greater_equal(a_high, 0.0)
-    return unbounded_where(np.asarray(pole), found)
+    return undefined_where(np.asarray(pole), found)
 
 
 def _column(values: Floats, index: int) -> Floats:
@@ -440,10 +446,14 @@ def _column(values: Floats, index: int) -> Floats:
 
 
 def _anything(bounds: object, *args: Operand) -> Intervals:
-    """Result of a function that has no method here: the constant range of its table entry, or all numbers."""
-    shape = np.broadcast_shapes(*(np.shape(ends(arg)[0]) for arg in args))
-    low, high = bounds if isinstance(bounds, tuple) else (-np.inf, np.inf)
-    return Intervals(np.full(shape, low - _RELATIVE * abs(low)), np.full(shape, high + _RELATIVE * abs(high)))
+    """Result of a function that has no method here: the constant range of its table entry.
+
+    Without one, and where an operand may be undefined, it is undefined.
+    """
+    undefined = reduce(np.logical_or, (np.isnan(ends(arg)[0]) for arg in args))
+    low, high = bounds if isinstance(bounds, tuple) else (np.nan, np.nan)
+    low, high = low - _RELATIVE * abs(low), high + _RELATIVE * abs(high)
+    return Intervals(np.where(undefined, np.nan, low), np.where(undefined, np.nan, high))
 
 
 for _name, _function in {

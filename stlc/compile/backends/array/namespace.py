@@ -128,6 +128,9 @@ class Ops(Protocol):
     def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
         """`no + weight (yes - no)`, exact if `weight` is 0 or 1; one of `no` and `yes` may be a float."""
 
+    def margin(self, x: Array) -> Array:
+        """`x` as the margin of a predicate: of intervals, any number where `x` may be undefined."""
+
     def infinite(self, mask: Mask, like: Array) -> Array:
         """Array that is +inf where `mask` is True, else -inf, in the dtype of `like`, without gradient."""
 
@@ -236,3 +239,7 @@ class FloatConstants:
     def constant(self, value: float, like: Array) -> float:  # noqa: ARG002
         """Return the float itself."""
         return value
+
+    def margin(self, x: Array) -> Array:
+        """Return `x` itself."""
+        return x

@@ -213,6 +213,8 @@ class Machine:
             known = parts[0]
             if node.guard:
                 known = ops.infinite(ops.gt(known, 0.0) if node.strict else ops.ge(known, 0.0), known)
+            else:
+                known = ops.margin(known)
             if whole:
                 return known
             known = padded(known, run.count - missing, outside)

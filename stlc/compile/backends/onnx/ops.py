@@ -144,6 +144,10 @@ class OnnxOps:
         parts = [each if isinstance(each, Value) else mask.sheet.constant(each, kind) for each in (yes, no)]
         return mask.apply("Where", *parts, kind=kind)
 
+    def margin(self, x: Value) -> Value:
+        """Return `x` itself."""
+        return x
+
     def infinite(self, mask: Value, like: Value) -> Value:  # noqa: ARG002
         return self.where(mask, math.inf, -math.inf)
 

@@ -188,6 +188,10 @@ class TorchOps:
     def lerp(self, no: Tensor | float, yes: Tensor | float, weight: Tensor) -> Tensor:
         return torch.lerp(*_pair(no, yes), weight)
 
+    def margin(self, x: Tensor) -> Tensor:
+        """Return `x` itself."""
+        return x
+
     def infinite(self, mask: Mask, like: Tensor) -> Tensor:
         """Array that is +inf where `mask` is True, else -inf, without gradient."""
         return torch.where(mask, self.constant(torch.inf, like), self.constant(-torch.inf, like))
