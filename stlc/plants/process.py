@@ -82,7 +82,7 @@ class PlantProcess:
         except BaseException:
             shutil.rmtree(self._scratch, ignore_errors=True)
             raise
-        self._tail, self._reading = bytearray(), threading.Lock()
+        self._tail, self._reading, self._ended = bytearray(), threading.Lock(), False
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         assert self._process.stderr is not None
@@ -190,9 +190,10 @@ class PlantProcess:
 
     def end(self) -> None:
         """Kill the process and its children, and remove its temporary files; any thread may call it."""
-        if self._process.returncode is None:
+        if not self._ended:  # once: the number of the group may be another's later
             with suppress(OSError):
                 os.killpg(self._process.pid, signal.SIGKILL)
+            self._ended = True
         self._process.wait()
         self._listener.join(_LAST_WORDS)
         for stream in (self._process.stdin, self._process.stdout):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import sys
 import threading
 import time
@@ -154,23 +155,36 @@ def _limit_memory(most: int) -> None:
 
 
 def _watch_parent() -> None:
-    """End this process when the one that started it has ended."""
+    """End this process, and those that the plant has started, when the one that started it has ended."""
     parent = os.getppid()
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(ORPHAN)
-        _remove_scratch()
-        os._exit(1)
+        _leave()
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _remove_scratch() -> None:
-    """Remove the folder for temporary files; it is left if the parent was killed."""
+def _leave() -> None:
+    """Remove the folder for temporary files, and end the whole session: nobody else does after the parent."""
     scratch = Path(os.environ.get("TMPDIR", ""))
     if scratch.name.startswith(SCRATCH):
         shutil.rmtree(scratch, ignore_errors=True)
+    if os.getpgrp() == os.getpid():  # not a group that is also the caller's
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
+def _disconnect(*numbers: int) -> None:
+    """Replace file descriptors by an empty file, in a process that the plant has forked.
+
+    It must neither answer requests, nor hold the streams open when the process of the plant has ended.
+    """
+    empty = os.open(os.devnull, os.O_RDWR)
+    for number in numbers:
+        os.dup2(empty, number, inheritable=False)
+    os.close(empty)
 
 
 def main() -> None:
@@ -181,9 +195,12 @@ def main() -> None:
     os.dup2(nowhere, 0)
     os.close(nowhere)
     os.dup2(2, 1)
+    own = os.getpid()
+    os.register_at_fork(after_in_child=lambda: _disconnect(inbox, outbox))
     with open(inbox, "rb") as requests, open(outbox, "wb") as replies:  # noqa: PTH123
         serve(requests, replies)
-    _remove_scratch()
+    if os.getpid() == own:  # else forked by the plant
+        _leave()
 
 
 if __name__ == "__main__":

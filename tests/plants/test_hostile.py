@@ -32,12 +32,14 @@ import numpy as np
 class Hostile:
     def reset(self, initial, params):
         self.mode, self.count = int(params["mode"]), 0
+        if self.mode == 14:
+            self.child()
         return [float(self.mode), 0.0]
 
     def step(self, inputs):
         self.count += 1
         if self.count == 5:
-            found = getattr(self, "mode_%d" % self.mode)()
+            found = getattr(self, "mode_%d" % self.mode, lambda: None)()
             if found is not None:
                 return found
         return [float(self.mode), float(self.count)]
@@ -83,9 +85,30 @@ class Hostile:
         time.sleep(600)
 
     def mode_9(self):
+        self.child()
+        sys.exit(3)
+
+    def mode_10(self):
+        self.child()
+        os._exit(3)
+
+    def mode_11(self):
+        self.child()
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+    def mode_12(self):
+        if (child := os.fork()) == 0:
+            time.sleep(600)
+        print("child", child, file=sys.stderr, flush=True)
+        os._exit(3)
+
+    def mode_13(self):
+        """Well-behaved, but forks, and lets the other process do what it does itself."""
+        os.fork()
+
+    def child(self):
         child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
         print("child", child.pid, file=sys.stderr, flush=True)
-        sys.exit(3)
 '''
 
 FILE = """\
@@ -110,6 +133,9 @@ REASONS = {
     7: ("error", "ValueError: no such valve"),
     8: ("bad message", "bytes"),
     9: ("error", "SystemExit: 3"),
+    10: ("crash", "exit code 3"),
+    11: ("crash", "SIGSEGV"),
+    12: ("crash", "exit code 3"),
 }
 
 
@@ -120,8 +146,8 @@ def hostile(folder: Path, **changes: str) -> Plant:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """One simulation of each kind, and then one that is well-behaved."""
-    modes = [*REASONS, 0]
+    """One simulation of each kind, and then two that are well-behaved."""
+    modes = [*REASONS, 13, 0]
     with hostile(tmp_path_factory.mktemp("endless"), limit=SHORT) as plant:
         (endless,) = plant.simulate(np.array([[float(ENDLESS)]]))
     with hostile(tmp_path_factory.mktemp("hostile")) as plant:
@@ -142,9 +168,9 @@ def test_a_failure_is_a_finding(runs, mode):
 
 
 def test_the_next_simulation_works(runs):
-    trace = runs[-1].outcome
-    assert isinstance(trace, Trace)
-    assert trace.data["two"][0].tolist() == [float(count) for count in range(11)]
+    for run in runs[-2:]:
+        assert isinstance(run.outcome, Trace)
+        assert run.outcome.data["two"][0].tolist() == [float(count) for count in range(11)]
 
 
 def test_a_finding_says_when_and_what_was_printed(runs):
@@ -156,8 +182,9 @@ def test_a_finding_says_when_and_what_was_printed(runs):
     assert "Traceback" in found[7].stderr
 
 
-def test_children_of_a_plant_end_with_it(runs):
-    told = runs[list(REASONS).index(9)].outcome.stderr.partition("child ")[2].split()
+@pytest.mark.parametrize("mode", [9, 10, 11, 12])
+def test_children_of_a_plant_end_with_it(runs, mode):
+    told = runs[list(REASONS).index(mode)].outcome.stderr.partition("child ")[2].split()
     assert gone(int(told[0]))
 
 
@@ -190,8 +217,9 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
 import numpy, sys
 from stlc.plants.plant import load_plant
 plant = load_plant("hostile.yaml")
-plant.simulate(numpy.array([[0.0]]))
-print(plant._processes[0]._process.pid, plant._processes[0]._scratch, flush=True)
+plant.simulate(numpy.array([[14.0]]))
+process = plant._processes[0]
+print(process._process.pid, process._said().split()[-1], process._scratch, flush=True)
 sys.stdin.read()
 """
     home = str(Path(__file__).parents[2])
@@ -203,10 +231,9 @@ sys.stdin.read()
         env={**os.environ, "PYTHONPATH": home},
     )
     assert parent.stdout is not None
-    number, scratch = parent.stdout.readline().decode().split()
+    *numbers, scratch = parent.stdout.readline().decode().split()
     assert Path(scratch).is_dir()
-    worker = int(number)
     parent.send_signal(signal.SIGKILL)
     parent.communicate()
-    assert gone(worker)
+    assert all(gone(int(number)) for number in numbers)
     assert not Path(scratch).exists()
