@@ -35,6 +35,8 @@ def columns(system: System, n: int, seed: int = 0) -> tuple[torch.Tensor, torch.
         ("uniform(2, 5)", 3.5, 3 / math.sqrt(12), 2, 5),
         ("normal(1, 2)", 1, 2, -math.inf, math.inf),
         ("truncnorm(0, 1, -1, 2)", 0.22962, 0.72129, -1, 2),
+        ("truncnorm(0, 1, 9, 20)", 9.10849, 0.10732, 9, 20),
+        ("truncnorm(1, 2, -39, -17)", -17.21705, 0.21461, -39, -17),
         ("bernoulli(0.3)", 0.3, math.sqrt(0.21), 0, 1),
         ("randint(3, 7)", 5, math.sqrt(2), 3, 7),
         ("choice(1, 4, 7)", 4, math.sqrt(6), 1, 7),

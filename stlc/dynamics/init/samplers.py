@@ -34,6 +34,10 @@ Draw: TypeAlias = Callable[[str, list[Any]], Array]
 
 _HARD = Hard()
 _SAMPLERS = frozenset(sampler_names())
+_FAR = 6.0
+"""Deviations from the mean beyond which `truncnorm` computes with logarithms of probabilities."""
+_TAIL_ROUNDS = 6
+"""Rounds of Newton's method there: more than the numbers change in."""
 
 
 @dataclass(slots=True)
@@ -176,9 +180,8 @@ def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
         case "normal", [mean, deviation]:
             return mean + deviation * rows.normals()
         case "truncnorm", [mean, deviation, low, high]:
-            below, above = (torch.special.ndtr((end - mean) / deviation) for end in (low, high))
-            quantile = torch.lerp(below, above, rows.uniforms())
-            return torch.clamp(mean + deviation * torch.special.ndtri(quantile), low, high)
+            first, last = ((end - mean) / deviation for end in (low, high))
+            return torch.clamp(mean + deviation * _between(first, last, rows.uniforms()), low, high)
         case "bernoulli", [chance]:
             return (rows.uniforms() < chance).to(torch.float64)
         case "randint", [low, high]:
@@ -189,6 +192,27 @@ def _draw(sampler: str, args: list[Tensor], rows: Rows) -> Tensor:
             return torch.stack(options).gather(0, index[None])[0]
         case _:
             raise ValueError(f"unknown sampler {sampler}")
+
+
+def _between(first: Tensor, last: Tensor, share: Tensor) -> Tensor:
+    """Standard normal numbers from `first` to `last`, at the given shares of the probability between them."""
+    quantile = torch.lerp(torch.special.ndtr(first), torch.special.ndtr(last), share)
+    found: Tensor = torch.special.ndtri(quantile)
+    far = (first * last > 0.0) & (torch.minimum(first.abs(), last.abs()) > _FAR)
+    return torch.where(far, _in_tail(first, last, share), found) if bool(far.any()) else found
+
+
+def _in_tail(first: Tensor, last: Tensor, share: Tensor) -> Tensor:
+    """Same as `_between` where both ends are far on one side, whose probabilities only logarithms hold."""
+    one, other = first.abs(), last.abs()
+    near, end = torch.minimum(one, other), torch.maximum(one, other)
+    start, least = (torch.special.log_ndtr(-each) for each in (near, end))
+    share = torch.where(one <= other, share, 1.0 - share)
+    rest = torch.maximum(torch.log1p(share * torch.expm1(least - start)), least - start)
+    x = torch.sqrt(near.square() - 2.0 * rest)
+    for _ in range(_TAIL_ROUNDS):  # Newton's method; the slope is that of the logarithm, nearly
+        x = x + (torch.special.log_ndtr(-x) - (start + rest)) / (x + 1.0 / x)
+    return torch.copysign(x, first)
 
 
 MAX_ROUNDS = 500
