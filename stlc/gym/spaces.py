@@ -92,7 +92,8 @@ def of_observation(task: Task, *, time: bool) -> SpaceBounds:
         least, most = min(ends[0], float(column.min())), max(ends[1], float(column.max()))
         if not math.isfinite(most - least):
             least, most = float(column.min()), float(column.max())
-        wider = 0.25 * max(most - least, 1e-3)
+        # also by several numbers of float32: bounds that are equal there have no normalised values between
+        wider = max(0.25 * max(most - least, 1e-3), 1e-6 * max(abs(least), abs(most)))
         found.append((least - wider, most + wider))
     return SpaceBounds.of([*found, *([(0.0, 1.0)] if time else [])])
 

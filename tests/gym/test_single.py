@@ -73,6 +73,20 @@ def test_actuators_get_the_action_where_a_feedback_lies_beneath_plans(tmp_path: 
     assert info["state"].tolist() == pytest.approx([0.5])
 
 
+def test_a_large_value_that_stays_has_a_normalised_one(tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_text(
+        "stlc: 1\nname: p\ntime: {dt: 0.1 s, horizon: 5 steps}\nstate: {x: {}, p: {unit: Pa}}\n"
+        "control: {u: {range: [-1, 1]}}\nflow: {x: u}\n"
+        "init: {mixture: [{draw: {x: 0.5, p: 101325 Pa}}]}\n"
+    )
+    (tmp_path / "p.stl").write_text("state signal x\nrequire r: always[0, T] x < 1\n")
+    files = tmp_path / "p.stl", tmp_path / "p.yaml"
+    plain, unit = stlc.gym.make(*files), stlc.gym.make(*files, normalised=True)
+    assert (plain.observation_space.low < plain.observation_space.high).all()
+    assert abs(plain.reset(seed=0)[0][1] - 101325) < 0.01
+    assert abs(unit.reset(seed=0)[0][1]) < 0.2
+
+
 @pytest.mark.parametrize("world", [False, True])
 def test_dense_rewards_sum_to_the_robustness_of_the_episode(world: bool) -> None:
     env = stlc.gym.make(ROOT / "specs" / "ship_safe.stl", reward="dense", world=world)
