@@ -43,8 +43,8 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     clipped to the actuator's range. `info` holds `state`, (n,) float64. After the last step, and with the
     reward `dense` after each step, it also holds `robustness` per requirement, `rho` of the whole
     specification, and `satisfied`. Robustness is computed from the last T steps of the episode, where T is
-    the number of steps of a plan, and clipped to ±10. While the episode is shorter than T steps, the time
-    windows of formulas are cut off at its last sample.
+    the number of steps of a plan, and clipped to ±10; NaN counts as -10. While the episode is shorter than T
+    steps, the time windows of formulas are cut off at its last sample.
 
     Args:
         task: specification and system.
@@ -167,7 +167,8 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         driven = torch.cat(self._driven[-self.task.horizon - 1 :]).numpy(force=True)
         columns = {name: driven[:, i, None] for i, name in enumerate(self.task.system.names)}
         margins = evaluate(self._formulas, columns, ops=NUMPY, end="truncate")
-        each = np.clip([float(np.broadcast_to(margin, (1, 1))[0, 0]) for margin in margins], -MOST, MOST)
+        exact = [float(np.broadcast_to(margin, (1, 1))[0, 0]) for margin in margins]
+        each = np.clip(np.nan_to_num(exact, nan=-MOST), -MOST, MOST)
         named = zip(self.task.rules, each, strict=True)
         return {
             **state,

@@ -19,7 +19,7 @@ from stlc.controller.methods._actor import ActorConfig, optimizer_tensors, resto
 from stlc.controller.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
 from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.problem.environments import MOST, Environments, Reward, reward_at_end
+from stlc.controller.problem.environments import Environments, Reward, reward_at_end
 from stlc.controller.training.checkpoint import below
 from stlc.diagnostics import usage
 
@@ -116,7 +116,7 @@ def final_reward(task: Task, kind: Reward, states: Tensor) -> Tensor:
 
     `kind`: `robustness` or `accuracy`, the two rewards that an episode earns at its end.
     """
-    return reward_at_end(kind, torch.nan_to_num(task.robustness(states), nan=-MOST))
+    return reward_at_end(kind, task.robustness(states))
 
 
 def step_rewards(task: Task, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:

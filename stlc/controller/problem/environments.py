@@ -44,14 +44,17 @@ def require_reward(task: Task, reward: str) -> None:
 
 
 def reward_at_end(reward: Reward, rho: Tensor) -> Tensor:
-    """Reward of episodes at their end, computed from their robustness: (N,) -> (N,); 0 for reward `task`."""
+    """Reward of episodes at their end, computed from their robustness: (N,) -> (N,); 0 for reward `task`.
+
+    Episodes whose robustness is NaN are violated.
+    """
     match reward:
         case "task":
             return torch.zeros_like(rho)
         case "accuracy":
             return SATISFIED * satisfied(rho).to(rho)
         case "robustness":
-            return torch.nan_to_num(rho).clamp(-MOST, MOST)
+            return torch.nan_to_num(rho, nan=-MOST).clamp(-MOST, MOST)
 
 
 @dataclass(frozen=True, slots=True)

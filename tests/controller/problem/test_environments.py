@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.problem.environments import SATISFIED, Environments
+from stlc.controller.problem.environments import SATISFIED, Environments, reward_at_end
 from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
@@ -44,6 +44,12 @@ def test_accuracy_rewards_satisfied_episodes_alone(car_task: Task) -> None:
     last = steps[-1]
     assert torch.equal(last.reward, SATISFIED * last.satisfied.float())
     assert 0 < int(last.satisfied.sum()) < 64
+
+
+def test_what_is_not_a_number_is_violated() -> None:
+    rho = torch.tensor([torch.nan, -torch.inf, -0.5, torch.inf])
+    assert reward_at_end("robustness", rho).tolist() == [-10.0, -10.0, -0.5, 10.0]
+    assert reward_at_end("accuracy", rho).tolist() == [0.0, 0.0, 0.0, SATISFIED]
 
 
 def test_episodes_move_as_the_model_says(car_task: Task) -> None:
