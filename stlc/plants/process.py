@@ -33,6 +33,8 @@ OPENING = 180.0
 """Seconds that a plant has to open, if a simulation may not take longer: imports on a busy machine."""
 _LAST_WORDS = 1.0
 """Seconds to wait for the standard error of a process that has ended; a child may hold it open."""
+_LONGEST = 1e6
+"""Seconds of one wait at most: `poll` takes milliseconds of 31 bits."""
 _LEAVING = 10.0
 """Seconds that a process which has closed its output has to end by itself, on a busy machine."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -100,9 +102,10 @@ class PlantProcess:
     def _open(self) -> None:
         """Open the plant. Raises the errors of the class."""
         decl = self._decl
-        deadline = time.monotonic() + max(float(decl.limits.time), OPENING)
+        limit = max(float(decl.limits.time), OPENING)
         try:
-            reply = self._exchanged({"layout": decl.layout(self._scratch).as_json()}, None, deadline)
+            layout = {"layout": decl.layout(self._scratch).as_json()}
+            reply = self._exchanged(layout, None, time.monotonic() + limit, limit)
         except FaultyError as error:
             raise _refused(
                 decl, f"the plant cannot be opened: {error.fault.message}", "", error.fault.stderr
@@ -131,7 +134,7 @@ class PlantProcess:
         Raises:
             FaultyError: the simulation failed. The process may have been ended; see `alive`.
         """
-        reply = self._exchanged(header, array, deadline)
+        reply = self._exchanged(header, array, deadline, float(self._decl.limits.time))
         reason = reply.header.get("fault")
         if reason is None:
             return reply
@@ -145,12 +148,13 @@ class PlantProcess:
             )
         )
 
-    def _exchanged(self, header: Mapping[str, Any], array: Floats | None, deadline: float) -> Message:
+    def _exchanged(
+        self, header: Mapping[str, Any], array: Floats | None, deadline: float, limit: float
+    ) -> Message:
         try:
             self._send(encoded(header, array), deadline)
             return received(lambda count: self._received(count, deadline))
         except TimeoutError:
-            limit = float(self._decl.limits.time)
             message = f"not finished within {limit:g} s of the clock"
             raise self._faulty("time limit", message) from None
         except (EOFError, BrokenPipeError):
@@ -271,9 +275,10 @@ def _await(number: int, event: int, deadline: float) -> None:
     """Wait until a file descriptor is ready. Raises TimeoutError at the deadline."""
     poll = select.poll()
     poll.register(number, event)
-    rest = deadline - time.monotonic()
-    if rest <= 0 or not poll.poll(rest * 1000):
-        raise TimeoutError
+    while (rest := deadline - time.monotonic()) > 0:
+        if poll.poll(1000 * min(rest, _LONGEST)):
+            return
+    raise TimeoutError
 
 
 def _refused(decl: PlantDecl, message: str, place: str, said: str) -> SystemFileError:

@@ -199,6 +199,24 @@ def test_a_plant_that_cannot_be_opened_has_a_place(tmp_path, changes, place, sai
     assert plant._processes == []
 
 
+def test_a_plant_that_does_not_open_says_how_long_it_had(tmp_path, monkeypatch):
+    monkeypatch.setattr("stlc.plants.process.OPENING", 0.25)
+    (tmp_path / "endless.py").write_text("import time\ntime.sleep(600)\n")
+    text = changed(FILE, python='"endless.py:f"', limit="{time: 0.1 s}")
+    with (
+        Plant(read(text, tmp_path)) as plant,
+        pytest.raises(SystemFileError, match=r"not finished within 0\.25 s"),
+    ):
+        plant.simulate(plant.random_point(0)[None])
+
+
+def test_a_time_limit_may_be_of_years(tmp_path):
+    pendulum(tmp_path)
+    with Plant(read(changed(FILE, limit="{time: 1e9 s}"), tmp_path)) as plant:
+        (run,) = plant.simulate(plant.random_point(0)[None])
+    assert isinstance(run.outcome, Trace)
+
+
 def test_a_missing_package_is_named(tmp_path):
     pendulum(tmp_path)
     (tmp_path / "fmpy.py").write_text("raise ImportError")
