@@ -29,7 +29,7 @@ class Tape:
     `torch`. They still draw from their generators; then the numbers for which the simulation's point has
     coordinates are replaced by the quantiles at these. The numbers of one simulation are numbered in the
     order of its calls. A generator that a world makes by `numpy.random.default_rng(SEED)` is replaced by a
-    `TapedGenerator`; numbers of other libraries are drawn as usual.
+    `TapedGenerator`, which does the same; numbers of other libraries are drawn as usual.
 
     Attributes:
         points: a point per simulation, (count, dim) float64 in [0, 1].
@@ -94,7 +94,7 @@ class Tape:
         row = self._row if generator is None else self._owners.get(id(generator), self._row)
         if row is None or drawn.numel() > MOST_NUMBERS:
             return drawn
-        if name == "randint" and _span(args, options) > MOST_VALUES:
+        if name == "randint" and _ends(args, options)[1] > MOST_VALUES:
             return drawn
         given = torch.from_numpy(self.given(row, drawn.numel()))
         return _READERS[name](drawn, given, args, options) if len(given) else drawn
@@ -103,7 +103,8 @@ class Tape:
 class TapedGenerator(np.random.Generator):
     """NumPy generator whose numbers are read from the point of a simulation, as far as the point goes.
 
-    The methods below read quantiles; all other methods draw as usual.
+    The methods below draw as usual, which also checks their arguments; then the numbers for which the point
+    has coordinates are replaced by the quantiles at these. All other methods draw as usual.
     """
 
     def __init__(
@@ -111,58 +112,103 @@ class TapedGenerator(np.random.Generator):
     ) -> None:
         super().__init__(source)
         self._given = given
+        self._usual = np.random.Generator(source)
 
-    def _quantiles(self, size: Any) -> Any:
-        """Quantiles in [0, 1), from the point and then drawn; a float if `size` is None."""
-        count = 1 if size is None else int(np.prod(size))
-        known = self._given(count) if self._given is not None and count <= MOST_NUMBERS else np.zeros(0)
-        found = np.concatenate((known, super().random(count - len(known))))
-        return float(found[0]) if size is None else found.reshape(size)
+    def _coordinates(self, count: int) -> NDArray[np.float64]:
+        """Coordinates for the next `count` numbers, (k,); fewer where the point ends."""
+        return np.zeros(0) if self._given is None or count > MOST_NUMBERS else self._given(count)
 
-    def random(self, size: Any = None, *_: Any, **__: Any) -> Any:
+    def _read(self, drawn: Any, quantiles: Callable[..., Any], *parameters: Any) -> Any:
+        """Numbers of one call, a scalar or in place, with those replaced for which there are coordinates.
+
+        `quantiles`: function of coordinates (k,), and of as many values of each parameter.
+        """
+        given = self._coordinates(np.size(drawn))
+        if not len(given):
+            return drawn
+        each = (np.broadcast_to(values, np.shape(drawn)).ravel()[: len(given)] for values in parameters)
+        found = quantiles(given, *each)
+        if not isinstance(drawn, np.ndarray):
+            return type(drawn)(found[0])
+        drawn.reshape(-1)[: len(given)] = found
+        return drawn
+
+    def random(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """Uniform numbers in [0, 1)."""
-        return self._quantiles(size)
+        below = 1.0 - np.finfo(dtype).epsneg
+        return self._read(self._usual.random(size, dtype, out), lambda at: np.minimum(at, below))
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
         """Uniform numbers from `low` to `high`."""
-        shape = np.broadcast_shapes(np.shape(low), np.shape(high))
-        drawn = self._quantiles(shape if size is None and shape else size)
-        return low + (np.subtract(high, low) if shape else high - low) * drawn
+        drawn = self._usual.uniform(low, high, size)
+        return self._read(drawn, lambda at, low, high: low + (high - low) * at, low, high)
 
-    def integers(self, low: Any, high: Any = None, size: Any = None, *_: Any, **__: Any) -> Any:
-        """Whole numbers from `low`, inclusive, to `high`, exclusive; from 0 to `low` if `high` is None."""
+    def integers(
+        self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False
+    ) -> Any:
+        """Whole numbers from `low` to `high`, exclusive unless `endpoint`; from 0 if `high` is None."""
+        drawn = self._usual.integers(low, high, size, dtype, endpoint)
         first, last = (0, low) if high is None else (low, high)
-        drawn = np.floor(first + (last - first) * self._quantiles(size))
-        return int(drawn) if size is None else drawn.astype(np.int64)
+        span = np.asarray(last) - np.asarray(first) + int(endpoint)
+        if np.any(span > MOST_VALUES):
+            return drawn
+        return self._read(
+            drawn, lambda at, first, span: first + np.floor(span * at).astype(np.int64), first, span
+        )
 
-    def standard_normal(self, size: Any = None, *_: Any, **__: Any) -> Any:
+    def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """Normal numbers with mean 0 and standard deviation 1."""
-        drawn = torch.as_tensor(self._quantiles(size), dtype=torch.float64).clamp(_INSIDE, 1.0 - _INSIDE)
-        found = torch.special.ndtri(drawn).numpy()
-        return float(found) if size is None else found
+        return self._read(self._usual.standard_normal(size, dtype, out), _standard_normals)
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
         """Normal numbers with mean `loc` and standard deviation `scale`."""
-        return loc + scale * self.standard_normal(size)
+        drawn = self._usual.normal(loc, scale, size)
+        return self._read(drawn, lambda at, loc, scale: loc + scale * _standard_normals(at), loc, scale)
 
-    def permutation(self, x: Any, *_: Any, **__: Any) -> Any:
-        """Shuffled copy of `x`, along its first axis, or of the whole numbers below `x`."""
+    def permutation(self, x: Any, axis: int = 0) -> Any:
+        """Shuffled copy of `x`, along an axis, or of the whole numbers below `x`."""
+        drawn = self._usual.permutation(x, axis)
         values = np.arange(x) if isinstance(x, int | np.integer) else np.asarray(x)
-        return values[np.argsort(self._quantiles(len(values)), kind="stable")]
+        given = self._coordinates(values.shape[axis])
+        whole = len(given) == values.shape[axis]
+        return np.take(values, np.argsort(given, kind="stable"), axis) if whole else drawn
 
     def choice(
-        self, a: Any, size: Any = None, replace: bool = True, p: Any = None, *_: Any, **__: Any
+        self,
+        a: Any,
+        size: Any = None,
+        replace: bool = True,
+        p: Any = None,
+        axis: int = 0,
+        shuffle: bool = True,
     ) -> Any:
-        """Elements of `a`, with the probabilities `p` if these are given."""
-        values = np.arange(a) if isinstance(a, int | np.integer) else np.asarray(a)
-        if not replace and size is not None:
-            if p is not None:
-                return super().choice(a, size, replace=False, p=p)
-            return self.permutation(values)[: int(np.prod(size))].reshape(size)
-        drawn = self._quantiles(size)
-        if p is None:
-            return values[np.floor(len(values) * np.asarray(drawn)).astype(np.int64)]
-        return values[np.minimum(np.searchsorted(np.cumsum(p), drawn, side="right"), len(values) - 1)]
+        """Elements of `a`, along an axis, with the probabilities `p` if these are given."""
+        if not replace and size is not None and p is not None:
+            return super().choice(a, size, replace, p, axis, shuffle)  # which calls `random`
+        plain = isinstance(a, int | np.integer)
+        count = a if plain else np.shape(a)[axis]
+        places = self._usual.choice(count, size, replace, p, 0, shuffle)
+        if replace or size is None:
+            ends = None if p is None else np.cumsum(p)[:-1]
+            places = self._read(
+                places,
+                lambda at: np.floor(count * at) if ends is None else np.searchsorted(ends, at, side="right"),
+            )
+        elif len(given := self._coordinates(count)) == count:
+            places = np.argsort(given, kind="stable")[: np.size(places)].reshape(np.shape(places))
+        return places if plain else np.take(a, places, axis)
+
+
+def _standard_normals(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Same as `_normal_quantiles`, for NumPy."""
+    found: NDArray[np.float64] = _normal_quantiles(torch.from_numpy(at)).numpy()
+    return found
+
+
+def _normal_quantiles(at: Tensor) -> Tensor:
+    """Quantiles of the standard normal distribution."""
+    found: Tensor = torch.special.ndtri(at.clamp(_INSIDE, 1.0 - _INSIDE))
+    return found
 
 
 def _replaced(drawn: Tensor, values: Tensor) -> Tensor:
@@ -173,16 +219,16 @@ def _replaced(drawn: Tensor, values: Tensor) -> Tensor:
 
 
 def _uniforms(drawn: Tensor, given: Tensor, *_: Any) -> Tensor:
-    return _replaced(drawn, given)
+    return _replaced(drawn, given.clamp(max=1.0 - 0.5 * torch.finfo(drawn.dtype).eps))
 
 
 def _normals(drawn: Tensor, given: Tensor, *_: Any) -> Tensor:
-    return _replaced(drawn, torch.special.ndtri(given.clamp(_INSIDE, 1.0 - _INSIDE)))
+    return _replaced(drawn, _normal_quantiles(given))
 
 
 def _integers(drawn: Tensor, given: Tensor, args: tuple[Any, ...], options: Mapping[str, Any]) -> Tensor:
-    low = _low(args, options)
-    return _replaced(drawn, low + torch.floor(given * _span(args, options)))
+    low, span = _ends(args, options)
+    return _replaced(drawn, low + torch.floor(given * span))
 
 
 def _permutation(drawn: Tensor, given: Tensor, *_: Any) -> Tensor:
@@ -198,17 +244,9 @@ _READERS: dict[str, Callable[..., Tensor]] = {
 """Functions of torch that are replaced while a tape is in effect."""
 
 
-def _low(args: tuple[Any, ...], options: Mapping[str, Any]) -> int:
-    """Least value of a call of `randint(high, size)` or `randint(low, high, size)`."""
-    if "low" in options:
-        return int(options["low"])
-    return int(args[0]) if len(args) > 1 and isinstance(args[1], int) else 0
-
-
-def _span(args: tuple[Any, ...], options: Mapping[str, Any]) -> float:
-    """Number of values of a call of `randint`."""
-    low = _low(args, options)
-    if "high" in options:
-        return float(int(options["high"]) - low)
-    numbers = [each for each in args[:2] if isinstance(each, int)]
-    return float(numbers[-1] - low) if numbers else math.inf
+def _ends(args: tuple[Any, ...], options: Mapping[str, Any]) -> tuple[int, float]:
+    """Least value, and number of values, of a call of `randint(high, size)` or `randint(low, high, size)`."""
+    numbers = [int(each) for each in args[:2] if isinstance(each, int | np.integer)]
+    high = int(options["high"]) if "high" in options else numbers.pop() if numbers else math.inf
+    low = int(options["low"]) if "low" in options else numbers.pop() if numbers else 0
+    return low, high - low
