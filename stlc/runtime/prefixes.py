@@ -61,8 +61,9 @@ class PrefixGrid:
         if self.size(length) > self.samples:
             return self._sampled(length)
         actions = np.array(list(product(*self.values)), dtype=np.float64)
-        index = np.indices((len(actions),) * length).reshape(length, -1).T
-        return np.ascontiguousarray(actions[index])  # which is laid out as the index is
+        places = len(actions) ** np.arange(length)[::-1]
+        found: NDArray[np.float64] = actions[np.arange(self.size(length))[:, None] // places % len(actions)]
+        return found
 
     def _sampled(self, length: int) -> NDArray[np.float64]:
         levels = np.array([len(values) for values in self.values] * length, dtype=np.uint64)

@@ -33,6 +33,11 @@ def test_a_grid_that_fits_is_tried_whole_and_in_order() -> None:
     assert (found.size(2), found.count(2)) == (36, 36)
 
 
+def test_a_prefix_of_one_action_may_have_any_length() -> None:
+    found = PrefixGrid(((0.5,), (-1.0,)), (70,), 100)
+    assert found.prefixes(70).tolist() == [[[0.5, -1.0]] * 70]
+
+
 def test_prefixes_of_one_control_lie_in_memory_in_order() -> None:
     """Parts that do not; torch.export keeps them with a warning."""
     assert grid([5]).prefixes(2).flags.c_contiguous
