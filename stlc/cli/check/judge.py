@@ -30,7 +30,7 @@ _DIGITS = 18
 """Digits of the greatest sample number."""
 _SHOWN = 40
 """Characters of a text that a message shows."""
-_INSTANT = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
+_INSTANT = re.compile(r"(?P<number>\d{1,300}(?:\.\d*)?|\.\d+)\s*(?P<unit>[a-zµ]*)")
 
 
 @dataclass(frozen=True, slots=True)

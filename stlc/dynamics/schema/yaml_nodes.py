@@ -124,7 +124,7 @@ Node: TypeAlias = Scalar | Sequence | Mapping
 _TRUE = frozenset({"true", "True", "TRUE"})
 _FALSE = frozenset({"false", "False", "FALSE"})
 _HALF = re.compile("[\ud800-\udfff]")
-_INT = re.compile(r"[-+]?[0-9]+\Z")
+_INT = re.compile(r"[-+]?[0-9]{1,300}\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
 
 
@@ -136,7 +136,7 @@ def as_bool(node: Scalar) -> bool | None:
 
 
 def as_int(node: Scalar) -> int | None:
-    """Return the value of a decimal integer; None for any other text."""
+    """Return the value of a decimal integer of 300 digits at most; None for any other text."""
     return int(node.text) if node.style == "plain" and _INT.match(node.text) else None
 
 

@@ -353,6 +353,7 @@ def test_a_stream_at_one_of_its_samples(
         ("9s", "there is no sample 90: the trace has 60"),
         ("2.55s", "has no sample at 2.55s"),
         ("noon", "`--at noon` is not an instant"),
+        ("9" * 5000, "is not an instant"),
     ],
 )
 def test_instants_that_a_stream_does_not_have(

@@ -98,6 +98,8 @@ def test_escapes_are_noticed() -> None:
         ("12:30", None, None, None),
         ("1_000", None, None, None),
         ("+7", 7, 7.0, None),
+        ("9" * 5000, None, None, None),
+        ("9" * 400, None, None, None),
         (".5", None, 0.5, None),
         ("5.", None, 5.0, None),
         (".nan", None, None, None),
