@@ -105,12 +105,11 @@ class PlantProcess:
         limit = max(float(decl.limits.time), OPENING)
         try:
             layout = {"layout": decl.layout(self._scratch).as_json()}
-            reply = self._exchanged(layout, None, time.monotonic() + limit, limit)
+            header = self._answer(layout, None, time.monotonic() + limit, limit).header
         except FaultyError as error:
             raise _refused(
                 decl, f"the plant cannot be opened: {error.fault.message}", "", error.fault.stderr
             ) from None
-        header = reply.header
         if "absent" in header:
             package, extra = str(header["absent"]), str(header.get("extra"))
             advice = f"pip install 'stlc[{extra}]'" if extra else f"pip install {package}"
@@ -134,7 +133,13 @@ class PlantProcess:
         Raises:
             FaultyError: the simulation failed. The process may have been ended; see `alive`.
         """
-        reply = self._exchanged(header, array, deadline, float(self._decl.limits.time))
+        return self._answer(header, array, deadline, float(self._decl.limits.time))
+
+    def _answer(
+        self, header: Mapping[str, Any], array: Floats | None, deadline: float, limit: float
+    ) -> Message:
+        """Send a request and return the reply; `limit` is the time that it had. Raises FaultyError."""
+        reply = self._exchanged(header, array, deadline, limit)
         reason = reply.header.get("fault")
         if reason is None:
             return reply

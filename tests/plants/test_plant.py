@@ -184,11 +184,13 @@ def test_a_new_process_for_every_simulation(tmp_path):
             "not a state",
         ),
         ({"python": '"broken.py:f"'}, '"broken.py:f"', "ended by SIGABRT"),
+        ({"python": '"leaving.py:f"'}, '"leaving.py:f"', "cannot be opened: SystemExit: 4"),
     ],
 )
 def test_a_plant_that_cannot_be_opened_has_a_place(tmp_path, changes, place, said):
     pendulum(tmp_path)
     (tmp_path / "broken.py").write_text("import os\nos.abort()\n")
+    (tmp_path / "leaving.py").write_text("import sys\nsys.exit(4)\n")
     with (
         Plant(read(changed(FILE, **changes), tmp_path)) as plant,
         pytest.raises(SystemFileError, match=said) as caught,
