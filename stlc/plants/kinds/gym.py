@@ -73,6 +73,7 @@ class GymEnvironment:
         ):
             for port in ports:
                 self._require(port, section)
+        self._read = {port.source.partition("[")[0] for port in layout.outputs}
         for port in layout.param:
             if not isinstance(getattr(environment.unwrapped, port.source, None), (int, float, np.number)):
                 message = f"the environment has no number `{port.source}` among its attributes"
@@ -138,13 +139,12 @@ class GymEnvironment:
         return self._outputs(observation, float(reward), terminated=bool(terminated))
 
     def _outputs(self, observation: Any, reward: float, *, terminated: bool) -> Floats:
-        numbers = self._spaces.flatten(self._environment.observation_space, observation)
-        parts = {
-            "obs": np.asarray(numbers, dtype=np.float64).reshape(-1),
-            "state": np.asarray(getattr(self._environment.unwrapped, "state", ()), dtype=np.float64).reshape(
-                -1
-            ),
-        }
+        parts = {}
+        if "obs" in self._read:
+            parts["obs"] = self._spaces.flatten(self._environment.observation_space, observation)
+        if "state" in self._read:
+            parts["state"] = getattr(self._environment.unwrapped, "state", ())
+        parts = {name: np.asarray(numbers, dtype=np.float64).reshape(-1) for name, numbers in parts.items()}
         single = {"reward": reward, "terminated": float(terminated)}
         found = np.empty(len(self._layout.outputs))
         for index, port in enumerate(self._layout.outputs):

@@ -87,3 +87,32 @@ def test_options_go_to_the_environment(tmp_path):
     assert decl.options["options"] == {"g": 0.0}
     found = simulated(decl, tmp_path, {"theta": 0.5, "rate": 0.0})
     assert found[-1, 0] == pytest.approx(np.cos(0.5), abs=1e-6)
+
+
+MOODY = """
+import gymnasium
+import numpy as np
+
+
+class Moody(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    state = "calm"
+
+    def reset(self, seed=None, options=None):
+        return np.zeros(1), {}
+
+    def step(self, action):
+        return action, 0.0, False, False, {}
+
+
+gymnasium.register("Moody-v0", entry_point=Moody)
+"""
+
+
+def test_a_state_that_is_not_numbers_is_not_read(tmp_path, monkeypatch):
+    (tmp_path / "moody.py").write_text(MOODY)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    text = FILE.replace("Pendulum-v1", '"moody:Moody-v0"')
+    text = text.partition("initial")[0] + "input: {torque: {range: [-1, 1]}}\noutput: {x: }\n"
+    assert (simulated(read(text, tmp_path), tmp_path, {}, np.full((3, 1), 0.5))[1:] == 0.5).all()
