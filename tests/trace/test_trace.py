@@ -544,6 +544,21 @@ def test_a_column_of_words_may_begin_with_an_empty_cell(tmp_path: Path) -> None:
     assert np.isnan(read[[0, 2]]).all()
 
 
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_long_words_are_cut(tmp_path: Path, quote: str) -> None:
+    path = csv(tmp_path / "a.csv", f"t,x,note\n0,1,{quote}ok{quote}\n1,2,{quote}{'a' * 5000}{quote}\n")
+    note = load_trace(path).extras["note"]
+    assert note.tolist() == ["ok", "a" * 64]
+    assert note.dtype.itemsize == 4 * 64
+
+
+def test_traces_whose_names_may_have_been_cut_are_refused(tmp_path: Path) -> None:
+    long = "run/" * 16
+    path = csv(tmp_path / "a.csv", f"trace,t,x\n{long}1,0,1\n{long}1,1,1\n{long}2,0,1\n{long}2,1,1\n")
+    assert code_of(path) == "E605"
+    assert "names of 64 letters or more" in message_of(path)
+
+
 def test_without_a_clock_the_arrays_are_named(tmp_path: Path) -> None:
     with pytest.raises(TraceError) as caught:
         load_trace(csv(tmp_path / "a.csv", "stamp,x\n0,1\n1,2\n"))

@@ -25,7 +25,7 @@ from stlc.escape import from_spreadsheet, spreadsheet
 from stlc.files import write_atomic
 from stlc.source import Source, Span
 from stlc.trace.formats.cells import NUMBER, STRETCH, TableText, bare, load, read_lines, value_of
-from stlc.trace.formats.registry import opened, unreadable
+from stlc.trace.formats.registry import MAX_LETTERS, opened, unreadable
 from stlc.trace.formats.table import GROUPS, OneTrace, Table, is_unit, of_table
 from stlc.trace.recording import Recording
 
@@ -279,7 +279,7 @@ def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> l
     if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
         return None
     columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
-    columns |= {i: np.array([cells[i].strip() for cells in words]) for i in texts}
+    columns |= {i: np.array([cells[i].strip()[:MAX_LETTERS] for cells in words]) for i in texts}
     return [columns[i] for i in range(width)]
 
 
@@ -322,7 +322,7 @@ def _read_row(
     row: list[float | str] = []
     for i, (text, span) in enumerate(cells):
         if i in texts:
-            row.append(text)
+            row.append(text[:MAX_LETTERS])
         elif (value := value_of(text)) is not None:
             row.append(value)
         else:

@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import atomic_path
 from stlc.trace.formats.csv import split_head
-from stlc.trace.formats.registry import MAX_BYTES, damage, needed, room_for, unreadable
+from stlc.trace.formats.registry import MAX_BYTES, MAX_LETTERS, damage, needed, room_for, unreadable
 from stlc.trace.formats.table import OneTrace, Table, of_table
 from stlc.trace.recording import Recording
 
 Floats = NDArray[np.float64]
 
 MAX_COMPONENTS = 1000
-MAX_LETTERS = 64
-"""Longer texts are cut; names of enum members are shorter."""
 
 
 def read(path: Path) -> Recording:

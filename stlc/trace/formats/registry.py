@@ -22,6 +22,8 @@ from typing import Any
 from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError, not_installed
 
 MAX_BYTES = 4_000_000_000
+MAX_LETTERS = 64
+"""Longer words are cut: an array of words is as wide as the longest. Names of enum members are shorter."""
 _ROOM = 500_000_000
 _RATIO = 200
 """A compressed file may expand to `_ROOM` bytes, or this multiple of its size; sensor logs need a tenth."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Column
+from stlc.trace.formats.registry import MAX_LETTERS
 from stlc.trace.meta import TraceMeta
 from stlc.trace.recording import CLOCK, ROSTOPIC, ClockGroup, Recording, clock_among, unit_of
 from stlc.units import parse_unit
@@ -150,9 +151,12 @@ def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> 
     The column `group` identifies the trace of each line; `keys` contains its values.
 
     Raises:
-        TraceError: E605, traces differ in length.
+        TraceError: E605, traces differ in length, or their names may have been cut.
     """
     labels, sizes = np.unique(keys, return_counts=True)
+    if labels.dtype.kind == "U" and (np.char.str_len(labels) >= MAX_LETTERS).any():
+        message = f"the traces in `{path}` have names of {MAX_LETTERS} letters or more in `{group}`"
+        raise TraceError(Diagnostic("E605", message, help=("number them",)))
     if len(set(sizes.tolist())) > 1:
         i = int(np.argmax(sizes != sizes[0]))
         message = (
