@@ -25,6 +25,8 @@ ROSTOPIC = "%time"
 CLOCKS = (CLOCK, "time", "times", "timestamp", "__time", "tout", ROSTOPIC)
 """Names of a clock, case-insensitive."""
 EXTRA = "extra."
+MAX_COMPONENTS = 1000
+"""Most components of a vector."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,13 +140,14 @@ def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array
     for signal, values in arrays.items():
         if values.ndim in (1, 2) and values.shape[-1] == samples:
             data[signal] = np.atleast_2d(values)
-        elif values.ndim in (2, 3) and values.shape[-2] == samples:
+        elif values.ndim in (2, 3) and values.shape[-2] == samples and values.shape[-1] <= MAX_COMPONENTS:
             stacked = values[None] if values.ndim == 2 else values
             data |= {f"{signal}[{i}]": stacked[..., i] for i in range(values.shape[-1])}
         else:
             shape = " x ".join(map(str, values.shape)) or "a single number"
             message = f"`{signal}` in `{name}` is {shape}, and `t` has {samples} samples"
-            help_ = ("signals are (samples,) or (traces, samples)",)
+            most = f"(samples, components up to {MAX_COMPONENTS})"
+            help_ = (f"signals are (samples,), (traces, samples) or {most}",)
             findings.append(Diagnostic("E605", message, help=help_))
     traces = max((len(values) for values in data.values()), default=0)
     for signal, values in data.items():

@@ -197,7 +197,9 @@ def _clocked(recording: Recording, dt: float | None) -> Recording:
 
 
 def _longest(group: ClockGroup) -> int:
-    return max((values.shape[-1] for values in group.arrays.values() if values.ndim), default=0)
+    """Number of samples of the longest signal; of three axes the last one numbers components."""
+    shapes = (values.shape for values in group.arrays.values() if values.ndim)
+    return max((shape[-1] if len(shape) < 3 else shape[-2] for shape in shapes), default=0)
 
 
 def _uniform(recording: Recording, step: float | None) -> Trace:

@@ -67,3 +67,37 @@ def test_pieces_of_several_traces_in_parquet(tmp_path: Path) -> None:
     parquet.write_table(table, tmp_path / "a.parquet")
     with pytest.raises(TraceError, match="the traces 0 and 1"):
         list(pieces(tmp_path / "a.parquet", 2, Reading(dt=1.0)))
+
+
+@pytest.mark.parametrize("shape", [(5,), (1, 5), (5, 1), (5, 2), (5, 3), (1, 5, 2)])
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_pieces_of_vectors(tmp_path: Path, shape: tuple[int, ...], size: int) -> None:
+    np.savez(tmp_path / "a.npz", t=np.arange(5.0), x=np.arange(np.prod(shape)).reshape(shape), y=np.zeros(5))
+    whole = load_trace(tmp_path / "a.npz")
+    parts = list(pieces(tmp_path / "a.npz", size, Reading(dt=1.0)))
+    assert all(part.data.keys() == whole.data.keys() for part in parts)
+    for name, values in whole.data.items():
+        assert np.concatenate([part.data[name][0] for part in parts]).tolist() == values[0].tolist()
+
+
+@pytest.mark.parametrize("shape", [(), (5, 5), (2, 5), (1, 5, 5, 1), (5, 0, 5)])
+def test_arrays_that_have_no_pieces(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    np.savez(tmp_path / "a.npz", t=np.arange(5.0), x=np.zeros(shape))
+    with pytest.raises(TraceError, match="cannot be read in pieces"):
+        list(pieces(tmp_path / "a.npz", 3, Reading()))
+
+
+@pytest.mark.parametrize("name", ["wide", "meta"])
+def test_a_piece_that_unpacks_to_much(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stlc.trace.formats.registry._ROOM", 1_000_000)
+    wide = np.zeros((4, 100_000)) if name == "wide" else np.array("a" * 400_000)
+    np.savez_compressed(tmp_path / "a.npz", t=np.arange(4.0), x=np.ones(4), **{name: wide})
+    for read in (lambda path: load_trace(path), lambda path: list(pieces(path, 2, Reading()))):
+        with pytest.raises(TraceError, match="unpacks to"):
+            read(tmp_path / "a.npz")
+
+
+def test_a_vector_of_too_many_components(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", t=np.arange(4.0), x=np.ones(4), wide=np.zeros((4, 1001)))
+    with pytest.raises(TraceError, match="4 x 1001"):
+        load_trace(tmp_path / "a.npz")

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.files import atomic_path
-from stlc.trace.formats.registry import damage, opened, room_for, unreadable
+from stlc.trace.formats.registry import damage, opened, require_room, unreadable
 from stlc.trace.meta import meta_array, read_meta
 from stlc.trace.recording import EXTRA, Recording, of_arrays
 
@@ -108,25 +108,29 @@ class ArchiveMember:
     """An array of an open archive, read as a whole or in consecutive chunks of samples.
 
     Attributes:
-        length: number of samples. This is the length of the last axis of an array (samples,) or (1, samples),
-            and of the first axis of other arrays. It is -1 if the array is stored in Fortran order, so that
-            its samples are not contiguous.
+        length: number of samples of an array (samples,), (1, samples), (samples, components) or (1, samples,
+            components). It is -1 for other arrays, for a square one, whose rows are traces, and for a vector
+            in Fortran order, whose samples are not contiguous.
+        size: number of bytes.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stack: ExitStack) -> None:
         self._path, self._name = path, info.filename.removesuffix(".npy")
         self._stream = stack.enter_context(archive.open(info))
         self._shape, self._fortran, self._dtype = _checked_header(path, self._stream, info, self._name)
-        row = self._shape[:1] == (1,) or len(self._shape) == 1
-        self._width = 1 if row else math.prod(self._shape[1:])
-        self.length = self._shape[-1] if row and self._shape else (self._shape or (0,))[0]
-        if self._fortran and not row and len(self._shape) > 1:
-            self.length = -1
+        self._vector: tuple[int, ...] = ()
+        self.length, self.size = -1, math.prod(self._shape) * self._dtype.itemsize
+        match self._shape:
+            case (samples,) | (1, samples):
+                self.length = samples
+            case (samples, components) | (1, samples, components) if not self._fortran:
+                square = len(self._shape) == 2 and samples == components
+                self.length, self._vector = -1 if square else samples, (components,)
 
     def read(self, count: int) -> Array:
-        """Read the next `count` samples, (count,) or (count, …)."""
-        values = self._values(count * self._width)
-        return values if self._width == 1 else values.reshape(count, *self._shape[1:])
+        """Read the next `count` samples, (count,) or (1, count, components)."""
+        values = self._values(count * math.prod(self._vector))
+        return values.reshape(1, count, *self._vector) if self._vector else values
 
     def whole(self) -> Array:
         """Read the whole array, in its own shape."""
@@ -158,10 +162,7 @@ def _infos(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 def _read_members(path: Path, archive: zipfile.ZipFile) -> dict[str, Array]:
     infos = _infos(path, archive)
-    size, most = sum(info.file_size for info in infos.values()), room_for(path)
-    if size > most:
-        reason = f"it unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
-        raise unreadable(path, reason, advice="split it, or do not compress it")
+    require_room(path, sum(info.file_size for info in infos.values()))
     arrays: dict[str, Array] = {}
     for name, info in infos.items():
         with ExitStack() as stack:
@@ -242,15 +243,18 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
         archive = stack.enter_context(zipfile.ZipFile(path))
         members = {name: ArchiveMember(path, archive, i, stack) for name, i in _infos(path, archive).items()}
         described = members.pop("meta", None)
-        meta, columns = read_meta(path, None if described is None else described.whole())
         signals = {name: m for name, m in members.items() if not name.startswith(EXTRA)}
         length = max((member.length for member in signals.values()), default=0)
-        odd = [name for name, member in signals.items() if member.length != length]
+        odd = [name for name, member in signals.items() if member.length != max(length, 0)]
         if odd:
             message = (
                 f"`{odd[0]}` in `{path}` is not one value per sample: such a file cannot be read in pieces"
             )
             raise TraceError(Diagnostic("E605", message))
+        share = min(samples, length) / max(length, 1)
+        size = share * sum(member.size for member in signals.values())
+        require_room(path, int(size) + (0 if described is None else described.size), chunk=True)
+        meta, columns = read_meta(path, None if described is None else described.whole())
         for begin in range(0, length, samples):
             count = min(samples, length - begin)
             arrays = {name: member.read(count) for name, member in signals.items()}

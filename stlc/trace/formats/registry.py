@@ -134,3 +134,17 @@ def damage(path: Path) -> Iterator[None]:
 def room_for(path: Path) -> int:
     """Number of bytes to which a compressed file may expand at most."""
     return min(MAX_BYTES, max(_ROOM, _RATIO * path.stat().st_size))
+
+
+def require_room(path: Path, size: int, *, chunk: bool = False) -> None:
+    """Check that a file, or a chunk of it, that unpacks to `size` bytes may be read.
+
+    Raises TraceError (E603) if not.
+    """
+    most = room_for(path)
+    if not 0 <= size <= most:
+        what, advice = "it", "split it, or do not compress it"
+        if chunk:
+            what, advice = "a chunk", "--chunk SAMPLES  reads fewer samples at a time"
+        why = f"{what} unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
+        raise unreadable(path, why, advice=advice)

@@ -15,6 +15,7 @@ import pytest
 from stlc.cli.framework.app import main
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, load_trace, save_trace
+from stlc.trace.chunks import size_of
 from stlc.units import parse_unit
 
 SPEC = """spec small
@@ -244,8 +245,10 @@ def test_a_file_that_is_too_large_is_read_in_pieces(monkeypatch: pytest.MonkeyPa
     (name,) = files(a_trace(peak=3))
     monkeypatch.setattr("stlc.trace.chunks.LARGE", 100)
     monkeypatch.setattr("stlc.cli.check.many.SMALL", 100)
-    monkeypatch.setattr("stlc.trace.formats.registry.MAX_BYTES", 100)
+    monkeypatch.setattr("stlc.trace.formats.registry.MAX_BYTES", size_of(Path(name)) - 1)
+    monkeypatch.setattr("stlc.cli.check.online.CHUNK", N // 2)
     assert check("s.stl", name, "-q") == 1
+    assert check("s.stl", name, "-q", "--resample", "1s") == 2
 
 
 # ------------------------------------------------------------------- the standard input
