@@ -14,6 +14,7 @@ import pytest
 
 from stlc.diagnostics import StlcError, TraceError
 from stlc.trace import Reading, load_trace, save_trace
+from stlc.trace.chunks import pieces
 
 pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -124,8 +125,72 @@ def test_parquet_that_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     parquet.write_table(pa.table({"word": ["a"]}), tmp_path / "b.parquet")
     assert code_of(tmp_path / "b.parquet") == "E603"
     assert code_of(tmp_path / "none.parquet") == "U102"
-    monkeypatch.setattr("stlc.trace.formats.parquet.MAX_BYTES", 100)
+    monkeypatch.setattr("stlc.trace.formats.registry.MAX_BYTES", 100)
     assert "unpacks to" in message_of(a_parquet(tmp_path / "c.parquet"))
+
+
+def test_missing_times_and_durations_are_unknown(tmp_path: Path) -> None:
+    lasts = pa.array([1000, None, 3000], pa.duration("ms"))
+    seen = pa.array([None, 5, 6], pa.timestamp("s"))
+    parquet.write_table(pa.table({"t": [0.0, 1.0, 2.0], "x": lasts, "y": seen}), tmp_path / "a.parquet")
+    data = load_trace(tmp_path / "a.parquet").data
+    np.testing.assert_array_equal(data["x"][0], [1.0, np.nan, 3.0])
+    np.testing.assert_array_equal(data["y"][0], [np.nan, 0.0, 1.0])
+
+
+def test_time_stamps_of_pieces_count_from_the_first_of_the_file(tmp_path: Path) -> None:
+    stamps = pa.array([1_700_000_000_000 + 1000 * k for k in range(7)], pa.timestamp("ms"))
+    seen = pa.array([stamps[k // 2].as_py() for k in range(7)], pa.timestamp("ms"))
+    parquet.write_table(pa.table({"t": stamps, "x": list(range(7)), "seen": seen}), tmp_path / "a.parquet")
+    whole = load_trace(tmp_path / "a.parquet")
+    parts = list(pieces(tmp_path / "a.parquet", 3, Reading()))
+    assert [part.t0 for part in parts] == [0.0, 3.0, 6.0]
+    for name in ("x", "seen"):
+        assert np.concatenate([part.data[name][0] for part in parts]).tolist() == whole.data[name][0].tolist()
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        pa.array(["w"] * 1000).dictionary_encode(),
+        pa.array(["w" * 1_000_000] + ["w"] * 999),
+        pa.array([[0.0] * 100_000] + [[0.0]] * 999),
+    ],
+)
+def test_words_and_lists_that_unpack_to_much(
+    tmp_path: Path, column: pa.Array, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.parquet"
+    table = pa.table({"t": np.arange(1000.0), "x": np.zeros(1000), "a.b": column})
+    parquet.write_table(table, path, compression="zstd")
+    assert load_refused(path) in (None, "E605")
+    monkeypatch.setattr("stlc.trace.formats.registry._ROOM", 200_000)
+    monkeypatch.setattr("stlc.trace.formats.registry._RATIO", 1)
+    assert "unpacks to" in message_of(path)
+    with pytest.raises(TraceError, match="a chunk unpacks to"):
+        list(pieces(path, 900, Reading()))
+
+
+def load_refused(path: Path) -> str | None:
+    try:
+        load_trace(path)
+    except StlcError as error:
+        return error.diagnostics[0].code
+    return None
+
+
+def test_a_word_is_unpacked_once(tmp_path: Path) -> None:
+    words = pa.DictionaryArray.from_arrays(np.zeros(10_000, np.int32), pa.array(["w" * 10_000]))
+    table = pa.table({"t": np.arange(10_000.0), "x": np.zeros(10_000), "word": words})
+    parquet.write_table(table, tmp_path / "a.parquet", store_schema=False)
+    assert parquet.read_schema(tmp_path / "a.parquet").field("word").type == pa.string()
+    usual, watched = pa.default_memory_pool(), pa.system_memory_pool()  # which nothing else uses
+    pa.set_memory_pool(watched)
+    try:
+        assert load_trace(tmp_path / "a.parquet").extras["word"].tolist() == ["w" * 64] * 10_000
+    finally:
+        pa.set_memory_pool(usual)
+    assert watched.max_memory() < 10_000_000
 
 
 # ---------------------------------------------------------------------------- MATLAB
