@@ -18,12 +18,14 @@ TIMES = {
 
 
 @pytest.mark.parametrize("kind", TIMES)
-def test_pieces_are_the_whole(tmp_path: Path, kind: str) -> None:
-    rows = [f"{t},{k % 5},go" for k, t in enumerate(TIMES[kind])]
-    (tmp_path / "a.csv").write_text("\n".join(["t,x,word", *rows]))
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_pieces_are_the_whole(tmp_path: Path, kind: str, end: str) -> None:
+    rows = [f"{t},{k % 5},gö" for k, t in enumerate(TIMES[kind])]
+    (tmp_path / "a.csv").write_bytes(end.join(["\ufefft,x,wörd", *rows]).encode())
     whole = load_trace(tmp_path / "a.csv")
     parts = list(pieces(tmp_path / "a.csv", 7, Reading()))
     assert [part.samples for part in parts] == [7, 7, 7, 2]
+    assert list(parts[1].extras) == ["wörd"]
     assert np.array_equal(np.concatenate([part.data["x"][0] for part in parts]), whole.data["x"][0])
     np.testing.assert_allclose(np.concatenate([part.times for part in parts]), whole.times, atol=1e-9)
 

@@ -76,11 +76,12 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
     Raises the errors of `read`, and E605 if the file contains several traces.
     """
     only = OneTrace(str(path))
-    with path.open("rb") as file:
-        header = next((line for line in file if line.strip()), b"")
+    with path.open(encoding="latin-1") as file:  # every byte a letter, and every line ending `\n`
+        header = next((line for line in file if line.strip()), "")
         while lines := list(islice(file, samples)):
-            if any(map(bytes.strip, lines)):
-                yield of_table(path, table_of_text(path, header + b"".join(lines)), only=only)
+            if any(map(str.strip, lines)):
+                text = (header + "".join(lines)).encode("latin-1")
+                yield of_table(path, table_of_text(path, text), only=only)
 
 
 def read_csv(path: Path) -> Table:
