@@ -10,6 +10,7 @@ from typing import Any
 
 from stlc.cli.check.outcome import Outcome, VerdictRow
 from stlc.diagnostics import usage
+from stlc.escape import spreadsheet
 from stlc.files import write_atomic
 
 COLUMNS = {
@@ -62,8 +63,13 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    writer.writerows(["" if cell is None else cell for cell in row] for row in rows)
+    writer.writerows(map(_cell, row) for row in rows)
     write_atomic(path, text.getvalue())
+
+
+def _cell(value: Any) -> Any:
+    """Content of a cell: numbers as they are, and texts so that no spreadsheet program runs them."""
+    return spreadsheet(value) if isinstance(value, str) else "" if value is None else value
 
 
 def _rows(outcome: Outcome) -> Iterator[tuple[Any, ...]]:

@@ -109,6 +109,17 @@ def test_the_same_as_parquet() -> None:
     assert text == rows_of("v.csv")
 
 
+def test_no_cell_is_a_formula() -> None:
+    recording("=1+1.csv")
+    Path("odd.stl").write_text("spec odd\nsignal a [m]\nrequire `=HYPERLINK(1)`: always a < 2 m\n")
+    assert main(["check", "odd.stl", "=1+1.csv", "--table", "v.csv", "-q"]) == 0
+    (row,) = rows_of("v.csv")
+    assert (row["file"], row["requirement"]) == ("'=1+1.csv", "'=HYPERLINK(1)")
+    recording("plain.csv", a=[3.0] * 20)
+    assert check("plain.csv", "--table", "v.csv", "-q") == 1
+    assert rows_of("v.csv")[0]["robustness"] == "-1.0"
+
+
 def test_one_file_and_the_standard_input_have_a_table_too(monkeypatch: pytest.MonkeyPatch) -> None:
     recording("one.csv", a=[3.0] * 20)
     assert check("one.csv", "--table", "one/t.csv", "-q") == 1
