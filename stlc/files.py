@@ -6,6 +6,7 @@ import errno
 import glob
 import os
 import re
+import stat
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -133,8 +134,8 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Context that yields a temporary path; the file written there replaces `path` if the block succeeds.
 
-    The temporary path has the same suffix. Missing folders are created. A path that is not a regular file (a
-    pipe, `/dev/null`) is written in place.
+    The temporary path has the same suffix. Missing folders are created. A file that is replaced keeps its
+    permissions. A path that is not a regular file (a pipe, `/dev/null`) is written in place.
 
     Raises:
         MissingError: R201, the disk is full, or the user may not write there; the old file is unchanged, and
@@ -150,9 +151,15 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     try:
         with reported(f"write `{path}`"), leaving(lambda _code: temporary.unlink(missing_ok=True)):
             target.parent.mkdir(parents=True, exist_ok=True)
+            mode = stat.S_IMODE(target.stat().st_mode) if target.is_file() else None
+            if mode is not None:
+                temporary.touch(0o600)  # nobody else reads it meanwhile
             yield temporary
             with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
+            if mode is not None:
+                with suppress(OSError):  # a file system without permissions
+                    temporary.chmod(mode)
             temporary.replace(target)
     finally:
         with suppress(OSError):

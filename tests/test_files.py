@@ -142,6 +142,18 @@ def test_a_file_is_readable_as_the_user_wants_it(tmp_path):
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
 
 
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, 0o755])
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path, mode):
+    path = tmp_path / "a"
+    path.write_text("old")
+    path.chmod(mode)
+    with atomic_path(path) as temporary:
+        assert temporary.stat().st_mode & 0o077 == 0
+        temporary.write_text("new")
+    assert path.read_text() == "new"
+    assert path.stat().st_mode & 0o777 == mode
+
+
 def test_a_link_is_written_through(tmp_path):
     write_atomic(tmp_path / "real.txt", "old")
     (tmp_path / "link.txt").symlink_to("real.txt")
