@@ -24,6 +24,7 @@ from stlc.cli.framework.options import (
     JsonOption,
     parse_pairs,
     require_no_jobs,
+    require_separate,
 )
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
@@ -134,6 +135,9 @@ def check(
     question = reading.question(
         spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics, uncertain=errors
     )
+    paths = out_paths(out, traces)
+    written = [("--table", table), ("--junit", junit), *(("--out", path) for path in paths)]
+    require_separate(written, (spec, reading.system, *traces))
     talk = not (QUIET.get() or json)
     if STDIN in traces:
         from stlc.cli.check.online import outcome_of_stream
@@ -141,7 +145,7 @@ def check(
         with PULSE.doing(""):  # waits for samples
             outcomes = [outcome_of_stream(question, talk=talk)]
     else:
-        color, paths = wants_color(sys.stdout), out_paths(out, traces)
+        color = wants_color(sys.stdout)
         works = [
             Work(
                 *(name, question, reading.runs, path, chunk, color, COLOR.get()),

@@ -18,6 +18,7 @@ from stlc.cli.framework.options import (
     parse_count,
     parse_overrides,
     planner_choice,
+    require_separate,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.plan_documents import Plans, PlanTubes
@@ -92,6 +93,7 @@ def plan(
     from stlc.trace import check_writable, save_trace
 
     check_writable(output)
+    require_separate([("--output", output)], (spec, system, from_))
     choice = planner_choice(method, option, budget)
     judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
     planner = planner_named(choice.name, **choice.options)

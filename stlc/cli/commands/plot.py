@@ -10,6 +10,7 @@ import typer
 
 from stlc.cli.check import options as given
 from stlc.cli.framework.documents import PlottedTrace
+from stlc.cli.framework.options import require_separate
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, StlcError, UsageError, usage
@@ -56,6 +57,7 @@ def plot(
     require_drawing()
     path = _find(what, reading.runs)
     target = _target(output, path)
+    require_separate([("--output", target)], (path, reading.spec, reading.system))
     question = reading.question(require=())
     recording = read_recording(path)
     planned = recording.meta.planned  # margins over time are those of windows

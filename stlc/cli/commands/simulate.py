@@ -31,6 +31,7 @@ from stlc.cli.framework.options import (
     parse_overrides,
     parse_seeds,
     planner_choice,
+    require_separate,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
@@ -151,6 +152,7 @@ def simulate(
     --from or at a random point for each seed, and each trace is judged. The exit code is then 1 if a
     simulation violates a requirement or gives no trace, and 4 if it is too short for a verdict.
     """
+    require_separate([("--record", record), ("--robustness", margins)], (run, plant, system))
     if plant is not None:
         from stlc.cli.simulate.plant import PlantOrder, simulate_plant
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+import stat
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -156,6 +157,43 @@ def parse_pairs(pairs: Sequence[str] | None, option: str, form: str, example: st
 
 SPEC_SUFFIXES = (".stl", ".stlc")
 STDIN = "-"
+
+
+def require_separate(
+    written: Iterable[tuple[str, Path | str | None]], read: Iterable[Path | str | None]
+) -> None:
+    """Check that no file that a command writes is one that it reads, or the file of another option.
+
+    Args:
+        written: options with the files that they name; None if an option is not given.
+        read: files that the command reads.
+
+    Raises:
+        UsageError: U101, two of the files are one.
+    """
+    known = {_identity(path): "" for path in read}
+    for option, path in written:
+        file = _identity(path)
+        if file is None:
+            continue
+        if file in known:
+            what = f"also the file of `{known[file]}`" if known[file] else "a file that this command reads"
+            raise usage(f"`{option} {path}` is {what}", "name another file")
+        known[file] = option
+
+
+def _identity(path: Path | str | None) -> object:
+    """What is equal for two paths of one file; None for no file, such as a folder, a device or `-`."""
+    if path is None or str(path) == STDIN:
+        return None
+    try:
+        target = Path(path).resolve()
+        found = target.stat()
+    except FileNotFoundError:
+        return target
+    except (OSError, ValueError, RuntimeError):  # no path: reading or writing it says why
+        return None
+    return (found.st_dev, found.st_ino) if stat.S_ISREG(found.st_mode) else None
 
 
 def spec_files(names: Sequence[str]) -> tuple[str, ...]:

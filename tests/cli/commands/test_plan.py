@@ -39,6 +39,15 @@ def test_what_makes_no_sense(
     assert not list(tmp_path.iterdir())
 
 
+def test_plans_do_not_replace_the_trace_that_they_start_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "plan.npz").write_text("plans")
+    assert planned("--from", str(tmp_path / "plan.npz"), "-o", str(tmp_path / "plan.npz")) == 2
+    assert "is a file that this command reads" in capsys.readouterr().err
+    assert (tmp_path / "plan.npz").read_text() == "plans"
+
+
 @pytest.mark.parametrize("signals", [1, 2])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_plans_found_before_a_signal_are_kept_and_counted(

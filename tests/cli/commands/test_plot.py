@@ -37,6 +37,13 @@ require low: always (level < 2 m -> eventually[0 s, 3 s] level >= 2.5 m)
 PLANNED = TANK + "require plan: always[0 s, T] level > 0 m\n"
 
 
+def test_no_picture_replaces_the_specification(tmp_path, capsys):
+    (tmp_path / "tank.svg").write_text(TANK)
+    assert main(["plot", "walk.npz", "--spec", "tank.svg", "-o", "./tank.svg"]) == 2
+    assert "is a file that this command reads" in capsys.readouterr().err
+    assert (tmp_path / "tank.svg").read_text() == TANK
+
+
 def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
     (tmp_path / "tank.stl").write_text(TANK)
     (tmp_path / "tank.csv").write_text("t,level\n" + "".join(f"{k},{1.5 + 0.1 * k}\n" for k in range(6)))
