@@ -20,6 +20,16 @@ FACTS = "controller.json"
 FORMAT = "stlc-controller/1"
 DECIDE, FOLLOW, JUDGE, FALL = "decide.onnx", "follow.onnx", "judge.onnx", "fall.onnx"
 CONTINUE = "continue.onnx"
+_NEEDED, _GRAPHS = {DECIDE, FOLLOW, JUDGE}, {DECIDE, FOLLOW, JUDGE, FALL, CONTINUE}
+_DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +131,8 @@ def read_facts(where: Path | str) -> Facts:
         raise UsageError(Diagnostic("U102", f"there is no controller `{path}`"))
     folder = path if path.is_dir() else path.parent
     try:
-        return _facts(json.loads((folder / FACTS).read_text(encoding="utf-8")), folder)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return _facts(json.loads(_content(folder / FACTS)), folder)
+    except _DAMAGE as error:
         finding = Diagnostic(
             "R106",
             f"`{folder}` holds no whole controller",
@@ -135,6 +145,9 @@ def read_facts(where: Path | str) -> Facts:
 def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
     if read["format"] != FORMAT:
         raise ValueError(f"its format is {read['format']}, not {FORMAT}")
+    digests = read["files"]
+    if not _NEEDED <= digests.keys() <= _GRAPHS:
+        raise ValueError(f"its graphs are {', '.join(digests)}")
     return Facts(
         read["spec"],
         read["system"],
@@ -144,7 +157,7 @@ def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
         float(read["dt"]),
         int(read["horizon"]),
         _grid(read["backup"]),
-        {name: _whole(folder / name, digest) for name, digest in read["files"].items()},
+        {name: _whole(folder / name, digest) for name, digest in digests.items()},
         _feedback(read.get("feedback"), len(read["controls"])),
     )
 
@@ -165,8 +178,14 @@ def _grid(read: Mapping[str, Any]) -> PrefixGrid:
     return PrefixGrid(values, lengths, int(read["batch"]), int(read["samples"]), read["sampling"])
 
 
+def _content(path: Path) -> bytes:
+    if path.exists() and not path.is_file():  # a pipe or a device has no end
+        raise ValueError(f"{path.name} is not a file")
+    return path.read_bytes()
+
+
 def _whole(path: Path, digest: str) -> bytes:
-    data = path.read_bytes()
+    data = _content(path)
     if hashlib.sha256(data).hexdigest() != digest:
         raise ValueError(f"{path.name} is damaged, or of another export")
     return data

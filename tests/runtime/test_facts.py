@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -54,6 +56,20 @@ def _without(key: str) -> Callable[[bytes], bytes]:
     return change
 
 
+def _with(key: str, value: object, *, add: bool = False) -> Callable[[bytes], bytes]:
+    def change(data: bytes) -> bytes:
+        read = json.loads(data)
+        read[key] = {**read[key], **value} if add and isinstance(value, dict) else value
+        return json.dumps(read).encode()
+
+    return change
+
+
+def _in_place_of(path: Path, make: Callable[[Path], None]) -> None:
+    path.unlink()
+    make(path)
+
+
 @pytest.mark.parametrize(
     ("damage", "why"),
     [
@@ -62,6 +78,15 @@ def _without(key: str) -> Callable[[bytes], bytes]:
         (damaged("controller.json", _without("backup")), "backup"),
         (damaged("controller.json", lambda data: data.replace(b"controller/1", b"controller/9")), "format"),
         (lambda folder: (folder / "fall.onnx").unlink(), "fall.onnx"),
+        (lambda folder: _in_place_of(folder / "fall.onnx", os.mkfifo), "fall.onnx is not a file"),
+        (lambda folder: _in_place_of(folder / "controller.json", os.mkdir), "controller.json is not a file"),
+        (damaged("controller.json", _with("files", ["a"])), "keys"),
+        (damaged("controller.json", _with("files", {})), "its graphs are"),
+        (damaged("controller.json", _with("files", {"/etc/passwd": "0"}, add=True)), "/etc/passwd"),
+        (damaged("controller.json", _with("files", {"../a.onnx": "0"}, add=True)), "../a.onnx"),
+        (damaged("controller.json", _with("horizon", math.inf)), "OverflowError"),
+        (damaged("controller.json", lambda _: b"[" * 200_000), "RecursionError"),
+        (damaged("controller.json", lambda _: b"\xff"), "Unicode"),
         (lambda folder: (folder / "controller.json").unlink(), "controller.json"),
     ],
 )
