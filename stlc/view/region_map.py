@@ -23,7 +23,7 @@ from stlc.signature import Signature
 from stlc.source import Span
 from stlc.trace import Trace
 from stlc.view.animation import Animation
-from stlc.view.signals import MOST_AGENTS
+from stlc.view.signals import MOST_AGENTS, drawable
 from stlc.view.style import (
     BLUE,
     FAINT,
@@ -101,7 +101,7 @@ def map_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> RegionMap | None:
     if plane is None:
         return None
     violated: Mask = np.logical_or.reduce([judgement.fails.any(0) for judgement in verdict])
-    return RegionMap(trace, plane, violated)
+    return RegionMap(drawable(trace), plane, violated)
 
 
 def draw_map(region_map: RegionMap) -> Picture:
@@ -408,8 +408,8 @@ class Plane:
         for name in self.axes:
             values = trace.data[name][np.isfinite(trace.data[name])]
             ends.append(tuple(np.quantile(values, [0.01, 0.99])) if len(values) else (0.0, 1.0))
-        size = max(high - low for low, high in ends) or 1.0
         lows, highs = np.array(ends).T
+        size = max(float((highs - lows).max()), 1e-6 * float(np.abs(ends).max())) or 1.0
         search = ((lows[0] - size, highs[0] + size), (lows[1] - size, highs[1] + size))
         for region in self.regions:
             xs, ys, depth = self.sampled(region, trace, search, count=GRID // 2)
@@ -417,7 +417,7 @@ class Plane:
             if inside.any() and not (inside[0] | inside[-1] | inside[:, 0] | inside[:, -1]).any():
                 here = np.array([xs[inside.any(0)][[0, -1]], ys[inside.any(1)][[0, -1]]])
                 lows, highs = np.minimum(lows, here[:, 0]), np.maximum(highs, here[:, 1])
-        room = ROOM * float((highs - lows).max())
+        room = ROOM * max(float((highs - lows).max()), size)
         lows, highs = lows - room, highs + room
         return (float(lows[0]), float(highs[0])), (float(lows[1]), float(highs[1]))
 

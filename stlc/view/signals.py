@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -57,6 +57,8 @@ MOST_ROWS = 7
 """Maximum number of requirements in the strip charts; those with the least margins are shown."""
 MOST_PANELS, MOST_AGENTS = 6, 40
 """Maximum numbers of signals and agents in the animation of a trace."""
+GREATEST = 1e300
+"""Greatest magnitude that is drawn; differences of greater values are infinite, which Matplotlib refuses."""
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
 _COVER = 0.72
 
@@ -83,10 +85,10 @@ def margin_limits(rho: Floats) -> tuple[float, float]:
 
     Large margins are cut off, so that violations remain visible beside them.
     """
-    finite = rho[np.isfinite(rho)]
-    if not len(finite):
+    known = finite(rho)[np.isfinite(rho)]
+    if not len(known):
         return -1.0, 1.0
-    low, high = min(float(finite.min()), 0.0), max(float(np.quantile(finite, 0.95)), 0.0)
+    low, high = min(float(known.min()), 0.0), max(float(np.quantile(known, 0.95)), 0.0)
     if low >= -TOLERANCE:
         low = 0.0  # rounding errors only
     else:
@@ -95,9 +97,14 @@ def margin_limits(rho: Floats) -> tuple[float, float]:
     return low - room, high + room
 
 
-def finite(rho: Floats) -> Floats:
-    """Robustness with infinities replaced by NaN."""
-    return np.where(np.isfinite(rho), rho, np.nan)
+def finite(values: Floats) -> Floats:
+    """Values as they are drawn: infinities are replaced by NaN, and others limited to `GREATEST`."""
+    return np.where(np.isfinite(values), np.clip(values, -GREATEST, GREATEST), np.nan)
+
+
+def drawable(trace: Trace) -> Trace:
+    """Return a copy of a trace with the values that are drawn."""
+    return replace(trace, data={name: finite(values) for name, values in trace.data.items()})
 
 
 def margin_text(rho: float, unit: str = "") -> str:
@@ -166,6 +173,7 @@ def draw_signals(
         choices: the traces to draw.
         units: requirement -> unit of its robustness; it contains only requirements that have a unit.
     """
+    trace = drawable(trace)
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
     with picture_style():
@@ -449,6 +457,7 @@ def signal_animation(trace: Trace, *, title: str = "") -> Animation:
 
     It is used for a run without a drawing of its world.
     """
+    trace = drawable(trace)
     names = [c.name for c in trace.signature.columns if c.kind in ("real", "int")][:MOST_PANELS]
     names = names or list(trace.signature.names[:MOST_PANELS])
 

@@ -149,6 +149,15 @@ def test_a_trace_without_decisions_has_no_strip(recording, margins, choices):
     assert not shown["x [m]"].patches
 
 
+def test_great_values_are_drawn(recording, margins, choices):
+    data = {name: values.copy() for name, values in recording.data.items()}
+    for values in data.values():
+        values[:, :3] = 1.7e308, -1.7e308, 1e-300
+    margins["first"][:, :3] = 1.7e308, -1.7e308, np.inf
+    margins["second"][:] = 1.7e308
+    assert draw_signals(replace(recording, data=data), margins, choices).svg().startswith("<svg")
+
+
 def test_robustness_that_is_nowhere_defined_still_draws(recording, choices):
     rho = np.full((recording.traces, recording.samples), np.nan)
     rho[0, :5] = np.inf

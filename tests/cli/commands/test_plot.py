@@ -37,6 +37,14 @@ require low: always (level < 2 m -> eventually[0 s, 3 s] level >= 2.5 m)
 PLANNED = TANK + "require plan: always[0 s, T] level > 0 m\n"
 
 
+@pytest.mark.parametrize("value", ["0", "5", "1e17", "1.7e308", "-1e305"])
+def test_a_map_of_paths_that_stand_still(value, tmp_path, capsys):
+    spec = "signal x [m]\nsignal y [m]\nrequire r: always ([x, y] not in circle([90 m, 9 m], 1 m))\n"
+    (tmp_path / "a.stl").write_text(spec)
+    (tmp_path / "a.csv").write_text(f"t,x,y\n0,{value},{value}\n1,{value},{value}\n")
+    assert main(["plot", "a.csv", "--spec", "a.stl", "--places", "-o", "a.svg"]) == 0, capsys.readouterr().err
+
+
 def test_no_picture_replaces_the_specification(tmp_path, capsys):
     (tmp_path / "tank.svg").write_text(TANK)
     assert main(["plot", "walk.npz", "--spec", "tank.svg", "-o", "./tank.svg"]) == 2
