@@ -104,9 +104,11 @@ def test_points_decide_the_drives():
         (["falsify", "cart.stl", "--agents", "2"], "`--agents` is for a run"),
         (["falsify", "latest", "--replay", "none.json"], "there is no file `none.json`"),
         (["falsify", "latest", "--replay", "cart.yaml"], "`cart.yaml` is not a counterexample"),
+        (["falsify", "latest", "--replay", "deep.json"], "`deep.json` is not a counterexample"),
     ],
 )
 def test_bad_input_is_named(args, message, capsys):
+    Path("deep.json").write_text("[" * 200_000)
     assert main(args) == 2
     assert message in capsys.readouterr().err
 

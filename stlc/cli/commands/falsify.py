@@ -436,7 +436,7 @@ def _stored(path: Path) -> dict[str, Any]:
         found = json_text.loads(path.read_text(encoding="utf-8"))
     except OSError:
         raise UsageError(Diagnostic("U102", f"there is no file `{path}`")) from None
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
     keys: dict[str, Any] = {
         "requirement": str,
