@@ -237,13 +237,10 @@ class Hoist:
     def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
         """Rewrite an if-then-else (`cond`, `yes`, `no`) whose condition does not change within the loop.
 
-        The condition is computed before the loop, as a mask in `early`.
+        The numbers in the condition are computed before the loop. It stays an if-then-else, because a product
+        with 0 would be NaN where the branch that is not taken is not finite.
         """
-        if yes == ir.Const(0.0):
-            keep = self._steady(ir.Op("sub", (ir.Const(1.0), ir.Indicator(cond))))
-            return multiply(keep, self.split(no))
-        mask = self._steady(ir.Op("sub", (ir.Indicator(cond), ir.Const(0.5))))
-        return ir.Where(ir.Predicate(mask), self.split(yes), self.split(no))
+        return ir.Where(map_parts(cond, self._steady), self.split(yes), self.split(no))
 
     def _sum(self, num: ir.Num) -> ir.Num:
         """Rewrite a sum: its loop-invariant terms are combined into one expression in `early`."""

@@ -82,7 +82,28 @@ def test_substeps_are_smaller_steps_with_the_same_control(make: Make, integrator
 @pytest.mark.parametrize("switch", SWITCHES)
 @pytest.mark.parametrize(("integrator", "substeps"), [("euler", 1), ("euler", 3), ("heun", 2), ("rk4", 1)])
 def test_a_rollout_is_its_steps(make: Make, integrator: str, substeps: int, switch: Switch) -> None:
-    system = make(RICH.format(integrator=integrator, substeps=substeps))
+    _is_its_steps(make(RICH.format(integrator=integrator, substeps=substeps)), switch)
+
+
+@pytest.mark.parametrize("switch", SWITCHES)
+def test_conditions_that_are_known_before_the_loop_have_the_slope_of_a_step(
+    make: Make, switch: Switch
+) -> None:
+    system = make("""\
+time: {dt: 0.1 s, horizon: 8 steps}
+state: {x: {}, y: {}, z: {}}
+control: {u: {range: [-1, 1]}, v: {range: [-1, 1]}}
+flow:
+  x: if u > 0 then 0 else -x * y * v
+  y: if u * u > 0.2 or v < 0.1 then y * cos(x) else y / 2
+  z: if v > 0 then u else z
+init: {mixture: [{draw: {x: "uniform(-1, 1)", y: "uniform(-1, 1)", z: "uniform(-1, 1)"}}]}
+""")
+    _is_its_steps(system, switch)
+
+
+def _is_its_steps(system: System, switch: Switch) -> None:
+    """The states of a rollout, and their gradients, are those of its steps one by one."""
     x0 = system.sample(200, seed=0, dtype=torch.float64).requires_grad_()
     u = torch.rand(200, 8, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 6 - 3
     u.requires_grad_()
