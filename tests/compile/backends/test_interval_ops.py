@@ -242,6 +242,8 @@ UNKNOWN = (-math.inf, math.inf)
         (ir.Indicator(ir.Predicate(X)), (0, 1), (1, 1)),
         (ir.Indicator(ir.Predicate(X, strict=True)), (0, 1), (0, 1)),
         (ir.Indicator(ir.Predicate(X, sign=-1)), (1, 2), (0, 0)),
+        (ir.Op("mul", (ir.Indicator(ir.Predicate(X, sign=-1)), X)), (1, math.inf), (0, 0)),
+        (ir.Op("mul", (ir.Indicator(ir.Predicate(X)), X)), (-1, math.inf), (-1, math.inf)),
         (ir.Where(ir.Predicate(X), ir.Const(5.0), X), (-1, 1), (-1, 5)),
         (ir.Where(ir.Predicate(X), X, ir.Const(5.0)), (1, 2), (1, 2)),
     ],

@@ -29,6 +29,32 @@ def test_rollouts_of_vectors_equal_torch(make: Make) -> None:
     agree(make(ARM))
 
 
+SINGULAR = """\
+time: {dt: 0.1 s, horizon: 5 steps}
+state: {x: {}, y: {}, z: {}}
+param: {r: {range: [-1, 1]}}
+control: {a: {range: [-1, 1]}, b: {range: [-1, 1]}}
+flow:
+  x: ind(r > 0) * log(r) + b
+  y: if r <= 0 then 0 else y * sqrt(r) * a
+  z: if r <= 0 or a > 0.9 then z else z * log(r)
+init: {mixture: [{draw: {x: "uniform(-1, 1)", y: "uniform(0, 1)", z: "uniform(0, 1)"}}]}
+"""
+
+
+def test_branches_not_taken_and_products_with_zero_are_nan_in_both_or_in_neither(make: Make) -> None:
+    system = make(SINGULAR)
+    x0 = system.sample(300, seed=2, dtype=torch.float64)
+    agree(system)
+    x = system.rollout(x0, torch.zeros(300, 5, 2, dtype=torch.float64))
+    found = dict(zip(system.names, x.unbind(2), strict=True))
+    negative = x0[:, system.names.index("r")] <= 0.0
+    assert negative.any()
+    assert torch.isnan(found["x"][negative, 1:]).all()
+    assert torch.isfinite(found["y"]).all()
+    assert torch.isfinite(found["z"]).all()
+
+
 def agree(system: System) -> None:
     """The rollouts of random plans by the kernel are those of torch."""
     step = build_step(system.decl, soft=False)

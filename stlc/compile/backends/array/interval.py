@@ -375,10 +375,20 @@ def bound(x: Operand) -> float:
 
 
 def mul(a: Operand, b: Operand) -> Intervals:
-    """`a * b`, for independent operands; a factor of 1 or -1 has no rounding error."""
+    """`a * b`, for independent operands; a factor of 1 or -1 has no rounding error.
+
+    An infinite end stands for any number, so that its product with 0 is 0.
+    """
     if isinstance(a, Intervals) and isinstance(b, float) and abs(b) == 1.0:
         return a if b > 0 else -a
-    return _extremes(a, b, np.multiply, bound(a) * bound(b) * _GROWTH + TINY)
+    most = bound(a) * bound(b) * _GROWTH + TINY
+    return _extremes(a, b, np.multiply if most < math.inf else _products, most)
+
+
+def _products(a: End, b: End) -> Any:
+    """Products of ends, some of which may be infinite."""
+    unbounded = (np.isinf(a) & np.equal(b, 0.0)) | (np.equal(a, 0.0) & np.isinf(b))
+    return np.where(unbounded, 0.0, np.multiply(a, b))
 
 
 def div(a: Operand, b: Operand) -> Intervals:

@@ -1,9 +1,9 @@
 """Tape of array operations: common sub-expressions are shared, constants folded, operations fused.
 
 In training each array operation has microseconds of overhead, so the tape minimizes their number:
-`a * 0.1 + b` becomes one `axpy`, the addition of a product becomes one `addcmul`, `min` and `max` with
-constants become one `clamp`, and multiplication by an indicator becomes one `where`. Each rule preserves the
-value up to rounding.
+`a * 0.1 + b` becomes one `axpy`, the addition of a product becomes one `addcmul`, and `min` and `max` with
+constants become one `clamp`. Each rule preserves the value up to rounding, also where it is NaN or infinite,
+except that a product with the constant 0 is 0.
 """
 
 from __future__ import annotations
@@ -118,9 +118,6 @@ class GradientTape:
             scaled = self.parts(one, "mul")
             if scaled is not None and isinstance(scaled[1], float):
                 return self.mul(self.mul(scaled[0], other), scaled[1])
-            gate = self.parts(one, "number")
-            if gate is not None:
-                return self.emit("where", gate[0], other, 0.0)
         return self.emit("square", a) if a == b else self.emit("mul", a, b)
 
     def _scaled(self, a: int, factor: float) -> Operand:
