@@ -38,6 +38,21 @@ def test_every_function_has_the_gradient_of_torch() -> None:
     gradients_agree(rules, np.random.default_rng(1).normal(0, 2, (STEPS + 1, 60, 3)), 3)
 
 
+def test_predicates_on_states_and_the_elapsed_time_have_the_gradient_of_torch() -> None:
+    """A margin of a guard that grows along a plan, a predicate on time alone, and a freeze of the time."""
+    x, y, elapsed = ir.Signal("x"), ir.Signal("y"), ir.Signal(ir.ELAPSED)
+    ramp = ir.Op("min", (ir.Op("mul", (elapsed, ir.Const(0.2))), ir.Const(1.0)))
+    late = ir.Predicate(ir.Op("sub", (elapsed, ir.Const(3.0))))
+    frozen = ir.Predicate(ir.Op("sub", (y, ir.Op("mul", (x, ir.FrozenVar("t0"))))))
+    inside = ir.Freeze((("t0", elapsed),), ir.Temporal("always", ir.Window(0, 1), frozen))
+    rules = [
+        ir.Temporal("always", ir.Window(0, STEPS), ir.Predicate(ir.Op("sub", (x, ramp)))),
+        ir.Temporal("eventually", ir.Window(0, STEPS), ir.BoolOp("and", (ir.Predicate(y), late))),
+        ir.Temporal("always", ir.Window(0, STEPS - 1), inside),
+    ]
+    gradients_agree(rules, np.random.default_rng(1).normal(0, 2, (STEPS + 1, 60, 3)), 3)
+
+
 def test_the_gradient_through_conditions_of_a_step_is_that_of_a_tanh() -> None:
     x, u = ir.Signal("x"), ir.Signal("u")
     after = ir.Where(ir.Predicate(x, strict=True), ir.Op("add", (x, u)), ir.Op("mul", (ir.Const(2.0), u)))

@@ -20,10 +20,9 @@ from typing import Any, Literal, TypeAlias
 
 from stlc.compile.backends.c.numbers import LISTED, NumberWriter, literal
 from stlc.compile.backends.c.plan import Buffer, Called, Frozen, Loop, Plan, Tabled, call_of
-from stlc.compile.backends.c.slopes import SlopeWriter
+from stlc.compile.backends.c.slopes import COUNTED, SlopeWriter
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import leaves
 from stlc.compile.schedule.schedule import PICKS, IndexRange, Pick, Step, earliest, latest, neutral
 
 Macro: TypeAlias = Literal["MIN", "MAX"]
@@ -149,10 +148,13 @@ def _gradient(num: ir.Num, seed: str, reader: LeafReader) -> list[str]:
     """C statements that propagate the gradient of an expression at sample `k` to its leaves (signals, calls).
 
     `seed` is the C expression of the derivative of the robustness with respect to the expression. Several
-    leaves may read the same sample, so gradients are added to them outside of the vectorized loop.
+    leaves may read the same sample, so gradients are added to them outside of the vectorized loop. There are
+    no statements if no leaf has a gradient.
     """
     writer = SlopeWriter(reader, soft=False)
     lines, gathered = writer.backward({writer.number(num): seed})
+    if not gathered:
+        return []
     shares = [f"h{i}" for i in range(len(gathered))]
     return [
         *(f"double {share}[LANES];" for share in shares),
@@ -172,7 +174,7 @@ def column(index: Mapping[str, int], name: str, k: str) -> str:
     an entry stands for a different state in each row.
     """
     if name == ir.ELAPSED:
-        return f"(double)({k})"
+        return f"{COUNTED}({k})"
     where = name.removeprefix(LISTED) if name.startswith(LISTED) else index[name]
     return f"x[{where}][{k}][j]"
 
@@ -194,15 +196,11 @@ class _Margin(StepForm):
         """Return C statements that propagate the gradient; none if it is zero.
 
         It is zero for guards (predicates whose robustness is +inf or -inf) and for predicates on the elapsed
-        time.
+        time alone.
         """
-        num, sign = self.node.num, "" if self.node.sign > 0 else "-"
-        counted = any(isinstance(leaf, ir.Signal) and leaf.name == ir.ELAPSED for leaf in leaves(num))
-        if self.node.guard or counted:
-            return []
-        reader = LeafReader(self.printer)
-        inner = _gradient(num, f"{sign}g{self.out['k']}", reader)
-        return [f"{loop(self.run)} {{ {reader.heads()}", *inner, "}"]
+        sign, reader = "" if self.node.sign > 0 else "-", LeafReader(self.printer)
+        inner = [] if self.node.guard else _gradient(self.node.num, f"{sign}g{self.out['k']}", reader)
+        return [f"{loop(self.run)} {{ {reader.heads()}", *inner, "}"] if inner else []
 
 
 class _Call(StepForm):

@@ -18,6 +18,8 @@ Slope = tuple[str, str]
 
 FLAT = "0.0"
 """The derivative of a step function."""
+COUNTED = "(double)"
+"""Start of the C expression of the elapsed time, a leaf without a gradient."""
 LESS = {"min": "<", "max": ">"}
 """Extremum -> comparison that selects an operand."""
 
@@ -76,7 +78,8 @@ class SlopeWriter(NumberWriter):
 
     def _load(self, place: str) -> str:
         register = super()._load(place)
-        self._inputs[register] = place
+        if not place.startswith(COUNTED):
+            self._inputs[register] = place
         return register
 
     def _indicator(self, cond: ir.Formula, sharpness: float | None) -> str:
