@@ -93,20 +93,74 @@ class SearchOptions:
     stop: Stop = never
 
 
+def check_plans(
+    who: str, x0: tuple[int, ...], u: tuple[int, ...], *, states: int, controls: int, steps: int | None = None
+) -> None:
+    """Check the shapes of initial states `x0`, (B, n), and plans `u`, (B, T, m).
+
+    Args:
+        who: what takes the arrays, for the message.
+        x0: shape of the initial states.
+        u: shape of the plans.
+        states: number n of states.
+        controls: number m of controls.
+        steps: number T of steps; None if any number is accepted.
+
+    Raises:
+        ValueError: the shapes are others.
+    """
+    if x0 == (*u[:1], states) and len(u) == 3 and u[2] == controls and steps in (None, u[1]):
+        return
+    length = "T" if steps is None else steps
+    raise ValueError(
+        f"{who} takes x0 (B, {states}) and u (B, {length}, {controls}), not {tuple(x0)} and {tuple(u)}"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """Sizes of the arrays that compiled code reads; it reads beyond the end of smaller ones.
+
+    Attributes:
+        states: number n of states.
+        controls: number m of controls.
+        steps: number T of steps of a plan.
+        rules: number R of requirements.
+    """
+
+    states: int
+    controls: int
+    steps: int
+    rules: int
+
+    def check(self, x0: NDArray[np.float64], u: NDArray[np.float64]) -> None:
+        """Check the shapes of initial states, (B, n), and plans, (B, T, m); ValueError if they are others."""
+        shape = {"states": self.states, "controls": self.controls, "steps": self.steps}
+        check_plans("the kernel", x0.shape, u.shape, **shape)
+
+    def check_slopes(self, batch: int, outcome: ObjectiveSlopes) -> None:
+        """Check the shapes of derivatives, (B, R) and (n, T+1, B); ValueError if they are others."""
+        wanted = {"by_rho": (batch, self.rules), "by_columns": (self.states, self.steps + 1, batch)}
+        for name, shape in wanted.items():
+            given = getattr(outcome, name)
+            if given is not None and given.shape != shape:
+                raise ValueError(f"`{name}` has the shape {shape}, not {given.shape}")
+
+
 class Kernel:
     """Loaded library with the compiled functions `judge` (robustness of plans) and `climb` (local search).
 
     Its C code comes from `stlc.compile.backends.c.emit`.
     """
 
-    def __init__(self, library: ctypes.CDLL, *, states: int, rules: int, steps: int) -> None:
+    def __init__(self, library: ctypes.CDLL, sizes: Sizes) -> None:
         self._judge, self._climb = library.judge, library.climb
         self._judge.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4
         self._climb.argtypes = [
             *([ctypes.c_int64] * 2 + [ctypes.c_void_p] * 6),
             *(ctypes.c_int64, ctypes.c_int, ctypes.c_double, ctypes.c_uint64),
         ]
-        self._states, self._rules, self._steps = states, rules, steps
+        self._sizes = sizes
 
     def judge(
         self, x0: NDArray[np.float64], u: NDArray[np.float64], *, threads: int = 1, columns: bool = False
@@ -124,11 +178,13 @@ class Kernel:
 
         Raises:
             MemoryError: there is not enough memory.
+            ValueError: an array has another shape.
         """
+        self._sizes.check(x0, u)
         x0, u = np.ascontiguousarray(x0, dtype=np.float64), np.ascontiguousarray(u, dtype=np.float64)
         batch = len(x0)
-        rho = np.empty((batch, self._rules))
-        seen = np.empty((self._states, self._steps + 1, batch)) if columns else None
+        rho = np.empty((batch, self._sizes.rules))
+        seen = np.empty((self._sizes.states, self._sizes.steps + 1, batch)) if columns else None
         where = None if seen is None else seen.ctypes.data
 
         def rows(first: int, last: int) -> int:
@@ -156,7 +212,11 @@ class Kernel:
 
         Raises:
             MemoryError: there is not enough memory.
+            ValueError: an array has another shape.
         """
+        self._sizes.check(x0, plans)
+        if len(search.bank) and search.bank.shape[1:] != plans.shape[1:]:
+            raise ValueError(f"the bank has the shape (k, T, m), not {search.bank.shape}")
         x0, plans = np.ascontiguousarray(x0, dtype=np.float64), np.array(plans, dtype=np.float64, order="C")
         rho = np.full(len(x0), np.nan)
         arrays = [a.ctypes.data for a in (x0, plans, rho, search.bounds, search.factors, search.bank)]
@@ -195,7 +255,8 @@ class Adjoint:
     Its C code comes from `stlc.compile.backends.c.adjoint`.
     """
 
-    def __init__(self, library: ctypes.CDLL) -> None:
+    def __init__(self, library: ctypes.CDLL, sizes: Sizes) -> None:
+        self._sizes = sizes
         self._pull = library.pull
         self._pull.argtypes = (
             [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 5 + [ctypes.c_double, ctypes.c_void_p]
@@ -224,6 +285,7 @@ class Adjoint:
 
         Raises:
             MemoryError: there is not enough memory.
+            ValueError: an array has another shape.
         """
         return self._pulled(x0, u, outcome, threads)[0]
 
@@ -236,6 +298,8 @@ class Adjoint:
     def _pulled(
         self, x0: NDArray[np.float64], u: NDArray[np.float64], outcome: ObjectiveSlopes, threads: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        self._sizes.check(x0, u)
+        self._sizes.check_slopes(len(x0), outcome)
         arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in (x0, u, outcome.by_rho)]
         columns = None if outcome.by_columns is None else np.ascontiguousarray(outcome.by_columns, np.float64)
         where = None if columns is None else columns.ctypes.data

@@ -25,7 +25,7 @@ from stlc.compile.ir.traverse import leaves, nodes, subexpressions
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.native import Adjoint, Kernel, ObjectiveSlopes, load
+from stlc.native import Adjoint, Kernel, ObjectiveSlopes, Sizes, load
 
 T = TypeVar("T")
 
@@ -47,18 +47,23 @@ def follower(steps: int = STEPS) -> Motion:
     return Motion(NAMES, controls, (), after, steps, 0.1)
 
 
+def sizes_of(motion: Motion, rules: int) -> Sizes:
+    """The sizes of the arrays of a kernel."""
+    return Sizes(len(motion.states), len(motion.controls), motion.steps, rules)
+
+
 def kernel_of(motion: Motion, rules: Sequence[ir.Formula]) -> Kernel:
     """The built kernel."""
     library = load(emit(motion, rules))
     assert library is not None
-    return Kernel(library, states=len(motion.states), rules=len(rules), steps=motion.steps)
+    return Kernel(library, sizes_of(motion, len(rules)))
 
 
 def adjoint_of(motion: Motion, rules: Sequence[ir.Formula], *, fixed: Sequence[str] = ()) -> Adjoint:
     """The built gradient."""
     library = load(emit_adjoint(motion, rules, fixed=fixed))
     assert library is not None
-    return Adjoint(library)
+    return Adjoint(library, sizes_of(motion, len(rules)))
 
 
 def gathered(

@@ -21,7 +21,7 @@ from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir.support import columns as columns_read
-from stlc.controller.problem.native import motion_of
+from stlc.controller.problem.native import motion_of, sizes_of
 from stlc.native import Adjoint, ObjectiveSlopes, load
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def state_gradient(system: System) -> Pull:
         library = None
     if library is None:
         return partial(_pulled_by_torch, system)
-    adjoint = Adjoint(library)
+    adjoint = Adjoint(library, sizes_of(system, []))
 
     def pull(x0: Tensor, plans: Tensor, columns: Tensor) -> Tensor:
         none = np.zeros((len(x0), 0))

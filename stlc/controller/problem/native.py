@@ -20,7 +20,18 @@ from stlc.compile.backends.c.advance import emit_advance
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.dynamics.model.step import commands
-from stlc.native import Adjoint, Advance, Kernel, ObjectiveSlopes, SearchOptions, Stop, load, never, why_none
+from stlc.native import (
+    Adjoint,
+    Advance,
+    Kernel,
+    ObjectiveSlopes,
+    SearchOptions,
+    Sizes,
+    Stop,
+    load,
+    never,
+    why_none,
+)
 from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
@@ -54,6 +65,11 @@ def motion_of(system: System) -> Motion:
     return Motion(system.names, system.control_names, step.lets, step.next, system.horizon, system.dt)
 
 
+def sizes_of(system: System, rules: Sequence[CompiledRequirement]) -> Sizes:
+    """Return the sizes of the arrays for a system and requirements."""
+    return Sizes(len(system.names), len(system.control_names), system.horizon, len(rules))
+
+
 class NativeJudge:
     """Native kernel that computes the robustness of plans of one task, on the CPU.
 
@@ -83,7 +99,7 @@ class NativeJudge:
             return None
         if library is None:
             return None
-        kernel = Kernel(library, states=len(system.names), rules=len(rules), steps=system.horizon)
+        kernel = Kernel(library, sizes_of(system, rules))
         return cls(kernel, system, rules)
 
     def judge(self, x0: Tensor, u: Tensor, *, columns: bool) -> tuple[Tensor, Mapping[str, Tensor]]:
@@ -170,7 +186,7 @@ class NativeGradient:
             library = load(emit_adjoint(motion_of(system), formulas, fixed=fixed, end=end))
         except Untranslatable:
             return None
-        return None if library is None else cls(judge, Adjoint(library))
+        return None if library is None else cls(judge, Adjoint(library, sizes_of(system, rules)))
 
     def __call__(self, x0: Tensor, u: Tensor, *, slope: float) -> tuple[Tensor, Mapping[str, Tensor]]:
         """Robustness per requirement (B, R), and states name -> (T+1, B), differentiable with respect to `u`.

@@ -22,6 +22,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
+from stlc.native import check_plans
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -257,7 +258,13 @@ class Task:
 
         Returns:
             The verdicts, in the dtype of `x0`. A plan that holds NaN counts as violated (robustness -inf).
+
+        Raises:
+            ValueError: `x0` or `u` has another shape.
         """
+        names, controls = self.system.names, self.system.control_names
+        sizes = {"states": len(names), "controls": len(controls), "steps": self.horizon}
+        check_plans(self.system.decl.name, tuple(x0.shape), tuple(u.shape), **sizes)
         with torch.no_grad():
             u = u.to(x0.dtype)
             each, columns = self._judged(x0, u, states=states)

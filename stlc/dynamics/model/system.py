@@ -31,6 +31,7 @@ from stlc.dynamics.model.step import ModelStep, build_step, commands
 from stlc.dynamics.robots.functions import load_functions
 from stlc.dynamics.scenarios.scenario import truth, under
 from stlc.files import find_system
+from stlc.native import check_plans
 
 HARD = Hard()
 PROBED = 1000
@@ -229,15 +230,8 @@ class System:
         The tensor of a constant state is an expanded view. `switch` selects exact jumps or their smooth
         blends.
         """
-        if (
-            x0.shape[1:] != (len(self.names),)
-            or u.shape[2:] != (len(self.decl.controls),)
-            or x0.shape[0] != u.shape[0]
-        ):
-            raise ValueError(
-                f"{self.decl.name} takes x0 (B, {len(self.names)}) and u (B, T, {len(self.decl.controls)}),"
-                f" not {tuple(x0.shape)} and {tuple(u.shape)}"
-            )
+        sizes = {"states": len(self.names), "controls": len(self.control_names)}
+        check_plans(self.decl.name, tuple(x0.shape), tuple(u.shape), **sizes)
         start = dict(zip(self.names, x0.t().contiguous().unbind(0), strict=True))
         inputs = dict(zip(self.control_names, u.permute(2, 1, 0).contiguous().unbind(0), strict=True))
         moving = {name: column for name, column in start.items() if name not in self._timer_step.next}

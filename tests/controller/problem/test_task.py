@@ -61,6 +61,23 @@ def test_satisfying_plans_come_first_then_cheap_ones_then_robust_ones(
         assert rho[best] >= rho.max() - 1e-9
 
 
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_plans_of_other_sizes_are_refused(
+    car_task: Task, by_torch: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x0, u = car_task.sample(4, seed=3), torch.zeros(4, car_task.horizon, 1)
+    if by_torch:
+        monkeypatch.setitem(car_task.__dict__, "native", None)
+    for start, plans in ((x0, u[:1]), (x0[:1], u), (x0[:, :3], u), (x0, u.expand(-1, -1, 2))):
+        with pytest.raises(ValueError, match=r"takes x0 \(B, "):
+            car_task.judge(start, plans)
+        with pytest.raises(ValueError, match=r"takes x0 \(B, "):
+            car_task.rollout(start, plans)
+    for plans in (u[:, 1:], torch.cat((u, u), 1)):
+        with pytest.raises(ValueError, match=rf"u \(B, {car_task.horizon}, 1\)"):
+            car_task.judge(x0, plans)
+
+
 @pytest.mark.parametrize("steps", [0, 1, 7, None])
 def test_plans_of_any_length_are_rolled_out_as_the_system_says(car_task: Task, steps: int | None) -> None:
     assert car_task.native is not None

@@ -9,6 +9,7 @@ import pytest
 import torch
 from dynamics.model.test_motion import RICH
 from dynamics.test_vectors import ARM
+from helpers.emitted import sizes_of
 
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.dynamics.model.step import build_step
@@ -67,7 +68,7 @@ def agree(system: System) -> None:
     )
     library = load(emit(motion, []))
     assert library is not None
-    kernel = Kernel(library, states=len(motion.states), rules=0, steps=motion.steps)
+    kernel = Kernel(library, sizes_of(motion, 0))
     _, columns = kernel.judge(x0.numpy(), u.numpy(), columns=True)
     assert columns is not None
     expected = system.rollout(x0, u).permute(2, 1, 0).numpy()
