@@ -112,7 +112,7 @@ _PLAIN = {
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
     "div": lambda a, b: a / b,
-    "mod": lambda a, b: a - math.floor(a / b) * b,
+    "mod": lambda a, b: a % b,
     "pow": lambda a, b: a**b,
     "neg": lambda a: -a,
     "square": lambda a: a * a,

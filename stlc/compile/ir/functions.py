@@ -325,7 +325,7 @@ _OPERATORS = (
         "same",
         operator.mod,
         "floored_mod({0}, {1})",
-        ("1.0", "(-floor({0} / {1}))"),
+        ("1.0", "(-rint(({0} - {r}) / {1}))"),
         _modulo,
         domain=_divides,
         numpy="mod",

@@ -53,6 +53,11 @@ def test_predicates_on_states_and_the_elapsed_time_have_the_gradient_of_torch() 
     gradients_agree(rules, np.random.default_rng(1).normal(0, 2, (STEPS + 1, 60, 3)), 3)
 
 
+def test_a_remainder_has_the_slope_of_torch_where_the_quotient_rounds_up() -> None:
+    points = np.array([[1.0, 0.1, 0.0], [9.0, -0.3, 0.0], [-1.0, 0.1, 0.0], [0.6, 0.2, 0.0], [0.7, 3.0, 0.0]])
+    slopes_agree([ir.Op("mod", (ir.Signal("x"), ir.Signal("y")))], points)
+
+
 def test_the_gradient_through_conditions_of_a_step_is_that_of_a_tanh() -> None:
     x, u = ir.Signal("x"), ir.Signal("u")
     after = ir.Where(ir.Predicate(x, strict=True), ir.Op("add", (x, u)), ir.Op("mul", (ir.Const(2.0), u)))

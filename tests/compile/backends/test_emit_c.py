@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from helpers.emitted import OPERATIONS, STEPS, follower, values_agree
+from helpers.emitted import OPERATIONS, STEPS, follower, kernel_of, values_agree
 from helpers.formula_strategies import NAMES
 
 from stlc import native
@@ -35,6 +35,17 @@ def test_every_function_equals_the_evaluator() -> None:
     rng = np.random.default_rng(1)
     trace = rng.normal(0, 2, (STEPS + 1, 200, 3))
     values_agree(rules, trace)
+
+
+def test_the_remainder_is_exact_where_the_quotient_rounds_up() -> None:
+    """1 / 0.1 rounds to 10, but the double 0.1 is in 1 nine times only."""
+    rule = ir.Predicate(ir.Op("mod", (ir.Signal("x"), ir.Signal("y"))))
+    pairs = [(1.0, 0.1), (9.0, -0.3), (-1.0, 0.1), (-9.0, -0.3), (0.6, 0.2), (3.0, 1.5), (0.0, -2.0)]
+    row = np.array([(x, y, 0.0) for x, y in pairs])
+    trace = np.broadcast_to(row, (STEPS + 1, *row.shape)).copy()
+    values_agree([rule], trace)
+    judged, _ = kernel_of(follower(), [rule]).judge(trace[0], trace[1:].transpose(1, 0, 2))
+    assert judged[:, 0].tolist() == [x % y for x, y in pairs]
 
 
 def test_every_node_is_printed() -> None:

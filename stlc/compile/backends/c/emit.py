@@ -48,8 +48,8 @@ VECTOR(sin) VECTOR(cos) VECTOR(exp) VECTOR(log)
 #define NAN_IN(a) ((double)((a) != (a)))
 
 static inline double floored_mod(double a, double b) {{
-  const double r = a - b * floor(a / b);
-  return r;
+  const double r = fmod(a, b); /* exact, unlike a - b * floor(a / b) where a / b rounds up */
+  return r != 0.0 && (r < 0.0) != (b < 0.0) ? r + b : r;
 }}
 """
 

@@ -129,6 +129,11 @@ def _elementwise(function: Any) -> Any:
     return method
 
 
+def _floored_mod(a: Any, b: Any) -> Any:
+    rest = casadi.fmod(a, b)
+    return casadi.if_else(rest * casadi.sign(b) < 0.0, rest + b, rest)
+
+
 def _each(*functions: Any) -> list[Any]:
     """Make methods of `CasadiOps` from several elementwise functions."""
     return [_elementwise(function) for function in functions]
@@ -149,7 +154,7 @@ class CasadiOps(FloatConstants):
     gt, ge, pow, where = _each(operator.gt, operator.ge, operator.pow, casadi.if_else)
     both, either = _each(casadi.logic_and, casadi.logic_or)
     round = _elementwise(lambda x: casadi.floor(x + 0.5))
-    mod = _elementwise(lambda a, b: a - b * casadi.floor(a / b))
+    mod = _elementwise(_floored_mod)
     square = _elementwise(lambda x: x * x)
     sqrt = _elementwise(lambda x: casadi.sqrt(x + TINY))
     sigmoid = _elementwise(lambda x: 0.5 + 0.5 * casadi.tanh(0.5 * x))
