@@ -89,6 +89,17 @@ def test_a_factor_of_one_changes_nothing() -> None:
         torch.testing.assert_close(right.step(x, u), model.step(x, u), rtol=1e-13, atol=1e-13)
 
 
+def test_jumps_with_one_name_stay_apart() -> None:
+    second = """\
+  - {name: bounce, guard: "p[0] < -wall", reset: {w: "[-lost * w[0] / 2, w[1]]"}}
+init:"""
+    decl = spring(SYSTEM.replace("init:", second))
+    loose, model = perturbable(decl), System(decl)
+    x, u = states(model, 200)
+    right = PerturbedSystem(loose, torch.ones(200, len(loose.numbers), dtype=torch.float64))
+    torch.testing.assert_close(right.step(x, u), model.step(x, u), rtol=1e-13, atol=1e-13)
+
+
 def states(system: System, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(1)
     x = 4 * torch.rand((count, len(system.names)), generator=generator, dtype=torch.float64) - 2

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any
 
 from stlc.compile.frontend.scope import Definition, Known
@@ -19,7 +20,7 @@ from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import moving_parts
-from stlc.dynamics.declaration.motion import Assign, JumpDecl, read_flow, read_jumps
+from stlc.dynamics.declaration.motion import Assign, JumpDecl, each_jump, read_flow
 from stlc.dynamics.model.algebra import multiply, names_in
 from stlc.dynamics.model.system import System
 from stlc.dynamics.schema.names import Names, base_name, each_number
@@ -71,9 +72,9 @@ def perturbable(decl: SystemDecl) -> Perturbable:
     names = parts.cx.names
     used, listed = _UsedNumbers(names), decl.test.uncertain
 
-    def read(rewriting: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl, ...]]:
+    def read(rewriting: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl | None, ...]]:
         cx = replace(parts.cx, reader=Reader(decl.source), names=rewriting).plain  # its findings are dropped
-        return read_flow(parts.flow, cx), read_jumps(parts.jump, cx)
+        return read_flow(parts.flow, cx), each_jump(parts.jump, cx)
 
     read(replace(names, rewrite=used.record))
     chosen = used.computed_with - used.compared if listed is None else frozenset(listed)
@@ -93,10 +94,11 @@ def perturbable(decl: SystemDecl) -> Perturbable:
     return Perturbable(factored, tuple(each for each in found if each.states))
 
 
-def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl, ...]) -> SystemDecl:
+def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl | None, ...]) -> SystemDecl:
     """Return the declaration with the guards, equations and resets of `flow` and `jumps`.
 
-    Bool and enum states keep their equations and resets.
+    `jumps` are the first ones of the declaration, in its order; those of timers follow them and stay. Bool
+    and enum states keep their equations and resets.
     """
     real = {column.name for column in decl.signature.columns if column.kind == "real"}
 
@@ -104,10 +106,11 @@ def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl
         values = {assign.name: assign for assign in others if assign.name in real}
         return tuple(values.get(assign.name, assign) for assign in assigns)
 
-    again = {jump.name: jump for jump in jumps}
-    pairs = ((jump, again.get(jump.name, jump)) for jump in decl.jumps)
     changed = (
-        replace(jump, guard=other.guard, resets=replaced(jump.resets, other.resets)) for jump, other in pairs
+        jump
+        if other is None
+        else replace(jump, guard=other.guard, resets=replaced(jump.resets, other.resets))
+        for jump, other in zip(decl.jumps, chain(jumps, repeat(None)), strict=False)
     )
     return replace(decl, flow=replaced(decl.flow, flow), jumps=tuple(changed))
 
