@@ -9,6 +9,7 @@ from helpers.emitted import (
     STEPS,
     adjoint_of,
     choosing,
+    follower,
     gradients_agree,
     near_switches,
     slopes_agree,
@@ -56,6 +57,37 @@ def test_predicates_on_states_and_the_elapsed_time_have_the_gradient_of_torch() 
 def test_a_remainder_has_the_slope_of_torch_where_the_quotient_rounds_up() -> None:
     points = np.array([[1.0, 0.1, 0.0], [9.0, -0.3, 0.0], [-1.0, 0.1, 0.0], [0.6, 0.2, 0.0], [0.7, 3.0, 0.0]])
     slopes_agree([ir.Op("mod", (ir.Signal("x"), ir.Signal("y")))], points)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_branches_that_are_not_taken_and_are_singular_have_no_gradient(soft: bool) -> None:
+    x, y, z = (ir.Signal(name) for name in NAMES)
+    far = ir.Predicate(ir.Op("sub", (ir.Op("abs", (y,)), ir.Const(0.1))))
+    quotient = ir.Op("div", (z, y))
+    branches = [
+        quotient,
+        ir.Op("mul", (x, ir.Op("sin", (quotient,)))),
+        ir.Op("atan2", (y, y)),
+        ir.Op("add", (ir.Op("log", (ir.Op("abs", (y,)),)), ir.Op("pow", (y, ir.Const(-1.5))))),
+    ]
+    nums: list[ir.Num] = [ir.Where(far, branch, z) for branch in branches]
+    points = np.array([[0.3, 0.0, 0.7], [0.3, 0.5, 0.2]])
+    for num in nums:
+        if soft:
+            motion = Motion(("state",), NAMES, (), {"state": num}, 1, 0.1)
+            by_state = np.zeros((1, 2, 2))
+            by_state[0, 1] = 1.0
+            outcome = ObjectiveSlopes(np.zeros((2, 1)), by_state, 500.0)
+            rule = ir.Predicate(ir.Signal("state"))
+            found = adjoint_of(motion, [rule]).pull(np.zeros((2, 1)), points[:, None].copy(), outcome)
+        else:
+            trace = np.broadcast_to(points, (STEPS + 1, 2, 3)).copy()
+            rule = ir.Temporal("always", ir.Window(1, 1), ir.Predicate(num))
+            ones = ObjectiveSlopes(np.ones((2, 1)), None, 5.0)
+            plans = trace[1:].transpose(1, 0, 2)
+            found = adjoint_of(follower(), [rule]).pull(trace[0], plans, ones)
+        assert found[0, 0].tolist() == [0.0, 0.0, 1.0], num
+        assert np.isfinite(found).all()
 
 
 def test_the_gradient_through_conditions_of_a_step_is_that_of_a_tanh() -> None:

@@ -32,6 +32,8 @@ static inline double decay(double x) {
   power.bits = ((int64_t)n + 1023) << 52;
   return p * power.value;
 }
+/* x, or 0 where a branch that is not taken is infinite or NaN. */
+static inline double finite(double x) { return fabs(x) < INFINITY ? x : 0.0; }
 /* Slope of (1 + tanh(slope z)) / 2. */
 static inline double bump(double z, double slope) {
   const double e = decay(-2.0 * slope * fabs(z));

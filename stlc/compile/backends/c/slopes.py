@@ -18,6 +18,18 @@ Slope = tuple[str, str]
 
 FLAT = "0.0"
 """The derivative of a step function."""
+SINGULAR = {
+    "div": 1,
+    "mod": 1,
+    "pow": 0,
+    "sqrt": 0,
+    "log": 0,
+    "log10": 0,
+    "asin": 0,
+    "acos": 0,
+    "atan2": 0,
+}
+"""Function whose value or slope may be infinite or NaN -> index of the argument that makes it so."""
 COUNTED = "(double)"
 """Start of the C expression of the elapsed time, a leaf without a gradient."""
 LESS = {"min": "<", "max": ">"}
@@ -26,6 +38,9 @@ LESS = {"min": "<", "max": ">"}
 
 class SlopeWriter(NumberWriter):
     """Writer of expressions that records the partial derivatives of each register (C variable).
+
+    A branch that is not taken, such as `a / y` in `if y > 0.1 then a / y else a`, may be infinite or NaN. So
+    no gradient passes to it, nor to its operands, and the step between the branches then has no slope.
 
     Args:
         place: returns the C expression of a leaf (signal, call, or frozen value).
@@ -39,6 +54,8 @@ class SlopeWriter(NumberWriter):
         self._slopes: dict[str, tuple[Slope, ...]] = {}
         self._inputs: dict[str, str] = {}
         self._constants: set[str] = set()
+        self._optional: set[str] = set()
+        self._unbounded: set[str] = set()
 
     def backward(self, seeds: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
         """Return C statements that propagate gradients from registers to leaves (signals, calls).
@@ -54,10 +71,20 @@ class SlopeWriter(NumberWriter):
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
+        optional = set(self._optional)
         for name in reversed(registers):
-            lines += [f"d{of} += d{name} * {slope};" for of, slope in self._slopes.get(name, ())]
+            slopes = self._slopes.get(name, ())
+            if name in optional & self._unbounded:
+                optional.update(of for of, _ in slopes)
+                slopes = tuple((of, self._limited(name, slope)) for of, slope in slopes)
+            lines += [f"d{of} += d{name} * {slope};" for of, slope in slopes]
         gathered = {f"g{place}": f"d{name}" for name, place in self._inputs.items()}
         return lines, gathered
+
+    def _limited(self, name: str, slope: str) -> str:
+        """C expression of a slope by which a gradient of 0 may be multiplied."""
+        plain = slope in ("1.0", "(-1.0)") or "(double)" in slope or " == " in slope
+        return slope if plain else f"(d{name} == 0.0 ? 0.0 : {slope})"
 
     def gradients(self, outputs: Iterable[tuple[ir.Num, str]]) -> list[str]:
         """Return C statements that compute expressions and propagate gradients to the signals in them.
@@ -91,9 +118,13 @@ class SlopeWriter(NumberWriter):
     def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
         margin, taken = self.margin(cond) if self._soft else "", f"(double){self.truth(cond)}"
         register = super()._choice(cond, yes, no)
-        slopes = [(yes, taken), (no, f"(1.0 - {taken})")]
+        slopes, step = [(yes, taken), (no, f"(1.0 - {taken})")], f"({yes} - {no})"
+        self._optional |= {yes, no}
+        if self._unbounded & {yes, no}:
+            self._unbounded.add(register)
+            step = f"finite{step}"
         if self._soft:
-            slopes.append((margin, f"(({yes} - {no}) * bump({margin}, slope))"))
+            slopes.append((margin, f"({step} * bump({margin}, slope))"))
         self._remember(register, slopes)
         return register
 
@@ -101,6 +132,8 @@ class SlopeWriter(NumberWriter):
         register = super()._apply(name, args)
         if not any(map(self._varies, args)):
             self._constants.add(register)
+        if self._unbounded.intersection(args) or (name in SINGULAR and self._varies(args[SINGULAR[name]])):
+            self._unbounded.add(register)
         derivative = FUNCTIONS[name].slopes
         if name == "clip":
             slopes = self._clipped(*args)
