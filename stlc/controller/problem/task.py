@@ -295,7 +295,15 @@ class Task:
 
     def _judged_by_torch(self, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
         columns = self.system.rollout_columns(x0, u, HARD)
-        return self.graph.per_requirement_columns(columns, ops=TORCH), columns
+        each = self.graph.per_requirement_columns(columns, ops=TORCH)
+        for name in self._moving:
+            each = torch.where(columns[name][1:].isnan().any(0)[:, None], torch.nan, each)
+        return each, columns
+
+    @cached_property
+    def _moving(self) -> tuple[str, ...]:
+        """Names of the states that change along a plan; a plan on which one is NaN is violated."""
+        return tuple(motion_of(self.system).next)
 
     @cached_property
     def _values_of_a_row(self) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -9,6 +11,8 @@ from stlc import native
 from stlc.controller.problem.native import NativeJudge
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.model.system import System
+from stlc.grammar.parse.parser import parse
+from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
 
@@ -51,6 +55,26 @@ def test_broken_plans_are_violated_in_both(car_task: Task, monkeypatch: pytest.M
     u[2, 0] = torch.inf
     for judged in _both(car_task, x0, u, monkeypatch):
         assert torch.isneginf(judged.rho).tolist() == [False, True, True, False]
+
+
+def test_a_state_that_no_requirement_reads_must_be_a_number_in_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = tmp_path / "log.yaml"
+    there.write_text("""\
+stlc: 1
+name: log
+time: {dt: 0.1 s, horizon: 5 steps}
+state: {x: {range: [-5, 5]}, y: {range: [-5, 5]}, still: {}}
+control: {a: {range: [-1, 1]}}
+flow: {x: a, y: log(y)}
+init: {mixture: [{draw: {x: 0, y: 1, still: 0}}]}
+""")
+    text = "spec a\nstate signal x\nrequire r: always[0,T] x < 2\n"
+    task = Task.of(parse(Source("a.stl", text)), System.load(there))
+    x0 = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, torch.nan]], dtype=torch.float64)
+    for judged in _both(task, x0, torch.zeros(3, 5, 1, dtype=torch.float64), monkeypatch):
+        assert torch.isneginf(judged.rho).tolist() == [False, True, False]
 
 
 def test_states_are_left_out_where_nobody_wants_them(car_task: Task) -> None:
