@@ -90,7 +90,9 @@ class StagedSearch(GuardSearch):
                 rejected.best.improve(rows, stage.propose(rejected, rows, deadline))
                 del rejected.tried[:before]
         best = rejected.best
-        best.source[best.source < 0] = SAFEST
+        left = (best.source < 0).nonzero()[:, 0]
+        if len(left):  # no stage judged a plan, for example because no prefix is shorter than the plan
+            best.put(left, Candidates.judged(self.task, x[left], best.plans[left], SAFEST))
         return best
 
 
