@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,7 +14,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.model.system import System
 from stlc.dynamics.robots.functions import function_files
-from stlc.files import SPECS, find_system, read_source, write_atomic
+from stlc.files import SPECS, alone_in, find_system, read_source, write_atomic
 from stlc.grammar.parse.parser import parse
 from stlc.jsontext import dumps, plain
 from stlc.provenance import git_state, hardware, sha256, versions
@@ -82,7 +80,7 @@ class ResultStore:
         """
         document = {"name": key.name, "key": key.values, "made": made_here(), **result}
         self.folder.mkdir(parents=True, exist_ok=True)
-        with _alone_in(self.folder):
+        with alone_in(self.folder, wait=True):
             kept = {**self.all(), key.name: plain(document)}
             lines = ",\n".join(f"{dumps(name)}: {dumps(each)}" for name, each in kept.items())
             write_atomic(self.path, f'{{"format": {dumps(FORMAT)}, "results": {{\n{lines}\n}}}}\n')
@@ -106,22 +104,6 @@ class ResultStore:
             raise UsageError(
                 Diagnostic("U102", message, help=("move the file away, or repair it",))
             ) from None
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Context in which no other process is in this context of the same folder; on Windows it does nothing."""
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
 
 
 def made_here() -> dict[str, Any]:

@@ -323,3 +323,36 @@ def beside(home: Path, name: str) -> Path:
     """
     there, here = home / name, home / Path(name).name
     return here if here.is_file() and not there.is_file() else there
+
+
+@contextmanager
+def alone_in(folder: Path, *, wait: bool = False) -> Iterator[bool]:
+    """Context in which no other process is in this context of the same folder; yields False if one is.
+
+    The lock lies on the folder itself: it ends with the process, and no copy of the folder has it. Where
+    folders have no locks (on Windows, on some network drives), True is yielded.
+
+    Args:
+        folder: the folder, which exists.
+        wait: whether to wait until the other process has left; then True is yielded.
+    """
+    try:
+        import fcntl
+
+        descriptor = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):
+        yield True
+        return
+    try:
+        own = True
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            own = False
+        except OSError:
+            pass
+        yield own
+    finally:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_UN)  # although a worker process may have a copy
+        os.close(descriptor)

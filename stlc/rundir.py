@@ -13,7 +13,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from stlc.diagnostics import Diagnostic, RunError, UsageError, usage
 from stlc.escape import file_part, shell
-from stlc.files import reported, write_atomic
+from stlc.files import alone_in, reported, write_atomic
 from stlc.jsontext import dumps
 from stlc.registry import did_you_mean
 
@@ -183,33 +183,9 @@ class RunDir:
         ended = {"status": status, "finished": now()}
         self.update(ended if result is None else {**ended, "result": result})
 
-    @contextmanager
-    def claimed(self) -> Iterator[bool]:
-        """Context in which this process alone trains the run; yields False if another process does.
-
-        The lock lies on the folder itself: it ends with the process, and no copy of the folder has it. Where
-        folders have no locks (on Windows, on some network drives), True is yielded.
-        """
-        try:
-            import fcntl
-
-            descriptor = os.open(self.path, os.O_RDONLY)
-        except (ImportError, OSError):
-            yield True
-            return
-        try:
-            own = True
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                own = False
-            except OSError:
-                pass
-            yield own
-        finally:
-            with suppress(OSError):
-                fcntl.flock(descriptor, fcntl.LOCK_UN)  # although a worker process may have a copy
-            os.close(descriptor)
+    def claimed(self) -> AbstractContextManager[bool]:
+        """Context in which this process alone trains the run; its value is False if another process does."""
+        return alone_in(self.path)
 
     def _damaged(self, name: str, error: Exception) -> Diagnostic:
         if isinstance(error, FileNotFoundError):
