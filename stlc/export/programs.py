@@ -169,8 +169,8 @@ class Guarding(nn.Module):
         own = finite(plan, self._task)
         nobody = torch.zeros_like(x[:, 0])
         if not self._prefixes:
-            each = torch.zeros_like(x[:, :1]).expand(-1, len(self._task.rules)) - torch.inf
-            return own, nobody - torch.inf, nobody - torch.inf, each, nobody.long() + 2, nobody.long()
+            judged = judged_by_torch(self._task, x, own)
+            return own, judged.rho, judged.safe, judged.requirements, nobody.long() + 2, nobody.long()
         decided, found = torch.zeros_like(nobody, dtype=torch.bool), _NOTHING
         for length, prefixes in zip(self.grid.lengths, self._prefixes, strict=True):
             last = length == self.grid.lengths[-1]

@@ -61,9 +61,7 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
             pick = best(allowed, (candidates.rho, -candidates.cost))
             return Found(candidates.of([pick]), BACKUP, length)
     if candidates is None:
-        nothing = np.full(1, -np.inf)
-        each = np.full((1, len(graphs.facts.requirements)), -np.inf)
-        return Found(JudgedPlans(own[None], nothing, nothing, -nothing, each), SAFEST, 0)
+        return Found(graphs.judged(x[None], own[None])[0], SAFEST, 0)
     return Found(candidates.of([_safest(graphs, x, candidates)]), SAFEST, grid.lengths[-1])
 
 
