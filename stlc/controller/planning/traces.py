@@ -16,14 +16,17 @@ from torch import Tensor
 from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.grammar import ast
+from stlc.monitor.signals import conversion
 from stlc.registry import closest
-from stlc.trace import Trace, TraceMeta, load_trace
+from stlc.trace import Reading, Trace, TraceMeta, load_trace
+from stlc.trace.enums import TRUTH, Words
 from stlc.units import parse_quantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
     from stlc.controller.planning.planner import PlanResult
     from stlc.controller.problem.task import Task
+    from stlc.signature import Column
 
 RANDOM = "random"
 
@@ -34,14 +37,15 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     Args:
         task: specification and system.
         text: `random`; or assignments such as `x=1, v=2 m/s`, where all other states are random; or the path
-            of a trace file. In the last case the first sample of each trace is an initial state.
+            of a trace file. In the last case the first sample of each trace is an initial state, in the units
+            of the system; an enum or bool may be a word.
         count: number of initial states; for a trace file, the maximum number.
         seed: seed of random states.
 
     Raises:
-        UsageError: U101, an assignment is invalid, or the traces lack a state or its first value; U102, there
-            is no such file.
-        TraceError: the trace file is invalid.
+        UsageError: U101, an assignment is invalid; or the traces lack a state or its first value, or this is
+            no value of the enum or bool; U102, there is no such file.
+        TraceError: the trace file is invalid, or a unit in it measures another quantity (E605).
     """
     if text == RANDOM:
         return task.sample(count or 1, seed=seed, dtype=torch.float64)
@@ -67,23 +71,29 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
         known = f"states: {', '.join(task.system.names)}"
         advice = known if near is None else f"did you mean `{near}`?  {known}"
         raise usage(f"`{task.system.decl.name}` has no state `{name}`", advice)
-    column = task.system.signature.columns[task.system.names.index(name)]
-    labels = dict(column.labels)
-    if value in labels:
-        return name, float(labels[value])
+    column = task.system.signature[name]
+    words = _words(column)
+    word = value.lower() if column.kind == "bool" else value
+    if word in words:
+        return name, float(words[word])
     try:
         found = parse_quantity(value, column.unit)
     except ValueError as error:
-        listed = f"or {', '.join(labels)}" if labels else f"`{name}` is in [{column.unit}]"
+        listed = f"or {', '.join(words)}" if words else f"`{name}` is in [{column.unit}]"
         raise usage(
             f"`{part.strip()}`: {error}", f"write NAME=NUMBER, such as x=1.5, v=2 m/s; {listed}"
         ) from None
-    if labels and found not in labels.values():
-        raise usage(f"`{part.strip()}`: `{name}` is one of {', '.join(labels)}")
+    if words and found not in words.values():
+        raise usage(f"`{part.strip()}`: `{name}` is one of {', '.join(words)}")
     low, high = column.low, column.high
-    if column.fact and not labels and low is not None and high is not None and not low <= found <= high:
+    if column.fact and not words and low is not None and high is not None and not low <= found <= high:
         raise usage(f"`{part.strip()}`: `{name}` is always within [{low:g}, {high:g}]")
     return name, found
+
+
+def _words(column: Column) -> Words:
+    """Words for the values of a state: the labels of an enum, or those for truth values; else none."""
+    return TRUTH if column.kind == "bool" else dict(column.labels)
 
 
 def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
@@ -92,24 +102,35 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     A state that the specification adds (timer or parameter) is random if the traces do not contain it.
 
     Raises:
-        UsageError: U101, the traces lack a state or its first value; U102, there is no such file.
+        UsageError: U101, the traces lack a state or its first value, or this is no value of the enum or bool;
+            U102, there is no such file.
+        TraceError: the trace file is invalid, or a unit in it measures another quantity (E605).
     """
     if not text.strip() or not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
         raise UsageError(Diagnostic("U102", f"there is no file `{text}` with initial states", help=help_))
-    trace = load_trace(text)
+    columns = task.system.signature.columns
+    trace = load_trace(text, Reading(words={column.name: _words(column) for column in columns}))
     rows = min(trace.traces, count or trace.traces)
     states = task.sample(rows, seed=seed, dtype=torch.float64)
     missing = [name for name in task.plain.names if name not in trace.data]
     if missing:
         raise usage(f"`{text}` has no signal {', '.join(f'`{name}`' for name in missing)}")
-    for index, name in enumerate(task.system.names):
-        if name in trace.data:
-            states[:, index] = torch.tensor(trace.data[name][:rows, 0])
+    for index, column in enumerate(columns):
+        if column.name in trace.data:
+            first = trace.data[column.name][:rows, 0]
+            change = conversion(trace.name, column, trace.signature[column.name].unit)
+            states[:, index] = torch.tensor(first if change is None else change(first))
     absent = (~torch.isfinite(states)).nonzero()
     if len(absent):
-        row, column = absent[0].tolist()
-        raise usage(f"trace {row} of `{text}` has no first value of `{task.system.names[column]}`")
+        row, index = absent[0].tolist()
+        raise usage(f"trace {row} of `{text}` has no first value of `{task.system.names[index]}`")
+    for index, column in enumerate(columns):
+        if words := _words(column):
+            odd = (~torch.isin(states[:, index], torch.tensor(list(words.values())).double())).nonzero()
+            if len(odd):
+                found = f"trace {int(odd[0])} of `{text}` begins with {float(states[odd[0], index]):g}"
+                raise usage(f"{found}: `{column.name}` is one of {', '.join(words)}")
     return states
 
 

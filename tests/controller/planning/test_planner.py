@@ -12,7 +12,7 @@ from stlc.controller.options import FINITE, bounds_of
 from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, PlanSearch, plan, planner_named
 from stlc.controller.planning.traces import starts_of, trace_of
 from stlc.controller.problem.task import Task
-from stlc.diagnostics import UsageError
+from stlc.diagnostics import TraceError, UsageError
 from stlc.monitor.verdict import Monitor
 from stlc.registry import PLANNERS
 from stlc.trace import load_trace, save_trace
@@ -95,9 +95,26 @@ def test_starts_are_drawn_written_or_recorded(car_task: Task, tmp_path: Path) ->
         starts_of(car_task, str(tmp_path / "holes.npz"), None, 0)
 
 
+def test_recorded_starts_are_in_units_and_words(car_task: Task, tmp_path: Path) -> None:
+    path, names = tmp_path / "start.csv", car_task.system.names
+    head = "time,x [km],v [km/h],sign,tau,dx,v_lead,yielding"
+    path.write_text(f"{head}\n0,-0.005,36,light,0,-1,0,true\n0.1,-0.004,36,light,0,-1,0,true\n")
+    given = dict(zip(names, starts_of(car_task, str(path), None, 0)[0].tolist(), strict=True))
+    assert (given["x"], given["v"], given["sign"], given["yielding"]) == (-5.0, 10.0, 1.0, 1.0)
+    path.write_text(f"{head}\n0,-0.005,36,7,0,-1,0,true\n0.1,-0.004,36,7,0,-1,0,true\n")
+    with pytest.raises(UsageError, match=r"begins with 7: `sign` is one of stop, light"):
+        starts_of(car_task, str(path), None, 0)
+    path.write_text(f"{head.replace('km/h', 's')}\n0,-0.005,36,0,0,-1,0,1\n0.1,-0.004,36,0,0,-1,0,1\n")
+    with pytest.raises(TraceError, match=r"`v` is in \[s\]"):
+        starts_of(car_task, str(path), None, 0)
+    yielding = starts_of(car_task, "yielding=TRUE", None, 0)[0, names.index("yielding")]
+    assert float(yielding) == 1.0
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("yielding=0.5", "`yielding` is one of true"),
         ("vv=1", "has no state `vv`"),
         ("v=fast", "`fast` is not a finite number"),
         ("v=1e400", "`1e400` is not a finite number"),
