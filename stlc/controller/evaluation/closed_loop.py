@@ -167,9 +167,12 @@ def _superiority(first: Share, second: Share, by: float) -> float:
     The prior distributions of both shares are uniform.
     """
     grid = np.linspace(0.0, 1.0, 2001)
+    good = np.log(np.maximum(grid, np.finfo(np.float64).tiny))
     mass = []
     for share in (first, second):
-        density = grid**share.satisfied * (1.0 - grid) ** (share.runs - share.satisfied)
+        failed = share.runs - share.satisfied
+        log = share.satisfied * good + failed * good[::-1]  # the density itself underflows with many runs
+        density = np.exp(log - log.max())
         mass.append(density / density.sum())
     below = np.interp(grid + by, grid, np.cumsum(mass[0]))
     return float(((1.0 - below) * mass[1]).sum())

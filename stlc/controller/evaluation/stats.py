@@ -46,7 +46,7 @@ def student(freedom: int) -> float:
     """97.5 % quantile of Student's t distribution with `freedom` degrees of freedom.
 
     The quantile is exact for 1 and 2 degrees of freedom. For more, a Cornish-Fisher expansion (Abramowitz &
-    Stegun 26.7.5) gives it within 0.1 %.
+    Stegun 26.7.5) gives it within 0.13 %.
     """
     if freedom == 1:
         return math.tan(math.pi * CONFIDENCE / 2)

@@ -99,6 +99,12 @@ def test_nothing_is_driven_where_nobody_wants_it(car_task: Task, tmp_path: Path)
     assert "closed_loop" not in outcome.run.dir.record()["result"]
 
 
+def test_few_drives_are_compared_with_many() -> None:
+    many = Share("none", 5_000, 2_500, None)
+    assert Share("full", LEAST - 4, LEAST - 4, None).better_than(many)
+    assert not Share("full", LEAST - 4, LEAST // 2, None).better_than(many)
+
+
 SHARES = st.tuples(*[st.tuples(st.integers(1, DRIVES), st.floats(0, 1)) for _ in range(3)])
 
 
