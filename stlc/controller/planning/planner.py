@@ -150,11 +150,15 @@ class PlanSearch:
             going &= self.evaluations < self.budget.evaluations
         return going.nonzero()[:, 0]
 
+    def allowed(self, rows: Tensor, most: int) -> int:
+        """Number of plans, from 1 to `most`, that the limit of judged plans still allows for each state."""
+        if self.budget.evaluations is None or not len(rows):
+            return most
+        return max(1, min(most, self.budget.evaluations - int(self.evaluations[rows].max())))
+
     def affordable(self, rows: Tensor, most: int) -> int:
         """Number of plans, from 1 to `most`, that the budget still allows for each state in `rows`."""
-        left = float(most)
-        if self.budget.evaluations is not None:
-            left = min(left, self.budget.evaluations - int(self.evaluations[rows].max()))
+        left = float(self.allowed(rows, most))
         spent, judged = float(self.seconds[rows].sum()), int(self.evaluations[rows].sum())
         if judged and spent:
             left = min(left, (self.budget.seconds - float(self.seconds[rows].max())) * judged / spent)
@@ -162,6 +166,8 @@ class PlanSearch:
 
     def offer(self, rows: Tensor, plans: Tensor, *, evaluations: int | None = None) -> Tensor:
         """Judge plans and store each one that is better than the best plan of its initial state.
+
+        Plans beyond the limit of judged plans are not judged.
 
         Args:
             rows: indices of the initial states, (k,).
@@ -171,10 +177,12 @@ class PlanSearch:
                 itself; by default the number of plans judged here.
 
         Returns:
-            Robustness of the plans, (k,) or (k, p).
+            Robustness of the plans, (k,) or (k, p); -inf for those that were not judged.
         """
-        each = plans[:, None] if plans.dim() == 3 else plans
-        system = self.task.system
+        whole = plans[:, None] if plans.dim() == 3 else plans
+        each, system = whole, self.task.system
+        if evaluations is None:
+            each = whole[:, : self.allowed(rows, whole.shape[1])]
         each = each.double().clamp(system.control_low.double(), system.control_high.double())
         count = each.shape[1]
         x0 = self.states[rows].repeat_interleave(count, 0)
@@ -184,6 +192,8 @@ class PlanSearch:
         self.rho[rows[better]] = value[better]
         self.plans[rows[better]] = each[better, which[better]]
         self.evaluations[rows] += count if evaluations is None else evaluations
+        if count < whole.shape[1]:
+            rho = torch.cat((rho, rho.new_full((len(rho), whole.shape[1] - count), -torch.inf)), 1)
         return rho if plans.dim() == 4 else rho[:, 0]
 
     @contextmanager

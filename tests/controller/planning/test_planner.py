@@ -67,6 +67,41 @@ def test_evaluations_are_a_limit_and_a_target_ends_the_search(car_task: Task) ->
     assert not bool(stopped.satisfied.any())
 
 
+def test_no_planner_judges_more_plans_than_allowed(car_task: Task, planner: str) -> None:
+    if planner == "mpc":  # a planner for smooth systems
+        return
+    x0 = car_task.sample(3, seed=1, dtype=torch.float64)
+    for most in (1, 70):
+        budget = PlanBudget(20.0, most, torch.inf if planner != "milp" else 0.0)
+        found = plan(car_task, x0, planner, budget=budget, **QUICK.get(planner, {}))
+        assert bool((found.evaluations <= most).all()), found.evaluations
+
+
+LINE = """stlc: 1
+name: line
+time: {dt: 1 s, horizon: HORIZON steps, integrator: euler, substeps: 1}
+state: {x: {range: [-10, 10]}}
+control: {u: {range: [-1, 1]}}
+flow: {x: FLOW}
+init: {mixture: [{draw: {x: "uniform(-1, 1)"}}]}
+"""
+
+
+def line_task(folder: Path, flow: str, horizon: int) -> Task:
+    path = folder / "line.yaml"
+    path.write_text(LINE.replace("FLOW", flow).replace("HORIZON", str(horizon)))
+    return Task.of(
+        stlc.parse("spec line\nstate signal x\nrequire far: eventually[0 s, T] x >= 0.5"),
+        stlc.System.load(path),
+    )
+
+
+def test_plans_of_a_single_number(tmp_path: Path, planner: str) -> None:
+    task = line_task(tmp_path, "u / (1 s)", 1)
+    found = plan(task, torch.zeros(2, 1), planner, budget=PlanBudget(5.0, 2_000))
+    assert bool(found.satisfied.all())
+
+
 def test_a_plan_is_a_trace_that_the_monitor_judges_alike(car_task: Task, tmp_path: Path) -> None:
     x0 = car_task.sample(5, seed=2, dtype=torch.float64)
     found = planned(car_task, "search", x0)
@@ -130,7 +165,7 @@ def test_starts_that_make_no_sense(car_task: Task, text: str, message: str) -> N
         starts_of(car_task, text, None, 0)
 
 
-def test_options_are_checked(planner: str) -> None:
+def test_options_are_checked(car_task: Task, planner: str) -> None:
     kind = PLANNERS.get(planner)
     assert all(type(each.default) in (bool, int, float, str) for each in fields(kind))
     with pytest.raises(UsageError, match="has no option `nonsense`"):
@@ -143,6 +178,8 @@ def test_options_are_checked(planner: str) -> None:
     for wrong in ({"population": 2.5}, {"population": True}, {"physical": 1}, {"over": 3}, {"floor": None}):
         with pytest.raises(UsageError, match="of planner `cem` is"):
             planner_named("cem", **wrong)
+    with pytest.raises(UsageError, match="neither `exact` nor `paper`"):
+        plan(car_task, car_task.sample(1), "gradient", objective="smooth")
     with pytest.raises(UsageError, match="unknown planner `serach`"):
         planner_named("serach")
 

@@ -63,7 +63,7 @@ class Cem:
 
     population: int = bounded(1_000, 1, 10**6)
     elites: int = bounded(100, 1, 10**6)
-    deviation: float = bounded(0.5, 0, 1e6)
+    deviation: float = bounded(0.5, 1e-9, 1e6)
     physical: bool = False
     floor: float = bounded(0.01, 0, 1e6)
     rounds: int = bounded(50, 1, 10**9)

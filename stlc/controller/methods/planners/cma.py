@@ -70,15 +70,17 @@ class Cma:
         options["seed"] = 1 + int(torch.randint(2**31 - 1, (), generator=search.generator))
         dims = search.start[row].numel()
         options["popsize"] = (self.population or 4 + int(3 * np.log(dims))) * 2**restarts
+        more = max(0, 2 - dims)  # the package has no search over a single number
         with search.charged(rows):
             guess = ((search.start[row] - middle) / half).clamp(-1.0, 1.0).flatten().numpy()
             if restarts:
                 guess = torch.rand(dims, generator=search.generator).double().mul(2).sub(1).numpy()
-            es = strategy(guess, self.sigma, options)
+            es = strategy(np.pad(guess, (0, more)), self.sigma, options)
         while not es.stop() and row in search.open():
             with search.charged(rows):
                 asked = es.ask()
-                plans = middle + half * torch.as_tensor(np.array(asked)).view(1, len(asked), -1, len(half))
+                entries = torch.as_tensor(np.array(asked))[:, :dims]
+                plans = middle + half * entries.view(1, len(asked), -1, len(half))
                 rho = search.offer(rows, plans)[0]
                 cost = torch.nan_to_num(-rho, nan=torch.inf, posinf=1e9, neginf=-1e9)
                 es.tell(asked, cost.tolist())

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from stlc.controller.options import bounded
 from stlc.controller.training.objective import Objective, guided_objective, loss, paper_objective
+from stlc.diagnostics import usage
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
@@ -46,7 +47,12 @@ class GradientPlanner:
         """Return a function that searches for plans by gradient steps on the objective.
 
         The objective `exact` leaves out the performance terms of the system file.
+
+        Raises:
+            UsageError: U101, the objective is neither `exact` nor `paper`.
         """
+        if self.objective not in ("exact", "paper"):
+            raise usage(f"`objective={self.objective}` of planner `gradient` is neither `exact` nor `paper`")
         if self.objective == "paper":
             return partial(self._run, objective=paper_objective(task))
         gamma = task.system.decl.objective.gamma

@@ -74,9 +74,11 @@ class Halving:
             tries: maximum number of plans that each search tries.
 
         Returns:
-            The improved plans, (k, p, T, m), for each state in descending order of robustness.
+            The improved plans, (k, p, T, m), for each state in descending order of robustness; fewer than p
+            if the limit of judged plans allows no more.
         """
-        count = plans.shape[1]
+        count = search.allowed(rows, plans.shape[1])
+        plans = plans[:, :count]
         tries = max(1, search.affordable(rows, tries * count) // count)
         x0 = search.states[rows].repeat_interleave(count, 0)
         bank = plans.new_zeros(0, *plans.shape[2:])

@@ -55,7 +55,7 @@ class Mpc:
     """
 
     guesses: int = bounded(12, 1, 10**6)
-    drawn: int = bounded(16, 0, 10**6)
+    drawn: int = bounded(16, 1, 10**6)
     iterations: int = bounded(100, 1, 10**6)
     smoothing: float = bounded(50.0, 1e-9, 1e9)
     sharpness: float = bounded(20.0, 1e-9, 1e9)
@@ -121,8 +121,11 @@ class Mpc:
                     break
                 rows = torch.tensor([row])
                 with search.charged(rows):
-                    self._improve(search, rows, self._guess(search, row, number), shooting, solve)
-                    self._mend(search, rows, searcher)
+                    guess = self._guess(search, row, number)
+                    if row in search.open():
+                        self._improve(search, rows, guess, shooting, solve)
+                    if row in search.open():
+                        self._mend(search, rows, searcher)
             search.ended[row] = True
 
     def _improve(
@@ -146,7 +149,7 @@ class Mpc:
             values = np.array(found["x"])[:, 0]
             guess = torch.nan_to_num(torch.from_numpy(shooting.controls(values).copy()))
             rho = float(search.offer(rows, guess[None])[0])
-            if maximise or rho >= target or values[-1] > NEARLY:
+            if maximise or rho >= target or values[-1] > NEARLY or not len(search.open()):
                 return
             margin += self.margin + target - rho
 
@@ -157,8 +160,9 @@ class Mpc:
         """
         missed = search.budget.target - float(search.rho[rows])
         if self.repair and TOLERANCE < missed <= NEARLY:
-            found = searcher.at_once(search.states[rows], search.plans[rows], tries=self.repair)
-            search.offer(rows, found.plans, evaluations=self.repair)
+            tries = search.allowed(rows, self.repair)
+            found = searcher.at_once(search.states[rows], search.plans[rows], tries=tries)
+            search.offer(rows, found.plans, evaluations=tries)
 
     def _guess(self, search: PlanSearch, row: int, number: int) -> Tensor:
         """Guess of a plan, (T, m) float64.
@@ -167,13 +171,14 @@ class Mpc:
         """
         if not number:
             return search.start[row]
-        system, shape = search.task.system, (self.drawn, PIECES)
+        count = search.allowed(torch.tensor([row]), self.drawn)
+        system, shape = search.task.system, (count, PIECES)
         low, high = system.control_low.double(), system.control_high.double()
         held = torch.rand(*shape, len(low), generator=search.generator).double()
         length = math.ceil(system.horizon / PIECES)
         plans = (low + (high - low) * held).repeat_interleave(length, 1)[:, : system.horizon]
-        x0 = search.states[row].expand(self.drawn, -1)
-        search.evaluations[row] += self.drawn
+        x0 = search.states[row].expand(count, -1)
+        search.evaluations[row] += count
         return plans[search.task.judge(x0, plans, states=False).rho.argmax()]
 
 

@@ -103,10 +103,10 @@ class SchedulePlanner:
         while len(rows := search.open()):
             row = rows[:1]
             with search.charged(row):
-                others = _random_plans(search, search.affordable(row, self.library))
+                others = _random_plans(search, search.affordable(row, self.library + 1) - 1)
                 library = torch.cat((search.start[row], others))
                 rho = search.offer(row, library[None])[0]
-                if len(search.open()) and self.first:
+                if self.first and bool((search.open() == row).any()):
                     best = rho.argsort(descending=True)[: self.starts]
                     _polish(search, row, library[best], searcher, self.first)
             if not bool((search.open() == row).any()):
@@ -201,7 +201,8 @@ class _Attempts:
 
 def _polish(search: PlanSearch, row: Tensor, plans: Tensor, searcher: Searcher, tries: int) -> None:
     """Improve plans, (k, T, m), from the initial state `row` by local search, each with `tries` tries."""
-    count = len(plans)
+    count = search.allowed(row, len(plans))
+    plans = plans[:count]
     tries = max(1, search.affordable(row, tries * count) // count)
     bank = plans.new_zeros(0, *plans.shape[1:])
     x0 = search.states[row].expand(count, -1).contiguous()
