@@ -94,7 +94,8 @@ class PlanSearch:
         states: initial states, (B, n) float64.
         budget: limits of the search.
         generator: source of the random numbers of the planner.
-        start: initial guesses of plans, (B, T, m); the middle of every control range if none were given.
+        start: initial guesses of plans, within the control bounds, (B, T, m); the middle of every control
+            range if none were given.
         plans: the best plans found, (B, T, m).
         rho: robustness of these plans, (B,); -inf before the first plan.
         infeasible: mask of the initial states from which the planner proved that no plan satisfies the
@@ -117,9 +118,10 @@ class PlanSearch:
         self.task, self.budget = task, budget
         self.states = states.double()
         self.generator = torch.Generator().manual_seed(seed)
-        middle = 0.5 * (task.system.control_low + task.system.control_high).double()
-        blank = middle.expand(len(states), task.system.horizon, -1) if start is None else start.double()
-        self.start, self.plans = blank, blank.clone()
+        low, high = task.system.control_low.double(), task.system.control_high.double()
+        whole = (0.5 * (low + high)).expand(len(states), task.system.horizon, -1)
+        self.start = whole if start is None else _guesses(start, whole).clamp(low, high)
+        self.plans = self.start.clone()
         self.rho = torch.full((len(states),), -torch.inf, dtype=torch.float64)
         self.infeasible = torch.zeros(len(states), dtype=torch.bool)
         self.ended = torch.zeros(len(states), dtype=torch.bool)
@@ -167,7 +169,8 @@ class PlanSearch:
     def offer(self, rows: Tensor, plans: Tensor, *, evaluations: int | None = None) -> Tensor:
         """Judge plans and store each one that is better than the best plan of its initial state.
 
-        Plans beyond the limit of judged plans are not judged.
+        A plan under which a state becomes infinite is not stored: the monitor judges no such trace. Plans
+        beyond the limit of judged plans are not judged.
 
         Args:
             rows: indices of the initial states, (k,).
@@ -189,6 +192,9 @@ class PlanSearch:
         rho = self.task.judge(x0, each.flatten(0, 1), states=False).rho.view(-1, count)
         value, which = rho.max(1)
         better = (value > self.rho[rows]).nonzero()[:, 0]
+        if len(better):
+            states = self.task.rollout(self.states[rows[better]], each[better, which[better]])
+            better = better[torch.isfinite(states).all(2).all(1)]
         self.rho[rows[better]] = value[better]
         self.plans[rows[better]] = each[better, which[better]]
         self.evaluations[rows] += count if evaluations is None else evaluations
@@ -209,6 +215,17 @@ class PlanSearch:
             self.seconds[rows] += (process_time() - before) / max(1, len(rows))
         if self._progress is not None:
             self._progress(self)
+
+
+def _guesses(start: Tensor, whole: Tensor) -> Tensor:
+    """Given initial guesses of plans in float64. Raises UsageError (U101) unless they are like `whole`."""
+    found = torch.as_tensor(start, dtype=torch.float64)
+    if found.shape != whole.shape:
+        message = f"initial guesses of {tuple(found.shape)} are not {tuple(whole.shape)}"
+        raise usage(message, "initial states, steps, controls")
+    if not bool(torch.isfinite(found).all()):
+        raise usage("initial guesses of plans hold NaN or infinity")
+    return found
 
 
 Solver: TypeAlias = Callable[[PlanSearch], None]
@@ -324,7 +341,8 @@ def plan(
 
     Raises:
         UsageError: U101, there is no such planner or option; or the planner cannot plan for this task; or the
-            last dimension of `x0` differs from the number of states.
+            last dimension of `x0` differs from the number of states; or `start` has another shape or holds
+            values that are not finite.
         MissingError: R301, the planner needs a package that is not installed.
     """
     given = torch.as_tensor(x0, dtype=torch.float64)

@@ -102,6 +102,28 @@ def test_plans_of_a_single_number(tmp_path: Path, planner: str) -> None:
     assert bool(found.satisfied.all())
 
 
+def test_plans_with_infinite_states_are_none(tmp_path: Path) -> None:
+    task = line_task(tmp_path, "(x * x + u * u) * 1e300 / (1 s)", 3)
+    assert torch.isposinf(task.judge(torch.ones(1, 1).double(), torch.ones(1, 3, 1).double()).rho)
+    found = plan(task, torch.ones(1, 1), budget=PlanBudget(5.0, 100))
+    assert torch.isneginf(found.rho)
+    endless = plan(
+        line_task(tmp_path, "u / (1 s)", 3), torch.full((1, 1), torch.inf), budget=PlanBudget(5.0, 9)
+    )
+    assert torch.isneginf(endless.rho)
+
+
+def test_initial_guesses_are_checked_and_within_bounds(tmp_path: Path) -> None:
+    task = line_task(tmp_path, "u / (1 s)", 2)
+    start = torch.full((1, 2, 1), 5.0)
+    assert plan(task, torch.zeros(1, 1), budget=PlanBudget(0.0), start=start).plans.max() == 1.0
+    for wrong in (start[0], start.expand(3, 2, 1), start[:, :1]):
+        with pytest.raises(UsageError, match=r"initial guesses of .* are not \(1, 2, 1\)"):
+            plan(task, torch.zeros(1, 1), start=wrong)
+    with pytest.raises(UsageError, match="hold NaN"):
+        plan(task, torch.zeros(1, 1), start=start * torch.nan)
+
+
 def test_a_plan_is_a_trace_that_the_monitor_judges_alike(car_task: Task, tmp_path: Path) -> None:
     x0 = car_task.sample(5, seed=2, dtype=torch.float64)
     found = planned(car_task, "search", x0)
