@@ -140,7 +140,7 @@ def _target(text: str) -> float:
         found = float("inf") if text.strip() == "max" else float(text)
     except ValueError:
         found = math.nan
-    if math.isnan(found):
+    if math.isnan(found) or found == -math.inf:
         raise usage(f"`--target {text}` is no robustness", "--target 0.1 or max")
     return found
 
