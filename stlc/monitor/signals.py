@@ -28,7 +28,7 @@ from stlc.signature import Column, Kind
 from stlc.source import Span
 from stlc.trace import AS_IT_IS, Reading, Trace
 from stlc.trace.enums import TRUTH, Words
-from stlc.units import SYMBOLS, Unit, same_dims
+from stlc.trace.recording import conversion
 
 Given: TypeAlias = Mapping[str, Any]
 """Signal -> array (time,) or (…, time); a vector is (…, time, k)."""
@@ -327,41 +327,6 @@ def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace)
     if findings:
         raise TraceError(*findings)
     return converted
-
-
-@dataclass(frozen=True, slots=True)
-class Conversion:
-    """Conversion from one unit to another: `x * factor + shift`."""
-
-    factor: float
-    shift: float
-
-    def __call__(self, values: Any) -> Any:
-        """Convert `values` to the new unit."""
-        scaled = values if self.factor == 1.0 else values * self.factor
-        return scaled + self.shift if self.shift else scaled
-
-
-def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> Conversion | None:
-    """Return the conversion from the unit in the trace, `recorded`, to the declared unit of `column`.
-
-    None is returned if the units are equal, or if one is unknown.
-
-    Raises:
-        TraceError: E605, the units measure different quantities.
-    """
-    wanted = column.unit
-    if not wanted.text or not recorded.text:
-        return None
-    if not same_dims(recorded, wanted):
-        message = f"`{column.name}` is in [{recorded}] in `{trace}`, the specification declares [{wanted}]"
-        coulombs = wanted.dims == SYMBOLS["K"].dims and recorded.text == "C"
-        help_ = (f"[C] is coulombs: name the column `{column.name} [degC]`",) if coulombs else ()
-        raise TraceError(Diagnostic("E605", message, span, help=help_))
-    found = Conversion(
-        float(recorded.ratio / wanted.ratio), float((recorded.offset - wanted.offset) / wanted.ratio)
-    )
-    return None if found == Conversion(1.0, 0.0) else found
 
 
 def _check_finite(signals: Signals, needs: Sequence[Need]) -> None:

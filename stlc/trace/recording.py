@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.registry import closest
 from stlc.signature import Column
+from stlc.source import Span
 from stlc.trace.meta import TraceMeta
-from stlc.units import CELSIUS, DIMENSIONLESS, Unit, means_celsius, parse_unit
+from stlc.units import CELSIUS, DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_unit, same_dims
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -161,3 +162,38 @@ def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array
     if not traces:
         raise TraceError(Diagnostic("E605", f"the arrays of `{name}` hold no traces"))
     return {signal: np.broadcast_to(values, (traces, samples)) for signal, values in data.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """Conversion from one unit to another: `x * factor + shift`."""
+
+    factor: float
+    shift: float
+
+    def __call__(self, values: Any) -> Any:
+        """Convert `values` to the new unit."""
+        scaled = values if self.factor == 1.0 else values * self.factor
+        return scaled + self.shift if self.shift else scaled
+
+
+def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = None) -> Conversion | None:
+    """Return the conversion from the unit in the trace, `recorded`, to the declared unit of `column`.
+
+    None is returned if the units are equal, or if one is unknown.
+
+    Raises:
+        TraceError: E605, the units measure different quantities.
+    """
+    wanted = column.unit
+    if not wanted.text or not recorded.text:
+        return None
+    if not same_dims(recorded, wanted):
+        message = f"`{column.name}` is in [{recorded}] in `{trace}`, the specification declares [{wanted}]"
+        coulombs = wanted.dims == SYMBOLS["K"].dims and recorded.text == "C"
+        help_ = (f"[C] is coulombs: name the column `{column.name} [degC]`",) if coulombs else ()
+        raise TraceError(Diagnostic("E605", message, span, help=help_))
+    found = Conversion(
+        float(recorded.ratio / wanted.ratio), float((recorded.offset - wanted.offset) / wanted.ratio)
+    )
+    return None if found == Conversion(1.0, 0.0) else found

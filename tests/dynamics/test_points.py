@@ -82,6 +82,27 @@ def test_states_from_a_file(tmp_path: Path) -> None:
     assert len(set(x0[:, 1].tolist())) == 40
 
 
+def test_states_from_a_file_are_in_units_and_words(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("stlc: 1\nname: a\n" + HEAD + FILE.replace("starts.npz", "starts.csv"))
+    path = tmp_path / "starts.csv"
+
+    def drawn(head: str, rows: str) -> torch.Tensor:
+        path.write_text(f"{head}\n{rows}\n")
+        return System(load_system_decl(tmp_path / "a.yaml")).sample(20, seed=0, dtype=torch.float64)
+
+    x0 = drawn("t,x [km],sign,q[0] [deg]", "0,0.002,light,180\n1,0.003,stop,180\n7,0.004,light,180")
+    assert {tuple(row) for row in x0[:, [0, 2]].tolist()} == {(2.0, 1.0), (3.0, 0.0), (4.0, 1.0)}
+    assert x0[:, 3].tolist() == pytest.approx([np.pi] * 20)
+    for head, row, message in (
+        ("t,x [s],sign,q[0]", "0,2,light,0", r"`x` is in \[s\]"),
+        ("t,x,sign,q[0]", "0,2,halt,0", "halt"),
+        ("t,x,sign,q[0]", "0,2,7,0", "holds 7 in `sign`, which is one of stop, light"),
+    ):
+        with pytest.raises(StlcError, match=message) as caught:
+            drawn(head, row)
+        assert [finding.code for finding in caught.value.diagnostics] == ["S303"]
+
+
 @pytest.mark.parametrize(
     "arrays",
     [

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from stlc.monitor.judgement import Status
     from stlc.monitor.online.online import Decision, Online
     from stlc.monitor.online.tally import RequirementSummary
-    from stlc.monitor.signals import Conversion
     from stlc.monitor.verdict import Monitor
     from stlc.trace.live import Sample, Uniform
+    from stlc.trace.recording import Conversion
 
 
 def _outcome(
@@ -226,7 +226,7 @@ def _conversions(online: Online, units: Mapping[str, str]) -> dict[str, Conversi
     Raises:
         TraceError: E605, a unit is invalid, or has another dimension than the declared one.
     """
-    from stlc.monitor.signals import conversion
+    from stlc.trace.recording import conversion
     from stlc.units import CELSIUS, means_celsius, parse_unit
 
     changes: dict[str, Conversion] = {}

@@ -16,17 +16,16 @@ from torch import Tensor
 from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.grammar import ast
-from stlc.monitor.signals import conversion
 from stlc.registry import closest
 from stlc.trace import Reading, Trace, TraceMeta, load_trace
-from stlc.trace.enums import TRUTH, Words
+from stlc.trace.enums import words_of
+from stlc.trace.recording import conversion
 from stlc.units import parse_quantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
     from stlc.controller.planning.planner import PlanResult
     from stlc.controller.problem.task import Task
-    from stlc.signature import Column
 
 RANDOM = "random"
 
@@ -72,7 +71,7 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
         advice = known if near is None else f"did you mean `{near}`?  {known}"
         raise usage(f"`{task.system.decl.name}` has no state `{name}`", advice)
     column = task.system.signature[name]
-    words = _words(column)
+    words = words_of(column)
     word = value.lower() if column.kind == "bool" else value
     if word in words:
         return name, float(words[word])
@@ -91,11 +90,6 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
     return name, found
 
 
-def _words(column: Column) -> Words:
-    """Words for the values of a state: the labels of an enum, or those for truth values; else none."""
-    return TRUTH if column.kind == "bool" else dict(column.labels)
-
-
 def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     """First samples of at most `count` traces of the file `text` as initial states, (B, n) float64.
 
@@ -110,7 +104,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
         raise UsageError(Diagnostic("U102", f"there is no file `{text}` with initial states", help=help_))
     columns = task.system.signature.columns
-    trace = load_trace(text, Reading(words={column.name: _words(column) for column in columns}))
+    trace = load_trace(text, Reading(words={column.name: words_of(column) for column in columns}))
     rows = min(trace.traces, count or trace.traces)
     states = task.sample(rows, seed=seed, dtype=torch.float64)
     missing = [name for name in task.plain.names if name not in trace.data]
@@ -126,7 +120,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         row, index = absent[0].tolist()
         raise usage(f"trace {row} of `{text}` has no first value of `{task.system.names[index]}`")
     for index, column in enumerate(columns):
-        if words := _words(column):
+        if words := words_of(column):
             odd = (~torch.isin(states[:, index], torch.tensor(list(words.values())).double())).nonzero()
             if len(odd):
                 found = f"trace {int(odd[0])} of `{text}` begins with {float(states[odd[0], index]):g}"

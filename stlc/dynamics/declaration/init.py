@@ -58,10 +58,10 @@ class GridDecl:
 
 @dataclass(frozen=True, slots=True)
 class FileDecl:
-    """Initial states from a file with one array per column in `names`; every sample is a possible state."""
+    """Initial states from a file with one array for each of `columns`; every sample is a possible state."""
 
     path: Path
-    names: tuple[str, ...]
+    columns: tuple[Column, ...]
     span: Span = field(compare=False, repr=False)
 
 
@@ -343,7 +343,7 @@ def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
     cx = draws.cx
     rest = {entry.key.text for entry in cx.reader.entries(keys.draw, "`draw`")}
     missing = [
-        column.name
+        column
         for column in cx.names.columns
         if column.name not in draws.ready | draws.computed
         and not {column.name, base_name(column.name)} & rest
@@ -355,7 +355,7 @@ def _given(keys: InitKeys, node: Node, draws: _Draws) -> Situation:
     else:
         assert keys.from_ is not None
         points = _file(keys.from_, tuple(missing), cx)
-        draws.ready |= set(missing)
+        draws.ready |= {column.name for column in missing}
     draws.read(keys)
     draws.require_all("the grid", node)
     return Situation("grid" if keys.grid is not None else "from", 1.0, tuple(draws.found), (), points)
@@ -415,10 +415,10 @@ def _spaced(column: Column, node: Mapping, where: str, cx: Context) -> tuple[flo
     return tuple(low + (high - low) * index / (keys.count - 1) for index in range(keys.count))
 
 
-def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
+def _file(node: Node, columns: tuple[Column, ...], cx: Context) -> FileDecl | None:
     """Read the path of a file of initial states, relative to the system file.
 
-    `names` are the columns whose values the file gives. Returns None if the path is not a text.
+    `columns` are those whose values the file gives. Returns None if the path is not a text.
     """
     text = cx.reader.text(node, "`from`")
     if text is None:
@@ -427,4 +427,4 @@ def _file(node: Node, names: tuple[str, ...], cx: Context) -> FileDecl | None:
 
     if Path(text).suffix.lower() not in SUFFIXES:
         cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(SUFFIXES)}")
-    return FileDecl(beside(Path(node.span.source.name).parent, text), names, node.span)
+    return FileDecl(beside(Path(node.span.source.name).parent, text), columns, node.span)

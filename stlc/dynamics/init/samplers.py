@@ -26,8 +26,10 @@ from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.init import FileDecl, GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.model.algebra import map_parts
-from stlc.trace import load_trace
-from stlc.trace.formats.npz import read_npz
+from stlc.signature import Column
+from stlc.trace import read_recording
+from stlc.trace.enums import in_numbers, words_of
+from stlc.trace.recording import Recording, conversion
 
 Draw: TypeAlias = Callable[[str, list[Any]], Array]
 """Function from the name of a sampler, such as `uniform`, and its arguments to its value."""
@@ -433,10 +435,14 @@ class _File:
     def _read(self) -> dict[str, Tensor]:
         path = self._decl.path
         try:
-            arrays = read_npz(path) if path.suffix == ".npz" else load_trace(path).data
+            recording = read_recording(path)
+            words = {column.name: words_of(column) for column in self._decl.columns}
+            recording = in_numbers(recording, words)
+            arrays = {group.named: group.clock for group in recording.groups if group.clock is not None}
+            arrays |= {name: each for group in recording.groups for name, each in group.arrays.items()}
+            found = {column.name: _values(column, arrays, recording) for column in self._decl.columns}
         except StlcError as error:
             raise self._refused(error.diagnostics[0].message) from None
-        found = {name: _column(name, arrays) for name in self._decl.names}
         missing = [name for name, column in found.items() if column is None]
         if missing:
             listed = ", ".join(f"`{name}`" for name in missing)
@@ -449,6 +455,12 @@ class _File:
         bad = [name for name, column in columns.items() if not bool(torch.isfinite(column).all())]
         if bad:
             raise self._refused(f"`{path}` holds NaN or infinity in `{bad[0]}`")
+        for each in self._decl.columns:
+            worth = words_of(each)
+            odd = np.setdiff1d(columns[each.name].numpy(), list(worth.values())) if worth else np.zeros(0)
+            if odd.size:
+                listed = ", ".join(worth)
+                raise self._refused(f"`{path}` holds {odd[0]:g} in `{each.name}`, which is one of {listed}")
         return columns
 
     def _refused(self, message: str, note: str = "") -> SystemFileError:
@@ -456,11 +468,13 @@ class _File:
         return SystemFileError(Diagnostic("S303", message, self._decl.span, "named here", note=notes))
 
 
-def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Return all samples of a column as (count,), or None if the arrays lack it.
+def _values(column: Column, arrays: Mapping[str, np.ndarray], recording: Recording) -> np.ndarray | None:
+    """Return all samples of a column in its unit as (count,), or None if the arrays of a file lack it.
 
-    A component `p[1]` of a vector may be stored as slice 1 of the last axis of the array `p`.
+    A component `p[1]` of a vector may be stored as slice 1 of the last axis of the array `p`. `recording`
+    knows the units of the file. Raises TraceError (E605) if one measures another quantity.
     """
+    name = column.name
     base, bracket, index = name.partition("[")
     values = arrays.get(name)
     if values is None and bracket and base in arrays and arrays[base].ndim:
@@ -469,4 +483,7 @@ def _column(name: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
         values = whole[..., component] if component < whole.shape[-1] else None
     if values is None or values.dtype.kind not in "biuf":
         return None
-    return values.astype(np.float64).ravel()
+    stored = recording.columns.get(name) or recording.columns.get(base)
+    change = None if stored is None else conversion(recording.name, column, stored.unit)
+    numbers = values.astype(np.float64).ravel()
+    return numbers if change is None else change(numbers)
