@@ -115,3 +115,12 @@ def test_a_refused_training_makes_no_run(tmp_path, monkeypatch):
     with pytest.raises(stlc.StlcError):
         stlc.train(task, method="sac", steps=3)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [{"budget": -1}, {"budget": float("nan")}, {"steps": 0}, {"seed": -1}])
+def test_a_training_that_makes_no_sense_is_refused(options, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    task = stlc.compile(stlc.load(SPEC), stlc.System.load(SYSTEM))
+    with pytest.raises(stlc.StlcError, match="U101"):
+        stlc.train(task, **options)
+    assert list(tmp_path.iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from stlc.controller.planning.planner import prepared
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import prepare, run
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
+from stlc.diagnostics import usage
 from stlc.dynamics.robots.functions import function_files
 from stlc.files import write_atomic
 from stlc.provenance import git_state, hardware, versions
@@ -117,7 +119,15 @@ def train_here(
         seed: seed of all random numbers; None: that of the system file.
         method: name of the method, such as `guided` (search and distil) or `gradient` (Meng and Fan 2023);
             None: that of the system file.
+
+    Raises:
+        UsageError: U101, `budget` is not a positive number, `steps` is below 1, `seed` is negative, or there
+            is no such method.
     """
+    if budget is not None and not 0.0 < budget < math.inf:
+        raise usage(f"a training time of {budget} s is not a positive number")
+    if (steps is not None and steps < 1) or (seed is not None and seed < 0):
+        raise usage("a training has at least 1 step, and its seed is at least 0")
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
     prepared = prepare(task, config)
     return run(prepared, open_folder(task, config)).run
