@@ -16,6 +16,7 @@ from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns as columns_read_by
 from stlc.controller.planning.planner import PlanResult
 from stlc.controller.planning.traces import trace_of
@@ -44,12 +45,13 @@ class ModelSimulator:
 
     Attributes:
         task: specification and system.
-        finer: function that loads the same task at half the time step; None if it has no finer one.
+        finer: function that loads the same task at half the time step, or, if its argument is True, with half
+            the step of the integration and the same samples; None if it has no finer one.
         batch: number of simulations side by side; 1 lets the search learn from each.
     """
 
     task: Task
-    finer: Callable[[], Task] | None = None
+    finer: Callable[[bool], Task] | None = None
     batch: int = 1
 
     @classmethod
@@ -66,8 +68,13 @@ class ModelSimulator:
             listed = ", ".join(f"`{control.name}`" for control in decl.controls)
             message = f"`{decl.name}` has controls ({listed}), which a controller must choose"
             raise usage(message, "stlc falsify RUN, for a trained policy", "declare them as `inputs`")
-        halved = {**overrides, **_halved(decl)}
-        return cls(task, None if decl.discrete else lambda: load_task(spec, system, halved))
+        digital = bool({each.name for each in decl.updates} - {each.name for each in decl.inputs})
+
+        @cache
+        def finer(sampled: bool) -> Task:
+            return load_task(spec, system, {**overrides, **_halved(decl, sampled=sampled)})
+
+        return cls(task, None if decl.discrete else lambda counts: finer(digital or counts))
 
     @cached_property
     def points(self) -> InitialPoints:
@@ -99,19 +106,6 @@ class ModelSimulator:
         """Names of the requirements."""
         return tuple(rule.name for rule in self.task.rules)
 
-    @cached_property
-    def _guides(self) -> tuple[ScaledRobustness, ...]:
-        return tuple(ScaledRobustness(rule.formula) for rule in self.task.rules)
-
-    @cached_property
-    def _finer(self) -> Task | None:
-        return None if self.finer is None else self.finer()
-
-    @cached_property
-    def _finer_guides(self) -> tuple[ScaledRobustness, ...]:
-        rules = () if self._finer is None else self._finer.rules
-        return tuple(ScaledRobustness(rule.formula) for rule in rules)
-
     def seen(self, requirement: int) -> float:
         """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
         inputs, rule = self.task.system.decl.inputs, self.task.rules[requirement]
@@ -142,14 +136,12 @@ class ModelSimulator:
         for part, focus in zip(parts, foci, strict=True):
             rows, end = slice(end, end + len(part)), end + len(part)
             own = {name: np.ascontiguousarray(column[:, rows]) for name, column in columns.items()}
-            found.append(self._judged(own, focus, admissible[rows], self._guides))
+            found.append(self._judged(self.task, own, focus, admissible[rows]))
         return found
 
     @staticmethod
-    def _judged(
-        columns: Columns, focus: Focus, admissible: NDArray[np.bool_], guides: Sequence[ScaledRobustness]
-    ) -> Simulations:
-        guide = guides[focus.requirement]
+    def _judged(task: Task, columns: Columns, focus: Focus, admissible: NDArray[np.bool_]) -> Simulations:
+        guide = _guides(task)[focus.requirement]
         margins = guide(columns, None)
         broken = ~np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
         margins = np.where(broken | np.isnan(margins), -np.inf, margins)
@@ -160,12 +152,16 @@ class ModelSimulator:
         return Simulations(margins, guidance, admissible, sizes)
 
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
-        """Outcomes at half the time step; None for a system in discrete time."""
-        if self._finer is None:
+        """Outcomes at half the time step; None for a system in discrete time.
+
+        A requirement that counts samples is judged by the same samples, at half the step of the integration.
+        """
+        if self.finer is None:
             return None
         states = self.points.states(torch.tensor(points))
         admissible = self.points.admissible(states).numpy()
-        return self._judged(self._moved(self._finer, states), focus, admissible, self._finer_guides)
+        task = self.finer(counts_samples(self.task.rules[focus.requirement].typed.formula))
+        return self._judged(task, self._moved(task, states), focus, admissible)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:
         """Gradient of the exact robustness at a point, (dim,), by the native kernel.
@@ -231,15 +227,21 @@ class ModelSimulator:
         return torch.zeros((count, task.horizon, 0), dtype=torch.float64)
 
 
-def _halved(decl: SystemDecl) -> dict[str, str]:
+def _halved(decl: SystemDecl, *, sampled: bool) -> dict[str, str]:
     """Keys of a system file that halve its time step: name -> text.
 
-    Values that are computed at samples, as by a digital controller, keep their period: then only the step of
-    the integration is halved.
+    Only the step of the integration is halved if values are computed at samples (`sampled`), as by a digital
+    controller, or counted by a requirement: they keep their period.
     """
-    if {each.name for each in decl.updates} - {each.name for each in decl.inputs}:
+    if sampled:
         return {"time.substeps": str(2 * decl.substeps)}
-    return {"time.dt": f"{float(decl.dt / 2)!r} s", "time.horizon": f"{2 * decl.horizon} steps"}
+    return {"time.dt": f"{decl.dt / 2} s", "time.horizon": f"{2 * decl.horizon} steps"}
+
+
+@cache
+def _guides(task: Task) -> tuple[ScaledRobustness, ...]:
+    """Guidance of each requirement of a task."""
+    return tuple(ScaledRobustness(rule.formula) for rule in task.rules)
 
 
 @cache

@@ -15,6 +15,7 @@ from stlc.assurance.guidance import ScaledRobustness
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Focus, Simulations
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.monitor.instants import rule_bounds, starts_of
@@ -204,9 +205,12 @@ class PlantSimulator:
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None if the plant file does not allow it.
 
+        None too for a requirement that counts samples, which would mean other times there.
+
         The margin of a simulation that fails is NaN there: it neither confirms a violation nor refutes it.
         """
-        if self._finer is None:
+        rule = self.monitor.compiled.requirements[focus.requirement]
+        if self._finer is None or counts_samples(rule.typed.formula):
             return None
         plant = self._finer.plant
         found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]

@@ -318,3 +318,41 @@ def test_jobs_of_the_command_change_nothing_for_several_requirements(capsys):
     for each in (*alone, *shared):
         del each["seconds"]
     assert alone == shared
+
+
+RAMP = """
+stlc: 1
+name: ramp
+time: {dt: 1/3 s, horizon: 4 s, integrator: rk4}
+state: {x: {}}
+flow: {x: 1}
+init: {mixture: [{draw: {x: "uniform(0, 0.5)"}}]}
+"""
+
+
+def ramp(requirement: str) -> ModelSimulator:
+    Path("ramp.yaml").write_text(RAMP)
+    Path("ramp.stl").write_text(f'system "ramp.yaml"\nsignal x\n{requirement}\n')
+    return ModelSimulator.load("ramp.stl", None, {})
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "always[0 s, 3 steps] x <= 0.9",
+        "always[0 s, 3 * dt] x <= 0.9",
+        "always[1 s, 2 s] x - prev(x) <= 0.2",
+        "always[1 s, 2 s] not prev(x >= 1)",
+    ],
+)
+def test_a_requirement_that_counts_samples_is_judged_by_the_same_samples_at_half_the_step(formula: str):
+    found = falsify(ramp(f"require r: {formula}"), 0, budget=SearchBudget(5), seed=0)
+    assert found.found is not None
+    assert found.spurious == ()
+    assert found.found.half_step == pytest.approx(found.found.margin)
+
+
+def test_half_of_a_step_that_is_no_decimal_fraction_is_exact():
+    found = falsify(ramp("require r: eventually[1 s, 1 s] x <= 1.2"), 0, budget=SearchBudget(5), seed=0)
+    assert found.found is not None
+    assert found.found.half_step == pytest.approx(found.found.margin)

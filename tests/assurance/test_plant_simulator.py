@@ -154,3 +154,19 @@ def test_simulations_out_of_scope_are_not_admissible():
     points = np.stack([np.ones(simulator.space.dim), np.zeros(simulator.space.dim)])
     with simulator.plant:
         assert simulator.simulate(points, Focus(0)).admissible.tolist() == [False, True]
+
+
+@pytest.mark.usefixtures("home")
+def test_a_requirement_that_counts_samples_has_no_half_step():
+    Path("half.yaml").write_text(PLANT.replace("duration: 2 s", "duration: 2 s, halves: true"))
+    Path("half.stl").write_text(
+        "signal big\n"
+        "require counted: always[0 s, 5 steps] big <= 100\n"
+        "require timed: always[0 s, 1 s] big <= 100\n"
+    )
+    simulator = load("half.stl", "half.yaml")
+    ones = np.ones((1, simulator.space.dim))
+    counted, timed = (simulator.at_half_step(ones, Focus(index)) for index in range(2))
+    simulator.close()
+    assert counted is None
+    assert timed is not None

@@ -14,7 +14,7 @@ from fractions import Fraction
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import leaves, map_children, map_leaves, nodes, numbers
+from stlc.compile.ir.traverse import NumberLeaf, leaves, map_children, map_leaves, nodes, numbers
 from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
 from stlc.units import nearest
@@ -45,6 +45,15 @@ def lacks(grid: Grid, formula: typed.Formula) -> bool:
     )
 
 
+def counts_samples(formula: typed.Formula) -> bool:
+    """True if a formula counts samples: `3 steps`, `dt`, `prev(p)`; it then depends on `dt`."""
+    return (
+        any(time.steps for time in _times(formula))
+        or any(isinstance(node, typed.Shift) and node.delay is None for node in nodes(formula))
+        or any(isinstance(leaf, ir.ShiftedSignal) and leaf.steps for leaf in _read(formula))
+    )
+
+
 def _times(formula: typed.Formula) -> Iterator[typed.Time]:
     """Yield the bounds of intervals and the delays of `shift` in a formula."""
     for node in nodes(formula):
@@ -52,8 +61,12 @@ def _times(formula: typed.Formula) -> Iterator[typed.Time]:
             yield from (end for end in (node.interval.lo, node.interval.hi) if end is not None)
         elif isinstance(node, typed.Shift) and node.delay is not None:
             yield node.delay
-    read = (leaf for num in numbers(formula) for leaf in leaves(num))
-    yield from (leaf.delay for leaf in read if isinstance(leaf, typed.DelayedSignal))
+    yield from (leaf.delay for leaf in _read(formula) if isinstance(leaf, typed.DelayedSignal))
+
+
+def _read(formula: typed.Formula) -> Iterator[NumberLeaf]:
+    """Yield the constants and signals that a formula reads."""
+    return (leaf for num in numbers(formula) for leaf in leaves(num))
 
 
 # ------------------------------------------------------------------------------------ windows
