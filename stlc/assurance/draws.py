@@ -145,19 +145,24 @@ class ModelDraws:
     def observed(self, seeds: Sequence[int]) -> Iterator[Sample]:
         """Simulate the system from the initial state of each seed, and yield the judged simulations.
 
+        A simulation in which the assumptions of the specification do not hold is left out.
+
         Raises:
             SystemFileError: S301, the conditions `where` reject (nearly) every state.
             UsageError: U101, there is no such requirement.
         """
         import torch
 
+        from stlc.assurance.model_simulator import in_scope
+
         task = self.simulator.task
         rules = _chosen(task.rules, self.require)
         states = [task.system.sample(1, seed=seed, dtype=torch.float64) for seed in seeds]
         columns = self.simulator.columns_from(torch.cat(states))
+        scope = in_scope(task, columns)
         margins = np.stack([np.broadcast_to(each[0], len(seeds)) for each in self._evaluated(rules, columns)])
         finite = np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
-        margins = np.where(finite & ~np.isnan(margins), margins, -np.inf)
+        margins = np.where(finite & ~np.isnan(margins), margins, -np.inf)[:, scope]
         yield _sample(
             rules,
             [

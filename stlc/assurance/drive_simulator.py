@@ -88,9 +88,15 @@ class DriveSimulator:
         return True
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
-        """Simulate `points`, (count, dim), and judge the drives."""
-        margins = self.margins(self.drive(points))[:, focus.requirement]
-        return Simulations.unscaled(margins, np.ones(len(points), dtype=bool))
+        """Simulate `points`, (count, dim), and judge the drives.
+
+        A point is admissible if the assumptions of the specification hold for one of its agents.
+        """
+        verdict = self._verdict(self.drive(points))
+        margins = self._margins_of_agents(verdict).min(1)[:, focus.requirement]
+        inside = np.broadcast_to(_inside(verdict), (len(points) * self.setting.agents,))
+        admissible: NDArray[np.bool_] = np.any(inside.reshape(len(points), -1), axis=1)
+        return Simulations.unscaled(margins, admissible)
 
     def drive(self, points: NDArray[np.float64], watch: Watch | None = None) -> DeploymentRecording:
         """Simulate `points`, (count, dim), side by side, and return the recorded drives.
@@ -110,8 +116,15 @@ class DriveSimulator:
         return least
 
     def margins_of_agents(self, recording: DeploymentRecording) -> NDArray[np.float64]:
-        """Robustness of each agent of each simulation, (count, agents, requirements)."""
-        each = np.stack([judgement.high.min(0) for judgement in self._verdict(recording)], 1)
+        """Robustness of each agent of each simulation, (count, agents, requirements).
+
+        It is +inf where the assumptions of the specification do not hold: nothing is violated there.
+        """
+        return self._margins_of_agents(self._verdict(recording))
+
+    def _margins_of_agents(self, verdict: Verdict) -> NDArray[np.float64]:
+        inside = _inside(verdict)
+        each = np.stack([np.where(inside, judgement.high.min(0), np.inf) for judgement in verdict], 1)
         return each.reshape(-1, self.setting.agents, each.shape[1])
 
     def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
@@ -137,3 +150,9 @@ class DriveSimulator:
         (first,) = self.setting.seeds
         seeds = (first + int(min(each, BELOW) * SEEDS) for each in points[:, -1])
         return replace(self.setting, seeds=tuple(seeds), draws=tuple(points[:, :-1]))
+
+
+def _inside(verdict: Verdict) -> NDArray[np.bool_]:
+    """True for the drives that satisfy the assumptions, (drives,), or (1,) if there are none."""
+    scope = verdict.requirements[0].scope
+    return np.ones(1, dtype=np.bool_) if scope is None else np.asarray(scope)

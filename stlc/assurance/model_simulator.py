@@ -18,12 +18,15 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns as columns_read_by
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.planning.planner import PlanResult
 from stlc.controller.planning.traces import trace_of
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
 from stlc.diagnostics import usage
 from stlc.dynamics.init.quantiles import InitialPoints
+from stlc.monitor.instants import rule_bounds
+from stlc.monitor.values import Record
 from stlc.native import Adjoint, ObjectiveSlopes
 
 if TYPE_CHECKING:
@@ -108,12 +111,14 @@ class ModelSimulator:
 
     def seen(self, requirement: int) -> float:
         """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
-        inputs, rule = self.task.system.decl.inputs, self.task.rules[requirement]
+        inputs = self.task.system.decl.inputs
         if not inputs:
             return 1.0
-        reads = columns_read_by(rule.formula) & {each.name for each in inputs}  # also at the last sample
+        names = {each.name for each in inputs}
         longest = max(float(each.duration) for each in inputs)
-        return min((rule.reach + bool(reads)) * self.task.system.dt / longest, 1.0)
+        read_by = (self.task.rules[requirement], *self.task.compiled.assumptions)
+        last = max(rule.reach + bool(columns_read_by(rule.formula) & names) for rule in read_by)
+        return min(last * self.task.system.dt / longest, 1.0)  # an input is also read at the last sample
 
     def graded(self, requirement: int) -> bool:
         """True if the robustness varies with real signals, rather than with whole numbers."""
@@ -149,7 +154,7 @@ class ModelSimulator:
         if focus.scales is not None:
             guidance = np.where(np.isneginf(margins), -np.inf, guide(columns, focus.scales))
         sizes = guide.sizes(columns) if focus.sized else np.zeros((len(margins), 0))
-        return Simulations(margins, guidance, admissible, sizes)
+        return Simulations(margins, guidance, admissible & in_scope(task, columns), sizes)
 
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None for a system in discrete time.
@@ -236,6 +241,15 @@ def _halved(decl: SystemDecl, *, sampled: bool) -> dict[str, str]:
     if sampled:
         return {"time.substeps": str(2 * decl.substeps)}
     return {"time.dt": f"{decl.dt / 2} s", "time.horizon": f"{2 * decl.horizon} steps"}
+
+
+def in_scope(task: Task, columns: Columns) -> NDArray[np.bool_]:
+    """True for the simulations that violate no assumption of the specification, (count,)."""
+    scope = np.ones(next(iter(columns.values())).shape[1], dtype=np.bool_)
+    for rule in task.compiled.assumptions:
+        _, high = rule_bounds(rule, Record.of(columns, NUMPY), range(1), task.horizon, "open")
+        scope &= ~(high[0] < -TOLERANCE)
+    return scope
 
 
 @cache

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.documents import misfits
 
+from stlc.assurance.draws import ModelDraws
 from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify, falsify_each
 from stlc.assurance.guidance import ScaledRobustness, scales_of
 from stlc.assurance.model_simulator import ModelSimulator
@@ -356,3 +357,17 @@ def test_half_of_a_step_that_is_no_decimal_fraction_is_exact():
     found = falsify(ramp("require r: eventually[1 s, 1 s] x <= 1.2"), 0, budget=SearchBudget(5), seed=0)
     assert found.found is not None
     assert found.found.half_step == pytest.approx(found.found.margin)
+
+
+def test_a_simulation_in_which_an_assumption_fails_violates_nothing_and_is_not_counted():
+    simulator = ramp("assume low: always[0 s, 1 s] x <= 1.2\nrequire r: always[0 s, 1 s] x <= 1.1")
+    outcome = simulator.simulate(np.array([[0.1], [0.3], [0.9]]), Focus(0))
+    assert outcome.admissible.tolist() == [True, True, False]
+    found = falsify(simulator, 0, budget=SearchBudget(20), seed=0)
+    assert found.found is not None
+    assert found.found.margin >= -0.1 - 1e-9
+    assert found.rejected > 0
+    draws = ModelDraws(simulator, Path("ramp.stl"))
+    (sample,) = draws.observed(range(40))
+    assert 0 < sample.drives < 40
+    assert sample.overall.robustness.min() >= -0.1 - 1e-9

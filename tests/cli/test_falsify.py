@@ -14,7 +14,10 @@ from stlc.assurance.simulation import Focus
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
+from stlc.controller.evaluation.rules import Rules
 from stlc.controller.training.run import Run
+from stlc.grammar.parse.parser import parse
+from stlc.source import Source
 from stlc.trace import load_trace
 
 SYSTEM = """
@@ -92,6 +95,22 @@ def test_points_decide_the_drives():
     assert np.allclose(together, alone, atol=1e-6)
     low = np.zeros((1, simulator.space.dim))
     assert simulator.drive(low).states[0, 0, 0] == pytest.approx(-0.5)
+
+
+def test_a_drive_that_violates_an_assumption_violates_no_requirement():
+    simulator = DriveSimulator(Run.open("latest"), "none", Setting((0,), 2, 20, 1))
+    points = np.random.default_rng(0).random((8, simulator.space.dim))
+    every = simulator.margins_of_agents(simulator.drive(points))
+    assumed = DriveSimulator(simulator.run, simulator.guard, simulator.setting)
+    spec = parse(Source("cart.stl", SPEC + "assume left: x <= 0 m\n"))
+    assumed.__dict__["_rules"] = Rules(spec, "cart.stl")
+    recording = assumed.drive(points)
+    left = (recording.states[:, 0, 0] <= 0.0).reshape(8, 2)
+    margins = assumed.margins_of_agents(recording)
+    assert 0 < left.sum() < left.size
+    assert np.isposinf(margins[~left]).all()
+    assert np.allclose(margins[left], every[left], atol=1e-6)
+    assert (assumed.simulate(points, Focus(0)).admissible == left.any(1)).all()
 
 
 @pytest.mark.parametrize(
