@@ -371,3 +371,33 @@ def test_a_simulation_in_which_an_assumption_fails_violates_nothing_and_is_not_c
     (sample,) = draws.observed(range(40))
     assert 0 < sample.drives < 40
     assert sample.overall.robustness.min() >= -0.1 - 1e-9
+
+
+def test_a_replay_makes_the_changes_of_the_search(capsys: pytest.CaptureFixture[str]):
+    ramp("const most = 9\nrequire r: always[0 s, 1 s] x <= most")
+    assert main(["falsify", "ramp.stl", "--set", "most=1.2"]) == 1
+    command = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert main(command[1:]) == 1
+    assert "the same, bit for bit" in capsys.readouterr().out
+    assert main([*command[1:], "--set", "most=5"]) == 0
+
+
+def test_a_counterexample_without_finite_states_can_be_replayed(capsys: pytest.CaptureFixture[str]):
+    ramp("require r: always[0 s, 4 s] x <= 9")
+    Path("ramp.yaml").write_text(RAMP.replace("flow: {x: 1}", "flow: {x: 9 * x ^ 4 + 9}"))
+    assert main(["falsify", "ramp.stl"]) == 1
+    capsys.readouterr()
+    assert main(["falsify", "ramp.stl", "--replay", "counterexamples/r.json"]) == 1
+    assert "robustness -inf; the trace is the same, bit for bit" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("changed", [{"margin": 10**400}, {"margin": "low"}, {"point": [10**400]}])
+def test_a_counterexample_with_numbers_beyond_all_bounds_is_refused(
+    changed: dict, capsys: pytest.CaptureFixture[str]
+):
+    ramp("require r: always[0 s, 1 s] x <= 1.2")
+    stored = {"format": "stlc-counterexample/1", "requirement": "r", "margin": -1.0, "trace": "r.npz"}
+    stored |= {"settings": {}, "point": [0.5]} | changed
+    Path("r.json").write_text(json.dumps(stored))
+    assert main(["falsify", "ramp.stl", "--replay", "r.json"]) == 2
+    assert "U101" in capsys.readouterr().err

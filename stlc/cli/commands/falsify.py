@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     _Simulator: TypeAlias = ModelSimulator | DriveSimulator | PlantSimulator
 
 FORMAT = "stlc-counterexample/1"
+RUNS = Path("runs")
+"""Folder of runs, unless another one is given."""
 
 
 @command(
@@ -101,7 +103,7 @@ def falsify(
         Path | None, typer.Option(metavar="FILE", help="Simulate this counterexample again, and compare.")
     ] = None,
     set_: SetOption = None,
-    runs: RunsOption = Path("runs"),
+    runs: RunsOption = RUNS,
 ) -> Answer[FalsifyResult]:
     """Search for simulations that violate requirements.
 
@@ -135,7 +137,7 @@ def falsify(
         for index in wanted:
             with PULSE.doing(f"searching for a violation of {simulator.requirements[index]}"):
                 result = next(results)
-            found.append(_written(made, simulator, result, output))
+            found.append(_written(source, simulator, result, output))
     failed = [*getattr(simulator, "findings", ()), *(() if workers is None else workers.findings)]
     document: FalsifiedSystem = {
         "target": target,
@@ -143,7 +145,7 @@ def falsify(
         "seed": seed,
         "coordinates": simulator.space.dim,
         "failures": list(dict.fromkeys(f"{each.finding.reason}: {each.finding.message}" for each in failed)),
-        "findings": findings.written(failed, output, made.settings(), partial(_command, made)),
+        "findings": findings.written(failed, output, source.settings(), partial(_command, source)),
         "requirements": found,
         "lost": 0 if workers is None else workers.lost,
     }
@@ -220,16 +222,6 @@ class _Target:
                 raise usage(f"`--{option}` and `--plant` contradict each other")
         return PlantSimulator.load(self.name, plant, overrides, jobs)
 
-    def settings(self) -> dict[str, Any]:
-        """Settings of the simulations that a replay needs."""
-        return {
-            "guard": self.guard,
-            "agents": self.agents,
-            "steps": self.steps,
-            "scenario": self.scenario,
-            "seed": self.seed,
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class _Source:
@@ -248,6 +240,18 @@ class _Source:
     runs: Path
     jobs: int = 1
     cluster: str | None = None
+
+    def settings(self) -> dict[str, Any]:
+        """Settings of the simulations that a replay needs."""
+        target = self.target
+        return {
+            "guard": target.guard,
+            "agents": target.agents,
+            "steps": target.steps,
+            "scenario": target.scenario,
+            "seed": target.seed,
+            "set": dict(self.overrides),
+        }
 
     def load(self) -> _Simulator:
         """Load the simulator."""
@@ -310,7 +314,7 @@ def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:
 
 
 def _written(
-    target: _Target, simulator: _Simulator, result: Falsification, folder: Path
+    source: _Source, simulator: _Simulator, result: Falsification, folder: Path
 ) -> FalsifiedRequirement:
     """Write the counterexample of a requirement, if there is one, and return its record."""
     from stlc.escape import file_part
@@ -329,7 +333,7 @@ def _written(
             "requirement": result.requirement,
             "margin": best.margin,
             "trace": trace.name,
-            "settings": target.settings(),
+            "settings": source.settings(),
             "point": best.point.tolist(),
         }
         write_atomic(path, dumps(stored) + "\n")
@@ -346,7 +350,7 @@ def _written(
         "seconds": result.seconds,
         "strategies": result.strategies,
         "file": None if best is None else str(path),
-        "replay": None if best is None else _command(target, path),
+        "replay": None if best is None else _command(source, path),
     }
 
 
@@ -359,19 +363,23 @@ def _violation(found: Counterexample) -> Any:
     }
 
 
-def _command(target: _Target, path: Path) -> str:
+def _command(source: _Source, path: Path) -> str:
     """Command that replays a counterexample."""
+    target = source.target
     words = ["stlc", "falsify", target.name]
     if target.plant is not None:
         words += ["--plant", str(target.plant)]
     if target.system is not None:
         words += ["--system", target.system]
+    if not target.model and source.runs != RUNS:
+        words += ["--runs", str(source.runs)]
     return shlex.join([*words, "--replay", str(path)])
 
 
 def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: Path) -> Answer[FalsifyResult]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
     from stlc.assurance.simulation import Focus
+    from stlc.compile.semantics.semantics import TOLERANCE
     from stlc.trace import load_trace
 
     stored = _stored(path)
@@ -382,7 +390,9 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
         None if given.get("scenario") is None else str(given["scenario"]),
         _optional(given.get("seed")) or 0,
     )
-    simulator = again.simulator(overrides, runs)
+    changed = given.get("set")
+    before = {str(name): str(text) for name, text in changed.items()} if isinstance(changed, dict) else {}
+    simulator = again.simulator({**before, **overrides}, runs)
     if stored["format"] == findings.FORMAT:
         point = _point(stored, simulator.space.dim, path)
         return findings.replayed(_plant_of(simulator, path), point, stored)
@@ -390,25 +400,25 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
     point = _point(stored, simulator.space.dim, path)
     margin = float(simulator.simulate(point[None], Focus(index)).margins[0])
     if getattr(simulator, "findings", ()):
-        before = {"reason": f"a violation of {stored['requirement']}"}
-        return findings.replayed(_plant_of(simulator, path), point, before)
+        violated = {"reason": f"a violation of {stored['requirement']}"}
+        return findings.replayed(_plant_of(simulator, path), point, violated)
     different = _different(
         load_trace(path.parent / Path(str(stored["trace"])).name), simulator.trace(point[None])
     )
     document: ReplayedCounterexample = {
         "requirement": stored["requirement"],
         "margin": margin,
-        "stored_margin": float(stored["margin"]),
+        "stored_margin": stored["margin"],
         "identical": not different,
         "different": different,
     }
 
     def show() -> None:
-        verdict = "violated" if margin < 0.0 else "satisfied"
+        verdict = "violated" if margin < -TOLERANCE else "satisfied"
         same = "the trace is the same, bit for bit" if not different else f"different: {', '.join(different)}"
         emit(f"{document['requirement']}: {verdict}, robustness {margin:.6g}; {same}")
 
-    return Answer(document, show, int(margin < 0.0))
+    return Answer(document, show, int(margin < -TOLERANCE))
 
 
 def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:
@@ -423,7 +433,8 @@ def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:
 
 
 def _optional(value: object) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    return int(value) if whole and 0 <= int(value) <= MOST_SEED else None  # type: ignore[call-overload]
 
 
 def _stored(path: Path) -> dict[str, Any]:
@@ -438,9 +449,10 @@ def _stored(path: Path) -> dict[str, Any]:
         raise UsageError(Diagnostic("U102", f"there is no file `{path}`")) from None
     except (ValueError, RecursionError):
         found = None
+    wrong = usage(f"`{path}` is not a counterexample", "a file that `stlc falsify` wrote")
     keys: dict[str, Any] = {
         "requirement": str,
-        "margin": (int, float),
+        "margin": (int, float, str),
         "trace": str,
         "settings": dict,
         "point": list,
@@ -450,7 +462,12 @@ def _stored(path: Path) -> dict[str, Any]:
     if kind not in (FORMAT, findings.FORMAT) or not all(
         isinstance(found.get(key), kind) for key, kind in keys.items()
     ):
-        raise usage(f"`{path}` is not a counterexample", "a file that `stlc falsify` wrote")
+        raise wrong
+    if kind == FORMAT:
+        try:
+            found["margin"] = float(found["margin"])  # an infinite one is a text
+        except (ValueError, OverflowError):
+            raise wrong from None
     return dict(found)
 
 
@@ -464,7 +481,7 @@ def _point(stored: Mapping[str, Any], dim: int, path: Path) -> np.ndarray:
 
     try:
         point = np.array(stored["point"], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         point = np.zeros(0)
     inside = point.shape == (dim,) and bool(((point >= 0.0) & (point <= 1.0)).all())
     if not inside:
@@ -475,13 +492,15 @@ def _point(stored: Mapping[str, Any], dim: int, path: Path) -> np.ndarray:
 
 
 def _different(stored: Trace, again: Trace) -> list[str]:
-    """Names of the signals that differ between two traces in any bit."""
+    """Names of the signals that differ between two traces in any bit, or that only one of them has."""
     import numpy as np
 
     return [
         name
-        for name, values in again.data.items()
-        if name not in stored.data or not np.array_equal(stored.data[name], values, equal_nan=True)
+        for name in dict.fromkeys((*again.data, *stored.data))
+        if name not in stored.data
+        or name not in again.data
+        or not np.array_equal(stored.data[name], again.data[name], equal_nan=True)
     ]
 
 
