@@ -216,9 +216,20 @@ def compared(
     """
     return CertificateVerification(
         _different(document["inputs"], inputs),
-        tuple(wrong_numbers(document)),
+        (*wrong_numbers(document), *_wrong_seeds(document)),
         _different(document["versions"], versions(*packages)),
     )
+
+
+def _wrong_seeds(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """The entry of the seeds, if they do not give as many drives as a certificate counts.
+
+    Simulations of a plant or system may be fewer: those in which an assumption does not hold are left out.
+    """
+    conditions, drives = document["conditions"], int(document["overall"]["drives"])
+    seeds = sum(int(last) - int(first) + 1 for first, last in conditions["seeds"])
+    given = drives <= seeds if "kind" in document else drives == seeds * int(conditions["agents"])
+    return () if given else ("conditions.seeds",)
 
 
 def _different(then: Mapping[str, Any], present: Mapping[str, Any]) -> tuple[Difference, ...]:

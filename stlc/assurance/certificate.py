@@ -579,20 +579,8 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
     wrong = []
     for place, each in _places(document):
         low, high = (_tally(each[name]) for name in ("observed", "observed_high"))
-        found = shares_of(low, high, confidence, any_time=any_time)
-        expected = {
-            "units": float(low.counts.sum()),
-            "share": float(low.values @ low.counts / low.counts.sum()),
-            "lower": found.lower,
-            "upper": found.upper,
-            "lower_deployed": claim.shift.least(found.lower),
-            "upper_deployed": claim.shift.least(found.upper),
-        }
-        wrong += [
-            f"{place}.{name}"
-            for name, value in expected.items()
-            if not abs(float(each[name]) - value) <= _AGREE
-        ]
+        expected = _expected(low, high, int(document["overall"]["drives"]), claim)
+        wrong += [f"{place}.{name}" for name, values in expected.items() if not _agree(each[name], values)]
     overall = document["overall"]
     lower, upper = float(overall["lower_deployed"]), float(overall["upper_deployed"])
     answer = "certified" if claim.share is not None and lower >= claim.share else "undecided"
@@ -600,6 +588,41 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
     if document["answer"] != ("measured" if claim.share is None else answer):
         wrong.append("answer")
     return wrong
+
+
+def _expected(low: Tally, high: Tally, drives: int, claim: Claim) -> dict[str, float | Bounds | None]:
+    """Entries of a statement that follow from the observations of `drives` drives, by their names."""
+    found = shares_of(low, high, claim.confidence, any_time=claim.any_time)
+    units, whole = int(low.counts.sum()), int(low.counts[low.values == 1.0].sum())
+    tally = Tally.counted(whole, units)
+    least, most = (float(each.values @ each.counts / each.counts.sum()) for each in (low, high))
+    expected: dict[str, float | Bounds | None] = {
+        "drives": drives,
+        "units": units,
+        "share": least,
+        "lower": found.lower,
+        "upper": found.upper,
+        "interval": found.interval,
+        "lower_any_time": found.any_time,
+        "lower_fixed": found.fixed,
+        "lower_deployed": claim.shift.least(found.lower),
+        "upper_deployed": claim.shift.least(found.upper),
+        "whole_units": whole,
+        "whole_units_lower": shares_of(tally, tally, claim.confidence, any_time=claim.any_time).lower,
+    }
+    if drives % units == 0:  # each unit has equally many drives
+        expected |= {"satisfied": least * drives, "undecided": (most - least) * drives}
+    return expected
+
+
+def _agree(given: Any, expected: float | Bounds | None) -> bool:
+    """True if an entry of a certificate is the expected number, or interval, but for rounding."""
+    if expected is None or given is None:
+        return expected is given
+    if isinstance(expected, Bounds):
+        low, high = given
+        return _agree(low, expected.low) and _agree(high, expected.high)
+    return abs(float(given) - expected) <= _AGREE * max(1.0, abs(expected))
 
 
 def _places(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -289,6 +289,38 @@ def test_numbers_that_were_changed_are_found(file: Path, capsys: pytest.CaptureF
     assert "has been changed" in out
 
 
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        ("drives", 4000),
+        ("satisfied", 0),
+        ("undecided", 1),
+        ("interval", [0.99, 1.0]),
+        ("lower_any_time", 0.9),
+        ("lower_fixed", None),
+        ("whole_units", 41),
+        ("whole_units_lower", 0.9),
+    ],
+)
+def test_every_count_and_bound_is_compared(
+    entry: str, value: object, file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = json.loads(file.read_text())
+    assert document["overall"][entry] != value
+    document["overall"][entry] = value
+    file.write_text(json.dumps(document))
+    assert set(compared(capsys, file, 1)["numbers"]) & {f"overall.{entry}", f"near.{entry}"}
+
+
+def test_a_certificate_of_more_drives_than_its_seeds_give_is_found(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = json.loads(file.read_text())
+    document["conditions"]["seeds"] = [[0, 1]]
+    file.write_text(json.dumps(document))
+    assert compared(capsys, file, 1)["numbers"] == ["conditions.seeds"]
+
+
 @pytest.mark.usefixtures("there")
 @pytest.mark.parametrize(
     "text",
