@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.simulation import Focus, Simulations
+from stlc.assurance.simulation import PARTS, Focus, Simulations
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
 from stlc.controller.deployment.simulator import simulate as run_worlds
@@ -73,6 +73,11 @@ class DriveSimulator:
         first = 0 if worlds.tape is None else worlds.tape.used[0]
         dim = min(max(2 * first, first + 4 * self.setting.steps), MOST_COORDINATES) + 1
         return SearchSpace(dim, sparse=True)
+
+    @property
+    def part(self) -> int:
+        """Number of points that are simulated at once where simulations are shared out."""
+        return max(self.batch // PARTS, 1)
 
     @cached_property
     def requirements(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stlc.assurance.guidance import Columns, ScaledRobustness, graded
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
-from stlc.assurance.simulation import Focus, Simulations
+from stlc.assurance.simulation import PARTS, Focus, Simulations
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import counts_samples
@@ -103,6 +103,11 @@ class ModelSimulator:
         Several coordinates may affect a time. The last of them, which is returned, affects no other time.
         """
         return self.points.last_coordinates_of(names)
+
+    @property
+    def part(self) -> int:
+        """Number of points that are simulated at once where simulations are shared out."""
+        return max(self.batch // PARTS, 1)
 
     @cached_property
     def requirements(self) -> tuple[str, ...]:

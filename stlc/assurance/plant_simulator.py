@@ -153,6 +153,11 @@ class PlantSimulator:
         """Number of simulations side by side."""
         return self.jobs
 
+    @property
+    def part(self) -> int:
+        """Number of points that are simulated at once where simulations are shared out: one per process."""
+        return self.jobs
+
     @cached_property
     def space(self) -> SearchSpace:
         """The search space: a coordinate per variable of the plant."""

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
-PARTS = 4
-"""Number of parts into which the points are cut that a simulator prefers to simulate side by side."""
-
 
 class SimulatorWorkers:
     """Worker processes that each hold the same simulator, as a context.
@@ -144,15 +141,15 @@ class SharedSimulator:
         return self.local.requirements
 
     @property
-    def _part(self) -> int:
+    def part(self) -> int:
         """Number of points of a part."""
-        return max(self.local.batch // PARTS, 1)
+        return self.local.part
 
     @property
     def batch(self) -> int:
         """Number of points side by side."""
         count = 1 if self.workers is None else self.workers.count
-        return self.points or max(self.local.batch, self._part * count)
+        return self.points or max(self.local.batch, self.part * count)
 
     def seen(self, requirement: int) -> float:
         """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
@@ -164,7 +161,7 @@ class SharedSimulator:
 
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate and judge `points`, (count, dim), in equal parts."""
-        parts = [points[first : first + self._part] for first in range(0, len(points), self._part)]
+        parts = [points[first : first + self.part] for first in range(0, len(points), self.part)]
         if self.workers is None or len(points) == 1:
             return Simulations.joined([self.local.simulate(part, focus) for part in parts])
         found = list(self.workers.run(_simulated, [_Part(part, focus) for part in parts]))

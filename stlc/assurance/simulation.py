@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
 
+PARTS = 4
+"""Number of parts into which the points are cut that a simulator prefers to simulate side by side."""
+
 
 @dataclass(frozen=True, slots=True)
 class Focus:
@@ -77,6 +80,10 @@ class Simulator(Protocol):
     @property
     def batch(self) -> int:
         """Number of points that are best simulated side by side."""
+
+    @property
+    def part(self) -> int:
+        """Number of points that are simulated at once where simulations are shared out."""
 
     @property
     def requirements(self) -> Sequence[str]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stlc.assurance.falsify import SearchBudget, falsify
 from stlc.assurance.plant_simulator import PlantSimulator
+from stlc.assurance.sharing import SharedSimulator
 from stlc.assurance.simulation import Focus
+from stlc.plants.plant import Plant
 
 CODE = """
 def rates(t, x, u):
@@ -170,3 +173,22 @@ def test_a_requirement_that_counts_samples_has_no_half_step():
     simulator.close()
     assert counted is None
     assert timed is not None
+
+
+@pytest.mark.usefixtures("home")
+def test_shared_simulations_use_all_processes_of_a_plant(monkeypatch: pytest.MonkeyPatch):
+    simulator = PlantSimulator.load("pair.stl", Path("pair.yaml"), {}, jobs=2)
+    sizes: list[int] = []
+    simulate = Plant.simulate
+
+    def counted(self: Plant, points: np.ndarray, **options: Any) -> Any:
+        sizes.append(len(points))
+        return simulate(self, points, **options)
+
+    monkeypatch.setattr(Plant, "simulate", counted)
+    points = np.random.default_rng(0).random((5, simulator.space.dim))
+    shared = SharedSimulator(simulator, None, 5).simulate(points, Focus(0))
+    alone = simulator.simulate(points, Focus(0))
+    simulator.close()
+    assert sizes == [2, 2, 1, 5]
+    assert np.array_equal(shared.margins, alone.margins)

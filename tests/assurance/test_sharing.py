@@ -40,6 +40,10 @@ class Bowl:
         return SearchSpace(2, ())
 
     @property
+    def part(self) -> int:
+        return max(self.batch // 4, 1)
+
+    @property
     def requirements(self) -> tuple[str, ...]:
         return ("centre", "edge", "none")
 
