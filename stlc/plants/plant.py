@@ -149,9 +149,11 @@ class Plant:
     def points_of(self, uniforms: Floats) -> Floats:
         """Return the points that uniform random numbers give: (batch, dim) between 0 and 1 -> (batch, dim).
 
-        Values are uniformly distributed over their ranges. Free times of input signals are sorted.
+        Values are uniformly distributed over their ranges, which they never leave. Free times of input
+        signals are sorted.
         """
-        found = self.low + (self.high - self.low) * np.asarray(uniforms, dtype=np.float64)
+        low, high = self.low, self.high
+        found = np.minimum(low + (high - low) * np.asarray(uniforms, dtype=np.float64), high)
         for signal, columns in self._free():
             if columns:
                 found[:, columns] = drawn_numbers(signal, np.asarray(uniforms, dtype=np.float64)[:, columns])
@@ -179,7 +181,8 @@ class Plant:
                 continue
             numbers = point[columns].copy()
             numbers[signal.points :] = np.sort(numbers[signal.points :])
-            found[:, index] = signal_values(signal, numbers[None], times)[0]
+            values = signal_values(signal, numbers[None], times)[0]
+            found[:, index] = np.clip(values, signal.low, signal.high)  # but for rounding they are inside
         return found
 
     # ------------------------------------------------------------------------ simulation

@@ -73,6 +73,23 @@ def test_points_fill_the_ranges_and_times_are_sorted(plant):
     assert (plant.random_point(3) == plant.random_point(3)).all()
 
 
+@pytest.mark.parametrize("ends", ["[-4.01, -1.55]", "[-2.33, 2.31]", "[-7.3, 4.43]"])
+def test_no_value_leaves_its_range_by_rounding(tmp_path, ends):
+    inputs = f"{{torque: {{unit: rad/s^2, range: {ends}, pieces: 3, interpolate: linear}}}}"
+    pendulum(tmp_path, input=inputs, initial=f"{{angle: {{range: {ends}, unit: rad}}, rate: 0}}")
+    with load_plant(tmp_path / "pendulum.yaml") as plant:
+        cube = np.random.default_rng(0).integers(0, 2, (50, len(plant.variables))).astype(float)
+        points = plant.points_of(cube)
+        assert (plant.low <= points).all()
+        assert (points <= plant.high).all()
+        (signal,) = plant.decl.free
+        (run,) = plant.simulate(points[:1])
+        assert isinstance(run.outcome, Trace)
+        torque = run.outcome.data["torque"]
+        assert (signal.low <= torque).all()
+        assert (torque <= signal.high).all()
+
+
 def test_a_trace_has_outputs_inputs_and_parameters(plant, folder, monkeypatch):
     point = plant.random_point(1)
     (run,) = plant.simulate(point[None])

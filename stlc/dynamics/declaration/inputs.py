@@ -123,7 +123,8 @@ def drawn_numbers(decl: InputDecl, uniforms: Floats) -> Floats:
     import numpy as np
 
     found = np.array(uniforms, dtype=np.float64)
-    found[:, : decl.points] = decl.low + (decl.high - decl.low) * found[:, : decl.points]
+    values = decl.low + (decl.high - decl.low) * found[:, : decl.points]
+    found[:, : decl.points] = np.minimum(values, decl.high)  # the sum may be rounded up
     rest = np.full(len(found), float(decl.duration))
     for index in range(len(decl.times)):
         column = decl.points + index
