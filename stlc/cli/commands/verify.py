@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stlc.cli.certify.text import floored
 from stlc.cli.framework.assured import Verified, VerifiedMode
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
@@ -228,11 +229,12 @@ def _lines(found: Verified) -> Iterator[str]:
     yield ""
     yield table(rows, header=("initial states", "probability", "proved", "refuted", "open"))
     if found["states"]:
+        certain = floored(float(found["states_share"]))
         yield ""
         yield (
             f"{found['states_proved']} of {found['states']} random initial states are in a proved box, "
-            f"{found['states_violated']} are violated; so at least {_percent(found['states_share'])} of all "
-            "initial states have such a box (95 % confidence)"
+            f"{found['states_violated']} are violated; so at least {certain} of all initial states have such "
+            "a box (95 % confidence)"
         )
     known = [mode for mode in found["modes"] if mode["witness"] is not None]
     for mode in sorted(known, key=lambda mode: float(mode["robustness"] or 0.0))[:_MOST]:
