@@ -401,3 +401,9 @@ def test_a_counterexample_with_numbers_beyond_all_bounds_is_refused(
     Path("r.json").write_text(json.dumps(stored))
     assert main(["falsify", "ramp.stl", "--replay", "r.json"]) == 2
     assert "U101" in capsys.readouterr().err
+
+
+def test_a_requirement_that_is_always_true_has_traces(capsys: pytest.CaptureFixture[str]):
+    ramp("require r: true")
+    assert main(["falsify", "ramp.stl", "--simulations", "2"]) == 0
+    assert "no violation in 2 simulations, least robustness inf" in capsys.readouterr().out

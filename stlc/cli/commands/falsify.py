@@ -510,11 +510,12 @@ def _different(stored: Trace, again: Trace) -> list[str]:
 def _lines(document: FalsifiedSystem) -> list[str]:
     lines = []
     for each in document["requirements"]:
-        lines.extend(_of_requirement(each))
+        lines.extend(_of_requirement(each, failed=bool(document["failures"])))
     return [*lines, *findings.lines(document["findings"])]
 
 
-def _of_requirement(each: FalsifiedRequirement) -> list[str]:
+def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:
+    """Lines about a requirement; `failed`: whether there are simulations without a trace."""
     from stlc.view.words import share
 
     name, found = each["name"], each["found"]
@@ -522,7 +523,7 @@ def _of_requirement(each: FalsifiedRequirement) -> list[str]:
     spurious = f"; {lost} violations vanish at half the time step" if lost else ""
     if found is None:
         least = float(each["least"])
-        told = f"least robustness {least:.4g}" if least < math.inf else "and no trace"
+        told = "and no trace" if failed and least == math.inf else f"least robustness {least:.4g}"
         return [
             f"{name}: no violation in {each['simulations']:,} simulations, {told}{spurious}",
             f"  pairwise coverage of the search space {share(each['coverage'])}; this is no proof",
