@@ -109,8 +109,9 @@ def _disagreement(how: str) -> Diagnostic:
 
 
 def _distance(a: Tensor, b: Tensor) -> float:
-    """Greatest absolute difference of two tensors; the difference of equal infinities is 0."""
-    return float(torch.where(a == b, torch.zeros_like(a), (a - b).abs()).nan_to_num(torch.inf).amax())
+    """Greatest absolute difference of two tensors; that of equal infinities, and of NaN and NaN, is 0."""
+    same = (a == b) | (torch.isnan(a) & torch.isnan(b))
+    return float(torch.where(same, torch.zeros_like(a), (a - b).abs()).nan_to_num(torch.inf).amax())
 
 
 def by_torch(path: Path) -> Callable[[Tensor], Answer]:

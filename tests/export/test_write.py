@@ -8,6 +8,7 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers.documents import misfits
@@ -25,6 +26,8 @@ from stlc.diagnostics import RunError, UsageError
 from stlc.export.programs import without_deprecations
 from stlc.export.verify import agreement, answers
 from stlc.export.write import export, target_of
+from stlc.runtime.facts import read_facts
+from stlc.runtime.graphs import Graphs
 from stlc.runtime.prefixes import SAMPLINGS
 
 ROOT = Path(__file__).parents[2]
@@ -181,6 +184,21 @@ def test_what_disagrees_is_not_handed_out(tmp_path: Path) -> None:
 
     with pytest.raises(RunError, match="does not do what the run does"):
         agreement(run.policy, proud, states=8)  # type: ignore[arg-type]
+
+
+def test_a_robustness_that_both_call_not_a_number_agrees(tmp_path: Path) -> None:
+    (tmp_path / "cart.yaml").write_text(CART)
+    rooted = "@safety\nrequire slow: always[0, T] sqrt(1 - abs(v) / (1.5 m/s)) >= 0\n"
+    signals = "state signal x [m]\nstate signal v [m/s]\n"
+    (tmp_path / "cart.stl").write_text(signals + rooted + "require near: always[0, T] abs(x) < 1.5 m\n")
+    run = untrained(tmp_path / "cart.stl", tmp_path / "cart.yaml", tmp_path / "runs")
+    done = export(run, "onnx", tmp_path / "out")
+    graphs, system = Graphs(read_facts(done.folder)), run.task.system
+    x = run.task.sample(4, seed=1, dtype=torch.float64).numpy()
+    hard = np.full((4, run.task.horizon, 1), float(system.control_high))
+    assert np.isnan(graphs.falls(x, hard)).any()
+    assert done.agreement is not None
+    assert done.agreement.rho <= 1e-9
 
 
 def test_an_unknown_target_is_a_usage_error() -> None:
