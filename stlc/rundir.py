@@ -101,24 +101,33 @@ class RunDir:
 
     @classmethod
     def open(cls, where: Path | str, root: Path = RUNS) -> RunDir:
-        """Open the run called `where`.
+        """Open the run called `where`; `found` lists the possible names.
+
+        Raises:
+            UsageError: R101, there is no such run, or several fit.
+            RunError: R101, the folder is damaged.
+        """
+        return cls.found(where, root).checked()
+
+    @classmethod
+    def found(cls, where: Path | str, root: Path = RUNS) -> RunDir:
+        """The run called `where`, even if its record (`run.json`) is damaged.
 
         Possible names: a folder, or a file in it; `latest`; the name or file of a specification (its newest
         run); the number of a run, its words, or both, with or without `SPEC/` before it.
 
         Raises:
             UsageError: R101, there is no such run, or several fit.
-            RunError: R101, the folder is damaged.
+            RunError: R101, the folder has no record.
         """
         given = Path(where)
         if given.exists() and given.resolve() != Path.cwd() / root:
             folder = _folder_of(given)
             if given.suffix == ".stl" and folder == given:
                 return _of_spec(given, root)
-            return cls(folder.resolve()).checked()
-        if str(where) == LATEST:
-            return cls.newest(root).checked()
-        return _by_name(str(where), root).checked()
+            run = cls(folder.resolve())
+            return run if (run.path / RECORD).is_file() else run.checked()
+        return cls.newest(root) if str(where) == LATEST else _by_name(str(where), root)
 
     def checked(self) -> RunDir:
         """Return this run if its record (`run.json`) can be read. Raises RunError (R101) if not."""

@@ -252,6 +252,24 @@ def test_a_run_that_is_going_needs_force():
     assert not list(Path("runs/cart").glob("0*"))
 
 
+def test_a_damaged_run_needs_force():
+    damaged = make_run("cart", "torn")
+    (damaged.path / "run.json").write_text("{")
+    assert main(["runs", "rm", "torn"]) == 3
+    assert main(["runs", "rm", "torn", "--force"]) == 0
+    assert not damaged.path.exists()
+    Path("folder").mkdir()
+    assert main(["runs", "rm", "folder", "--force"]) == 3
+    assert Path("folder").exists()
+
+
+def test_a_run_that_is_named_twice_is_removed_once(capsys):
+    folder = make_run("cart", "first").path
+    assert main(["runs", "rm", "1", "first", str(folder)]) == 0
+    assert capsys.readouterr().err.count("removed") == 1
+    assert not folder.exists()
+
+
 # ---------------------------------------------------------------------- explain, plot
 
 

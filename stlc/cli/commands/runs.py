@@ -98,16 +98,18 @@ def rm(
     names: Annotated[
         list[str], typer.Argument(metavar="RUN…", help="Runs to remove.", autocompletion=run_names)
     ],
-    force: Annotated[bool, typer.Option("--force", help="Also runs that are in progress.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Also runs in progress, and damaged ones.")] = False,
     runs: RunsOption = RUNS,
 ) -> Answer[documents.RemovedRuns]:
     """Remove the folders of runs.
 
-    A run in progress is removed only with --force. The links to the newest run are updated.
+    A run that is in progress or damaged is removed only with --force. The links to the newest run are
+    updated.
     """
-    folders = [RunDir.open(name, runs) for name in names]
-    going = [folder.shown for folder in folders if folder.status == "running"]
-    if going and not force:
+    named = [RunDir.found(name, runs) for name in names]
+    folders = list({folder.path.resolve(): folder for folder in named}.values())
+    going = [] if force else [folder.shown for folder in folders if folder.status == "running"]
+    if going:
         advice = ("stop it first, or remove it with --force",)
         raise usage(f"{', '.join(going)} is still going", *advice)
     for folder in folders:
