@@ -142,7 +142,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             the temporary one removed.
     """
     path = Path(path)
-    target = path.resolve()
+    target = real(path)
     if target.exists() and not target.is_file() and not target.is_dir():
         with reported(f"write `{path}`"):
             yield target
@@ -179,6 +179,11 @@ def reported(action: str) -> Iterator[None]:
 
 
 # ----------------------------------------------------------------------- finding
+
+
+def real(path: Path) -> Path:
+    """Absolute path without links; unlike `Path.resolve`, it gives no error at a link back to itself."""
+    return Path(os.path.realpath(path))
 
 
 def require_folder(path: Path) -> None:

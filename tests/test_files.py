@@ -162,6 +162,12 @@ def test_a_link_is_written_through(tmp_path):
     assert (tmp_path / "real.txt").read_text(encoding="utf-8") == "new"
 
 
+def test_a_loop_of_links_is_a_diagnostic(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(MissingError, match=r"cannot write .*loop"):
+        write_atomic(tmp_path / "loop" / "file.txt", "new")
+
+
 def test_the_temporary_file_has_the_suffix_and_the_folder(tmp_path):
     with atomic_path(tmp_path / "trace.npz") as temporary:
         assert (temporary.suffix, temporary.parent) == (".npz", tmp_path)

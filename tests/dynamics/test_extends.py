@@ -71,14 +71,21 @@ def test_an_error_is_shown_where_it_is_written(folder: Path) -> None:
     assert finding.span.text == "w"
 
 
-@pytest.mark.parametrize("target", ["fast.yaml", "nowhere.yaml", "list.yaml", "back.yaml"])
+@pytest.mark.parametrize("target", ["fast.yaml", "nowhere.yaml", "list.yaml", "back.yaml", "loop.yaml"])
 def test_a_chain_that_leads_nowhere_is_said(folder: Path, target: str) -> None:
     (folder / "list.yaml").write_text("- 1\n")
     (folder / "back.yaml").write_text("extends: fast.yaml\n")
+    (folder / "loop.yaml").symlink_to("loop.yaml")
     (folder / "fast.yaml").write_text(f"extends: {target}\n" + BASE)
     with pytest.raises(StlcError) as caught:
         load_system_decl(folder / "fast.yaml")
     assert [finding.code for finding in caught.value.diagnostics] == ["S209"]
+
+
+def test_a_judge_may_be_a_link_back_to_itself(folder: Path) -> None:
+    (folder / "loop.stl").symlink_to("loop.stl")
+    (folder / "judged.yaml").write_text(BASE + "test: {judge: loop.stl}\n")
+    assert not load_system_decl(folder / "judged.yaml").judges_by(folder / "cart.stl")
 
 
 def test_an_entry_that_is_nothing_takes_one_away(folder: Path) -> None:

@@ -29,7 +29,7 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
-from stlc.files import has_wildcard, matching_traces, write_atomic
+from stlc.files import has_wildcard, matching_traces, real, write_atomic
 from stlc.registry import SEMANTICS
 
 if TYPE_CHECKING:
@@ -230,14 +230,15 @@ def _expanded(names: Sequence[str], written: Sequence[Path]) -> list[str]:
         UsageError: U102, no file matches.
     """
     found: list[str] = []
-    own = {path.resolve() for path in written}
+    own = set(map(real, written))
     for name in names:
         if not has_wildcard(name):
             found.append(name)
             continue
         known = set(found)
         for match in matching_traces(name):
-            places = {Path(match).resolve(), *Path(match).resolve().parents}
+            place = real(Path(match))
+            places = {place, *place.parents}
             if match not in known and Path(match).suffix not in SPEC_SUFFIXES and own.isdisjoint(places):
                 found.append(match)
     if not found:

@@ -24,6 +24,7 @@ from stlc.dynamics.declaration.motion import Assign, JumpDecl
 from stlc.dynamics.declaration.tables import TableDecl
 from stlc.dynamics.schema.names import ControlDecl
 from stlc.escape import visible
+from stlc.files import real
 from stlc.signature import Column, Signature
 from stlc.source import Source, Span
 from stlc.units import Unit
@@ -155,7 +156,7 @@ class SystemDecl:
 
         A specification that judges closed-loop runs is compiled for recorded traces, not for plans.
         """
-        return any(judge.path.resolve() == spec.resolve() for judge in self.judges)
+        return any(real(judge.path) == real(spec) for judge in self.judges)
 
     @property
     def grid(self) -> Grid:

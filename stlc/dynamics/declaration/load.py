@@ -65,7 +65,7 @@ from stlc.dynamics.schema.record import (
     section,
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, load_node, load_yaml
-from stlc.files import beside, read_source
+from stlc.files import beside, read_source, real
 from stlc.registry import closest
 from stlc.signature import Signature
 from stlc.source import Source
@@ -350,19 +350,19 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
     source location. S209 is reported if a file cannot be read or extends itself.
     """
     sources: list[Source] = []
-    seen = {Path(reader.source.name).resolve()}
+    seen = {real(Path(reader.source.name))}
     chain = [root]
     while (node := chain[-1].get(_EXTENDS)) is not None:
         text = reader.text(node, f"`{_EXTENDS}`")
         if text is None:
             break
         path = beside(Path(node.span.source.name).parent, text)
-        if path.resolve() in seen or len(chain) > MAX_FILES:
-            again = path.resolve() in seen
+        again = real(path) in seen
+        if again or len(chain) > MAX_FILES:
             why = "leads back to itself" if again else f"goes through more than {MAX_FILES} files"
             reader.report("S209", f"`{_EXTENDS}: {text}` {why}", node.span, label="named here")
             break
-        seen.add(path.resolve())
+        seen.add(real(path))
         try:
             source = read_source(path)
             chain.append(load_yaml(source, sink=reader.findings))
