@@ -217,6 +217,13 @@ def make_run(spec: str, words: str, **facts: object) -> RunDir:
     return run
 
 
+@pytest.mark.parametrize("name", ["", ".", "/"])
+@pytest.mark.parametrize("kind", ["--spec", "--system"])
+def test_a_file_without_a_name_is_a_usage_error(kind, name, capsys):
+    assert main(["init", kind, name]) == 2
+    assert "cannot be a name" in capsys.readouterr().err
+
+
 def test_runs_are_listed_sorted_and_compared(capsys):
     make_run("cart", "good", started="2026-01-01", result={"accuracy": 0.9, "seconds": 10.0})
     make_run("cart", "bad", started="2026-01-02", result={"accuracy": 0.2, "seconds": 10.0}, seed=3)

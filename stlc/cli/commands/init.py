@@ -230,7 +230,7 @@ def _path(folder: Path, name: str, kind: str, suffix: str) -> Path:
     from stlc.grammar.words import BUILT_IN, RESERVED
 
     given = Path(name)
-    path = given if given.suffix in (suffix, ".stlc", ".yml") else given.with_name(f"{given.name}{suffix}")
+    path = given if given.suffix in (suffix, ".stlc", ".yml") else given.parent / f"{given.name}{suffix}"
     if not _NAME.fullmatch(path.stem) or path.stem in RESERVED or path.stem in BUILT_IN:
         advice = ("letters, digits and `_`, none of the words of the language",)
         raise usage(f"`{path.stem}` cannot be a name", *advice)
