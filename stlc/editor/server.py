@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,12 @@ class PositionMapper:
         return self._ends[place.line]
 
 
+@lru_cache(maxsize=16)
+def mapper_of(text: str, codec: PositionCodec) -> PositionMapper:
+    """Mapper of a text; one for all places in it, since finding the lines takes time in a long text."""
+    return PositionMapper(text, codec)
+
+
 class Server(LanguageServer):
     """Language server that stores an analysis of every open specification, renewed after each change."""
 
@@ -97,11 +104,11 @@ class Server(LanguageServer):
 
     def offset(self, document: Document, position: lsp.Position) -> int:
         """Return the character offset of a position that the editor sent."""
-        return PositionMapper(document.source.text, self.workspace.position_codec).offset(position)
+        return mapper_of(document.source.text, self.workspace.position_codec).offset(position)
 
     def range(self, span: Span) -> lsp.Range:
         """Convert a source location to a range (start and end) of the language server protocol (LSP)."""
-        layout = PositionMapper(span.source.text, self.workspace.position_codec)
+        layout = mapper_of(span.source.text, self.workspace.position_codec)
         return lsp.Range(layout.place(span.start), layout.place(span.end))
 
     def location(self, span: Span) -> lsp.Location:

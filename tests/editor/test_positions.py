@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from lsprotocol.types import Position
 from pygls.workspace import PositionCodec
 
-from stlc.editor.server import PositionMapper
+from stlc.editor.server import PositionMapper, mapper_of
 
 UTF_16 = PositionCodec("utf-16")
 TEXTS = st.text(alphabet="ab \t\r\né€😀\u2028", max_size=30)
@@ -44,3 +44,9 @@ def test_back_and_forth(text, encoding):
     for offset in range(len(text) + 1):
         if text[offset - 1 : offset + 1] != "\r\n":  # no editor stands inside of a break
             assert layout.offset(layout.place(offset)) == offset
+
+
+def test_the_lines_of_a_text_are_found_once():
+    text = "signal x\n" * 3
+    assert mapper_of(text, UTF_16) is mapper_of(text, UTF_16)
+    assert mapper_of("😀b", UTF_16).place(2) != mapper_of("😀b", PositionCodec("utf-8")).place(2)
