@@ -240,6 +240,18 @@ def test_runs_are_listed_sorted_and_compared(capsys):
     assert facts == {"seed": ["0", "3"], "result.accuracy": ["0.9", "0.2"]}
 
 
+@pytest.mark.parametrize("value", ["NaN", "1e999", "1" + "0" * 400, '"x"'])
+def test_a_result_that_is_no_finite_number_is_left_out(value, capsys):
+    make_run("cart", "good", result={"accuracy": 0.5, "seconds": 1.0})
+    odd = make_run("cart", "odd")
+    (odd.path / "run.json").write_text(f'{{"result": {{"accuracy": {value}, "seconds": {value}}}}}')
+    assert main(["runs", "list", "--sort", "acc"]) == 0
+    capsys.readouterr()
+    assert main(["runs", "list", "--sort", "acc", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["result"]["runs"]
+    assert [row["accuracy"] for row in rows] == [None, 0.5]
+
+
 def test_the_links_follow_when_a_run_is_removed(capsys):
     make_run("cart", "first")
     make_run("cart", "second")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -156,9 +158,16 @@ def _accuracy(record: Mapping[str, Any]) -> float | None:
     The accuracy is the share of validation states (never used in training) for which the plan of the policy
     satisfies the specification.
     """
+    return _result(record, "accuracy")
+
+
+def _result(record: Mapping[str, Any], name: str) -> float | None:
+    """Entry `name` of the result in the record of a run; None if it is not there, or is no finite number."""
     result = record.get("result")
-    value = result.get("accuracy") if isinstance(result, Mapping) else None
-    return float(value) if isinstance(value, int | float) else None
+    value = result.get(name) if isinstance(result, Mapping) else None
+    with suppress(OverflowError):
+        return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+    return None
 
 
 def _cells(run: RunDir, record: Mapping[str, Any], status: str) -> tuple[str, ...]:
@@ -166,15 +175,14 @@ def _cells(run: RunDir, record: Mapping[str, Any], status: str) -> tuple[str, ..
 
     `record` is the content of `run.json`, and `status` the status of the run.
     """
-    accuracy, result = _accuracy(record), record.get("result")
-    seconds = result.get("seconds") if isinstance(result, Mapping) else None
+    accuracy, seconds = _accuracy(record), _result(record, "seconds")
     return (
         f"{run.path.parent.name}/{run.name}",
         Path(str(record.get("system_path", ""))).name,
         status,
         "" if accuracy is None else f"{accuracy:.4f}",
         str(record.get("steps") or ""),
-        f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
+        "" if seconds is None else f"{seconds:.0f} s",
         str(record.get("started", "")),
     )
 
