@@ -16,7 +16,8 @@ from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.parameters import fixed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.traverse import nodes
+from stlc.compile.ir.support import columns
+from stlc.compile.ir.traverse import is_state, nodes
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import Hard, Switch
@@ -27,6 +28,7 @@ from stlc.native import check_plans
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from stlc.compile.ir import nodes as ir
     from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.compile.schedule.schedule import End
     from stlc.dynamics.model.system import System
@@ -99,6 +101,16 @@ def satisfied(rho: Tensor) -> Tensor:
     return rho >= -slack
 
 
+def _on_starts(compiled: Compiled, system: System) -> dict[str, ir.Formula]:
+    """Assumptions that restrict the initial state alone: text for messages -> condition on its columns."""
+    known = {*system.decl.signature.names}
+    return {
+        f"assume {rule.name}": rule.formula
+        for rule in compiled.assumptions
+        if is_state(rule.typed.formula) and columns(rule.formula) <= known
+    }
+
+
 class Task:
     """A specification compiled for a system: the problem for which a policy is trained.
 
@@ -106,7 +118,8 @@ class Task:
         compiled: the specification in discrete time, with the timers and parameters that it adds to the
             state.
         plain: the system of the system file, without these timers and parameters.
-        system: the system whose last states are the timers and parameters of the specification.
+        system: the system whose last states are the timers and parameters of the specification, and whose
+            initial states satisfy its assumptions on them.
         graph: function that computes the robustness of the whole specification.
         safety: function that computes the robustness of phi_safe (the requirements tagged `@safety`).
     """
@@ -114,6 +127,8 @@ class Task:
     def __init__(self, compiled: Compiled, system: System) -> None:
         self.compiled = compiled
         self.plain = system
+        if conditions := _on_starts(compiled, system):
+            system = system.assuming(conditions)
         added = compiled.timers, compiled.parameters
         self.system = system.augmented(*added) if any(added) else system
         self.graph = RobustnessGraph(compiled.requirements, self.system.signature, end=compiled.end)

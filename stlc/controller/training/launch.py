@@ -62,7 +62,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
         MissingError: R201, the folder cannot be written.
         UsageError: U101, an option is refused.
     """
-    decl, launch = task.system.decl, launch or Launch()
+    decl, launch = task.plain.decl, launch or Launch()
     resolved = resolve_config(task, config)  # before the folder: a refused option leaves no run behind
     folder = RunDir.create(launch.root, task.compiled.name, launch.name)
     folder.update(

@@ -94,6 +94,16 @@ class System:
         """
         return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
 
+    def assuming(self, conditions: Mapping[str, ir.Formula]) -> System:
+        """Return the same system with further conditions on the initial states that it draws.
+
+        `conditions`: text for messages -> condition on the columns of the system file.
+        """
+        init = self.decl.init
+        where = (*init.where, *conditions.values())
+        init = replace(init, where=where, where_text=(*init.where_text, *conditions))
+        return System(replace(self.decl, init=init), self.timers, self.parameters)
+
     def interface(self) -> Interface:
         """The interface that specifications are compiled against, with external functions loaded.
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import stlc
 from stlc.controller.problem.task import Task, rank, satisfied
 
 
@@ -92,3 +95,23 @@ def test_plans_of_any_length_are_rolled_out_as_the_system_says(car_task: Task, s
     if length:
         car_task.rollout(x0, u).sum().backward()
         assert u.grad is not None
+
+
+def test_initial_states_satisfy_the_assumptions_on_them(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(
+        "stlc: 1\nname: s\ntime: {dt: 1 s, horizon: 3}\nstate: {x: {}, n: {}}\n"
+        "control: {a: {range: [-1, 1]}}\nflow: {x: a}\n"
+        'init: {mixture: [{draw: {x: "uniform(-1, 1)", n: "uniform(-2, 2)"}}], where: [x < 0.5]}\n'
+    )
+    (tmp_path / "s.stl").write_text(
+        'system "s.yaml"\nsignal x\nsignal n\nparam r: real in [0, 1]\n'
+        "assume right: x >= 0 and n < 1\nassume later: always[0 s, 1 s] n > -1\nassume reached: x < r\n"
+        "require close: always x < 5\n"
+    )
+    system = stlc.System.load(tmp_path / "s.yaml")
+    task = stlc.compile(stlc.load(tmp_path / "s.stl"), system)
+    x, n, _ = task.sample(500, seed=0).unbind(1)
+    assert 0.0 <= float(x.min()) < 0.1 < 0.4 < float(x.max()) < 0.5
+    assert -2.0 <= float(n.min()) < -1.5 < 0.9 < float(n.max()) < 1.0  # the future of n is not drawn
+    assert task.system.decl.init.where_text == ("x < 0.5", "assume right")
+    assert float(system.sample(500, seed=0)[:, 0].min()) < -0.9
