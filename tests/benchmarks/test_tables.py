@@ -124,6 +124,7 @@ def test_results_that_cannot_be_read_are_not_overwritten(text: str, tmp_path: Pa
     assert store.path.read_text() == text
 
 
+@pytest.mark.apart
 def test_processes_that_store_at_the_same_time_keep_all_results(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from benchmarks.store import Key, ResultStore\n"

@@ -138,6 +138,9 @@ def test_what_policies_see_and_what_is_shown(make: Make) -> None:
     [
         ("held: {u: {value: prev(u) + x}}", "S102"),
         ("held: {u: {value: u + x}}", "S202"),
+        ("control: {a: {range: [-1, 1]}}\nheld: {u: {value: x / (1 m) + a}}", "S202"),
+        ("control: {a: {range: [-1, 1]}}\nheld: {u: {value: prev(a)}}", "S202"),
+        ("control: {a: {range: [-1, 1]}}\ndelay: {d: {of: a, by: 0.2 s}}", "S202"),
         ("held: {a: {value: b}, b: {value: a}}", "S202"),
         ("held: {u: {value: next(x)}}", "S201"),
         ("held: {u: {value: 'always[0 s, 1 s] x > 0 m'}}", "S201"),

@@ -18,7 +18,7 @@ from stlc.dynamics.declaration.columns import (
 )
 from stlc.dynamics.declaration.motion import Assign, state_assigns
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
-from stlc.dynamics.model.algebra import add, multiply, total
+from stlc.dynamics.model.algebra import add, multiply, names_in, total
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
@@ -179,10 +179,25 @@ def read_held(section: HeldSection, cx: Context) -> Sampled:
         parts = _delayed(delay, replace(cx, here=here))
         cells |= {each.column.name: each for each in parts.cells}
         late, flow = late + parts.hidden, flow + parts.flow
+    cells = {name: _without_controls(cell, cx) for name, cell in cells.items()}
     past = _Past(cells, cx)
     initial = tuple(Assign(name, past.at_start(cell), cell.text) for name, cell in cells.items())
     updates = tuple(Assign(name, past.later(cell), cell.text) for name, cell in cells.items())
     return section.ticks + Sampled((), initial, updates, flow, late) + past.kept()
+
+
+def _without_controls(cell: _Held, cx: Context) -> _Held:
+    """Return a column whose value depends on no control; if it does, report S202, and return a constant.
+
+    Values are computed before controls are chosen.
+    """
+    read = names_in(cell.value) | (frozenset() if cell.before is None else names_in(cell.before))
+    found = {control.name for control in cx.names.controls} & {name.split(ir.BEFORE)[0] for name in read}
+    if not found:
+        return cell
+    message = f"`{base_name(cell.column.name)}` is computed before the control `{min(found)}` is chosen"
+    cx.reader.report("S202", message, cell.span, "read the control in `flow`")
+    return replace(cell, value=ir.Const(0.0), before=None)
 
 
 @dataclass(frozen=True, slots=True)
