@@ -48,6 +48,7 @@ class Exported:
     Attributes:
         folder: folder of the written files.
         files: names of the files.
+        kept: names of example files that were there already and differ, so that they were left as they are.
         agreement: comparison with the run; None if the export could not be verified.
         latency: decision time of the Python runtime; None if it was not measured.
         unchecked: reason why the export could not be verified; "" if it was verified.
@@ -58,6 +59,7 @@ class Exported:
     agreement: Agreement | None
     latency: Latency | None = None
     unchecked: str = ""
+    kept: tuple[str, ...] = ()
 
 
 def target_of(word: str) -> Target:
@@ -79,7 +81,7 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
     Args:
         run: a run with a checkpoint.
         target: the form of the export.
-        folder: destination; existing files of the same names are replaced.
+        folder: destination; existing files of the same names are replaced, except for those in `EXAMPLES`.
 
     Raises:
         RunError: R105, the export disagrees with the run; nothing is written.
@@ -92,14 +94,23 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
             (found, latency), unchecked = _WRITERS[target](run, beside), ""
         except Unchecked as why:
             found, latency, unchecked = None, None, why.why
-        files = tuple(sorted(path.name for path in beside.iterdir() if path.name != BUILT))
+        texts = {path.name: path.read_bytes() for path in sorted(beside.iterdir()) if path.name != BUILT}
         folder.mkdir(parents=True, exist_ok=True)
-        for each in files:
-            write_atomic(folder / each, (beside / each).read_bytes())
-    return Exported(folder, files, found, latency, unchecked)
+        kept = tuple(name for name in EXAMPLES if name in texts and _differs(folder / name, texts[name]))
+        files = tuple(name for name in texts if name not in kept)
+        for name in files:
+            write_atomic(folder / name, texts[name])
+    return Exported(folder, files, found, latency, unchecked, kept)
+
+
+def _differs(path: Path, content: bytes) -> bool:
+    """True if there is something else than `content` at `path`."""
+    return path.exists() and not (path.is_file() and path.read_bytes() == content)
 
 
 BUILT = "checked"
+EXAMPLES = ("main.c", "Makefile")
+"""Files that show how the others are used, and that a user changes."""
 Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 

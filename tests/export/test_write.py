@@ -247,5 +247,14 @@ def test_the_command_writes_beside_the_run(
         assert misfits(document, load_schema("export/1")) == []
         assert sorted(path.name for path in (tmp_path / target).iterdir()) == document["result"]["files"]
         assert (document["result"]["latency"] is not None) == (target == "onnx")
+    folder = tmp_path / "c"
+    (folder / "main.c").write_text("int main(void) { return 0; }\n")
+    (folder / "stlc_weights.h").write_text("old")
+    assert main(["export", "--to", "c", "--json", "-o", str(folder)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["result"]["kept"] == ["main.c"]
+    assert document["result"]["files"] == ["Makefile", "stlc_controller.h", "stlc_weights.h"]
+    assert (folder / "main.c").read_text() == "int main(void) { return 0; }\n"
+    assert (folder / "stlc_weights.h").read_text() != "old"
     assert main(["export", "--to", "onnx", "-o", str(tmp_path / "again")]) == 0
     assert "decides in" in capsys.readouterr().err

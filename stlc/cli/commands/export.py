@@ -31,7 +31,8 @@ def export(
     `torch` is a torch.export program that maps states to plans and their robustness. `c` is a C99 header with
     an example program. It depends only on libm, and includes the backup policy. `onnx` is a set of graphs for
     onnxruntime, which `stlc.runtime` runs without torch. It includes the backup policy, too. For random
-    states, the results of every export are compared with those of the run.
+    states, the results of every export are compared with those of the run. Files of an earlier export are
+    replaced; an example program that was changed since is kept.
     """
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write
@@ -58,6 +59,8 @@ def export(
             )
         for name in done.files:
             emit(visible(str(shown / name)))
+        for name in done.kept:
+            say(f"kept {visible(str(shown / name))}, which was there and differs")
 
     return Answer(
         {
@@ -65,6 +68,7 @@ def export(
             "target": target,
             "folder": str(shown),
             "files": list(done.files),
+            "kept": list(done.kept),
             "checked": None if found is None else record(ExportCheck, found),
             "latency": None if taken is None else {"median_ms": taken.median, "p99_ms": taken.p99},
         },

@@ -312,6 +312,7 @@ class ExportedRun(TypedDict):
     target: Literal["torch", "c", "onnx"]
     folder: str
     files: list[str]
+    kept: list[str]
     checked: ExportCheck | None
     latency: ExportLatency | None
 
