@@ -341,11 +341,12 @@ def alone_in(folder: Path, *, wait: bool = False) -> Iterator[bool]:
         folder: the folder, which exists.
         wait: whether to wait until the other process has left; then True is yielded.
     """
-    try:
+    descriptor = None
+    with suppress(ImportError, OSError):
         import fcntl
 
         descriptor = os.open(folder, os.O_RDONLY)
-    except (ImportError, OSError):
+    if descriptor is None:
         yield True
         return
     try:

@@ -141,9 +141,15 @@ def rules_at(
     """
     sides = [_sides(rule, record) for rule in rules]
     if any(sides):
-        pairs = [side or (rule, rule) for rule, side in zip(rules, sides, strict=True)]
-        least, most = (rules_at(each, record.sure, at, horizon, end) for each in zip(*pairs, strict=True))
-        return [_agreed(*pair, record, end) for pair in zip(least, most, strict=True)]
+        pairs = [side for side in sides if side is not None]
+        others = [rule for rule, side in zip(rules, sides, strict=True) if side is None]
+        least, most, known = (
+            iter(rules_at(each, record.sure, at, horizon, end))
+            for each in (*zip(*pairs, strict=True), others)
+        )
+        return [
+            next(known) if side is None else _agreed(next(least), next(most), record, end) for side in sides
+        ]
     starts_of_all = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at) for rule in rules]
     formulas = [rule.under(record.semantics) for rule in rules]
     together = [

@@ -57,6 +57,13 @@ def test_pieces_of_several_traces_are_not_taken_for_one(tmp_path: Path, group: s
         assert caught.value.diagnostics[0].code == "E605"
 
 
+def test_pieces_of_traces_whose_names_are_cut(tmp_path: Path) -> None:
+    rows = [f"{'a' * 64}{k // 2},{k}" for k in range(4)]
+    (tmp_path / "a.csv").write_text("\n".join(["trace,x", *rows]))
+    with pytest.raises(TraceError, match="names of 64 letters"):
+        list(pieces(tmp_path / "a.csv", 2, Reading(dt=1.0)))
+
+
 def test_pieces_of_one_trace_that_has_a_name(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("trace,x\n7,0\n7,1\n7.0,2\n")
     parts = list(pieces(tmp_path / "a.csv", 2, Reading(dt=1.0)))

@@ -32,7 +32,7 @@ def export(
     an example program. It depends only on libm, and includes the backup policy. `onnx` is a set of graphs for
     onnxruntime, which `stlc.runtime` runs without torch. It includes the backup policy, too. For random
     states, the results of every export are compared with those of the run. Files of an earlier export are
-    replaced; an example program that was changed since is kept.
+    replaced, but a different `main.c` or `Makefile` is kept.
     """
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write

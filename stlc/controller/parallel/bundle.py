@@ -149,12 +149,14 @@ def _replace(run: RunDir, files: bytes) -> None:
     """
     beside = run.path.with_name(f".{run.name}.received")
     shutil.rmtree(beside, ignore_errors=True)
-    unpack(files, beside)
-    moves = [(path, run.path / path.relative_to(beside)) for path in beside.rglob("*") if path.is_file()]
-    for path, target in sorted(moves, key=lambda move: (move[1].name == RECORD, move[1].exists())):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        path.replace(target)
-    shutil.rmtree(beside)
+    try:
+        unpack(files, beside)
+        moves = [(path, run.path / path.relative_to(beside)) for path in beside.rglob("*") if path.is_file()]
+        for path, target in sorted(moves, key=lambda move: (move[1].name == RECORD, move[1].exists())):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            path.replace(target)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 # ---------------------------------------------------------------------- worker

@@ -97,6 +97,8 @@ def of_table(
     """
     group = group_among(table.columns)
     arrays = {name: values for name, values in table.columns.items() if name != group}
+    if group is not None:
+        _require_whole_names(path, group, table.columns[group])
     if group is not None and only is not None:
         for key in np.unique(table.columns[group]):
             only.require(group, key)
@@ -145,18 +147,22 @@ def clock_scale(trace: str, name: str, unit: str) -> float:
     return float(time.scale)
 
 
+def _require_whole_names(path: Path, group: str, keys: Array) -> None:
+    """Raise TraceError (E605) if names of traces in the column `group` may have been cut to equal ones."""
+    if keys.dtype.kind == "U" and (np.char.str_len(keys) >= MAX_LETTERS).any():
+        message = f"the traces in `{path}` have names of {MAX_LETTERS} letters or more in `{group}`"
+        raise TraceError(Diagnostic("E605", message, help=("number them",)))
+
+
 def _grouped(path: Path, columns: dict[str, Array], group: str, keys: Array) -> dict[str, Array]:
     """Reshape columns (lines,) to (traces, samples).
 
     The column `group` identifies the trace of each line; `keys` contains its values.
 
     Raises:
-        TraceError: E605, traces differ in length, or their names may have been cut.
+        TraceError: E605, traces differ in length.
     """
     labels, sizes = np.unique(keys, return_counts=True)
-    if labels.dtype.kind == "U" and (np.char.str_len(labels) >= MAX_LETTERS).any():
-        message = f"the traces in `{path}` have names of {MAX_LETTERS} letters or more in `{group}`"
-        raise TraceError(Diagnostic("E605", message, help=("number them",)))
     if len(set(sizes.tolist())) > 1:
         i = int(np.argmax(sizes != sizes[0]))
         message = (
