@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.small_systems import moved_by_steps
 
 from stlc.assurance.campaign import BATCH, FIRST, SEED, Campaign, campaign
 from stlc.assurance.certificate import Claim, Judged, Sample
@@ -33,22 +34,6 @@ from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
 SMALL = {"test.steps": "30", "test.agents": "4", "test.world": "null"}
-
-
-CART = """
-stlc: 1
-name: cart
-time: {dt: 1 s, horizon: 6 steps, discrete: true}
-state:
-  x: {range: [-9, 99]}
-control:
-  u: {range: [-1, 1]}
-flow:
-  x: x + u
-init:
-  mixture:
-    - draw: {x: "uniform(0, 1)"}
-"""
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +85,7 @@ def test_drives_are_judged_as_deployments_are(run: Run) -> None:
 def test_a_drive_that_ends_before_a_window_may_be_undecided(
     tmp_path: Path, formula: str, values: list[float], satisfied: bool, violated: bool, least: float
 ) -> None:
-    (tmp_path / "cart.yaml").write_text(CART)
+    (tmp_path / "cart.yaml").write_text(moved_by_steps("cart", "uniform(0, 1)", horizon=6))
     spec = parse(Source("cart.stl", f"signal x\nrequire r: {formula}"))
     task = Task.of(spec, System.load(tmp_path / "cart.yaml"))
     states = np.zeros((2, 4, len(task.system.names)))

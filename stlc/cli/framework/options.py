@@ -12,6 +12,7 @@ import typer
 
 from stlc.cli.framework.completion import requirement_names, run_names
 from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.files import real
 from stlc.registry import GUARDS, PLANNERS
 
 if TYPE_CHECKING:
@@ -183,15 +184,15 @@ def require_separate(
 
 
 def _identity(path: Path | str | None) -> object:
-    """What is equal for two paths of one file; None for no file, such as a folder, a device or `-`."""
+    """Key of a file, equal for all its paths; None for no file, such as a folder, a device or `-`."""
     if path is None or str(path) == STDIN:
         return None
     try:
-        target = Path(path).resolve()
+        target = real(Path(path))
         found = target.stat()
     except FileNotFoundError:
         return target
-    except (OSError, ValueError, RuntimeError):  # no path: reading or writing it says why
+    except (OSError, ValueError):  # no path: reading or writing it says why
         return None
     return (found.st_dev, found.st_ino) if stat.S_ISREG(found.st_mode) else None
 

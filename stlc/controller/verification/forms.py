@@ -138,7 +138,7 @@ Operand: TypeAlias = Forms | float
 
 
 def _unbounded(low: Floats, high: Floats) -> tuple[Bools, Floats, Floats]:
-    """Which intervals have finite ends, and the ends: of the others NaN if one of them is, else infinite."""
+    """Mask of intervals with finite ends, and the ends; of others NaN if one of them is, else infinite."""
     finite = np.isfinite(low) & np.isfinite(high)
     if finite.all():
         return finite, low, high

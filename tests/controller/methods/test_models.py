@@ -161,7 +161,7 @@ def test_an_unlearnt_reward_ends_the_training_as_diverged(car_task: Task) -> Non
 
 @pytest.mark.parametrize("lr", [1e4, 1e8, 1e12])
 def test_weights_of_a_diverged_step_are_not_saved(car_task: Task, lr: float) -> None:
-    """Whether the loss shows it at once, or only the weights do, or no imagined transition is finite."""
+    """The loss shows it at once, or only the weights do, or no imagined transition is finite."""
     learner = learner_of(car_task, "mbpo", lr=lr, updates=0.02)
     for _ in range(8):
         if math.isnan(learner.advance()):

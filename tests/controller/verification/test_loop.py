@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.small_policies import half_seen_task
+from helpers.small_systems import moved_by_steps
 
 from stlc.cli.framework.app import main
 from stlc.controller.problem.load import load_task
@@ -161,26 +162,11 @@ def test_a_closed_loop_on_the_command_line(tmp_path: Path, capsys: pytest.Captur
     assert main(["verify", "latest", "--period", "0.1s"]) == 2
 
 
-TWO_PLACES = """
-stlc: 1
-name: two_places
-time: {dt: 1 s, horizon: 1 steps, discrete: true}
-state:
-  x: {range: [-9, 9]}
-control:
-  u: {range: [-1, 1]}
-flow:
-  x: x + u
-init:
-  mixture:
-    - draw: {x: "choice(uniform(0, 1), uniform(5, 6))"}
-"""
-
-
 def test_ways_to_draw_a_state_may_have_equal_names(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "two_places.yaml").write_text(TWO_PLACES)
+    system = moved_by_steps("two_places", "choice(uniform(0, 1), uniform(5, 6))")
+    (tmp_path / "two_places.yaml").write_text(system)
     spec = tmp_path / "two_places.stl"
     spec.write_text('system "two_places.yaml"\nsignal x\nrequire r: always[0 s, 1 s] x > 3\n')
     still = [NetworkLayer(np.zeros((1, 1)), np.zeros(1), "tanh"), NetworkLayer(np.zeros((1, 1)), np.zeros(1))]
