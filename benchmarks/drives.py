@@ -35,8 +35,8 @@ from stlc.diagnostics import UsageError
 from stlc.provenance import sha256
 
 GUARDS: tuple[Mode, ...] = ("none", "paper")
-DECISIONS = 60
-"""Number of decisions that are timed, each for one agent."""
+DECISIONS, LEAST_DECISIONS, TIMING = 60, 5, 60.0
+"""Number of decisions that are timed, each for one agent; fewer, if they take longer than so many seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +141,13 @@ def drive(cell: Drive) -> Result:
 def _timed(guard: Guard, recording: DeploymentRecording) -> Times:
     """Measure the processor time of single decisions, in states that are evenly chosen from the recording."""
     rows, steps = recording.actions.shape[:2]
-    picked = np.unique(np.linspace(0, rows * steps - 1, DECISIONS).astype(int))
-    seconds = []
+    picked = np.random.default_rng(0).permutation(
+        np.unique(np.linspace(0, rows * steps - 1, DECISIONS).astype(int))
+    )
+    seconds: list[float] = []
     for row, step in zip(picked // steps, picked % steps, strict=True):
+        if sum(seconds) > TIMING and len(seconds) >= LEAST_DECISIONS:
+            break
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
         previous = guard.decide(before).later()
         begin = process_time()

@@ -334,6 +334,13 @@ def test_a_drive_is_stored_with_guard_and_size(tmp_path: Path) -> None:
         assert result["decision"]["median"] <= result["decision"]["p99"]
 
 
+def test_slow_decisions_are_timed_less_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.drives.TIMING", 0.0)
+    cells = [Drive(tiny(), "none", (0,), agents=2, steps=6)]
+    (result,) = driven(cells, ResultStore("drives", tmp_path)).results
+    assert result["decision"]["samples"] == 5  # of 12
+
+
 def test_a_drive_depends_on_its_world_and_its_backup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cell = Drive(tiny(), "paper", (0,), agents=2, steps=3)
     (result,) = driven([cell], ResultStore("drives", tmp_path)).results
