@@ -79,9 +79,12 @@ FINER = {
     "f16": (),
 }
 """Inputs of instance 1, which the tool chooses."""
-THIRTEENTHS = ("inputs.throttle.pieces", "13"), ("inputs.brake.pieces", "13")
-OWN = {**dict.fromkeys(("AT6a", "AT6b", "AT6c", "AT6abc"), ()), **dict.fromkeys(("CC5", "CCx"), THIRTEENTHS)}
-"""Inputs of instance 1 for single requirements: those of the file for AT6, and 13 constant pieces."""
+OWN: dict[str, tuple[tuple[str, str], ...]] = {
+    **dict.fromkeys(("AT6a", "AT6b", "AT6c", "AT6abc"), ()),
+    "CC5": (("inputs.throttle.pieces", "13"), ("inputs.brake.pieces", "3")),
+    "CCx": (("inputs.throttle.pieces", "13"), ("inputs.brake.pieces", "13")),
+}
+"""Inputs of instance 1 for single requirements: as in the file for AT6; constant pieces for CC5 and CCx."""
 PRESCRIBED = {"fuel_control_power": (("inputs.throttle.range", "[61.201, 81.2]"),)}
 """Inputs of instance 2 where they are not those of the file.
 

@@ -18,6 +18,7 @@ from stlc.assurance.strategies import (
     CovarianceAdaptation,
     GradientVertices,
     HillClimbing,
+    InputVertices,
     PeriodicInputs,
     Perturbation,
     Strategy,
@@ -92,8 +93,11 @@ class Portfolio:
         surrogate = SurrogateSearch(space, generator)
         self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
         self._guided = not random and not space.sparse and graded and space.dim > 0
-        uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
-        self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
+        uniform, even = UniformSampling(space, generator), VertexSampling(space, generator)
+        several = self._guided and not space.small and len(space.blocks) > 1
+        vertices = InputVertices(space, generator) if several else even
+        self._vertices: tuple[Strategy, Strategy] = even, vertices
+        self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, even]
         self._samplers: list[Strategy] = [vertices, uniform]
         if self._guided and any(len(block.values) > max(PIECES) for block in space.blocks):
             coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
@@ -119,28 +123,24 @@ class Portfolio:
                 else:
                     self._others.append(adaptation)
             constant = ConstantVertices(space, generator)
-            self._first.extend(self._opening(space, constant, vertices, perturbation, climb))
+            self._first.extend(self._opening(space, constant, perturbation, climb))
         elif not random and not graded:
-            self._blind = [*[uniform] * (BLIND_TURNS - 1), vertices]
-            self._first.append(_Opening(vertices, BLIND))
+            self._blind = [*[uniform] * (BLIND_TURNS - 1), even]
+            self._first.append(_Opening(even, BLIND))
         self._turn = 0
         self._values: deque[float] = deque(maxlen=FLAT_VALUES)
 
     def _opening(
-        self,
-        space: SearchSpace,
-        constant: Strategy,
-        vertices: Strategy,
-        perturbation: Strategy,
-        climb: Strategy,
+        self, space: SearchSpace, constant: Strategy, perturbation: Strategy, climb: Strategy
     ) -> Sequence[_Opening]:
         """Points with which a guided search begins."""
+        even, vertices = self._vertices
         if space.small:
             uniform = _Opening(self._samplers[-1], SMALL_OPENING)
-            return _Opening(vertices, 2), _Opening(constant, None), uniform, _Opening(climb, None)
+            return _Opening(even, 2), _Opening(constant, None), uniform, _Opening(climb, None)
         drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
         return (
-            *(_Opening(vertices, 2), _Opening(constant, 2), _Opening(vertices, 5), _Opening(constant, None)),
+            *(_Opening(even, 2), _Opening(constant, 2), _Opening(vertices, 5), _Opening(constant, None)),
             *(_Opening(perturbation, PERTURBATIONS), *drawn[:4], _Opening(climb, None), *drawn[4:]),
         )
 

@@ -114,6 +114,30 @@ class VertexSampling(Strategy):
         return _values(self.space, self.generator, np.arange(self.space.dim), ENDS)
 
 
+class InputVertices(VertexSampling):
+    """Vertices at which each input has its own share of values at the high end, drawn for each point.
+
+    So there are points at which one input is high nearly always and another one hardly ever. At every second
+    point a third of the values is uniform between the ends.
+    """
+
+    name = "input vertices"
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._proposed = 0
+
+    def propose(self) -> Point:
+        self._proposed += 1
+        ends = 1.0 if self._proposed % 2 else ENDS
+        point = _values(self.space, self.generator, np.arange(self.space.dim), ends)
+        for block in self.space.blocks:
+            share = self.generator.random()
+            at_end, high, drawn = self.generator.random((3, len(block.values)))
+            point[list(block.values)] = np.where(at_end < ends, high < share, drawn)
+        return point
+
+
 class CoarseSampling(Strategy):
     """Inputs of a few long pieces with uniform values."""
 

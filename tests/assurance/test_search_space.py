@@ -15,6 +15,7 @@ from stlc.assurance.strategies import (
     CovarianceAdaptation,
     GradientVertices,
     HillClimbing,
+    InputVertices,
     PeriodicInputs,
     Perturbation,
     VertexSampling,
@@ -232,3 +233,23 @@ def test_coverage_of_a_grid_is_one_and_of_a_point_small():
     assert coverage(np.zeros((0, 2))) == 0.0
     assert coverage(np.zeros((3, 0))) == 1.0
     assert coverage(np.array([[0.0], [0.9]])) == 0.5
+
+
+def test_vertices_of_inputs_differ_in_the_share_of_high_values():
+    blocks = (
+        SignalBlock("throttle", tuple(range(40)), fractions=tuple(np.arange(40) / 40)),
+        SignalBlock("brake", tuple(range(40, 80)), tuple(range(80, 119))),
+    )
+    space = SearchSpace(121, blocks)  # the last two coordinates belong to no input
+    drawn = InputVertices(space, np.random.default_rng(3))
+    points = np.stack([drawn.propose() for _ in range(400)])
+    assert 0.0 <= points.min() <= points.max() <= 1.0
+    values, times, rest = points[:, :80], points[:, 80:119], points[:, 119:]
+    at_end = (values == 0.0) | (values == 1.0)
+    assert at_end[::2].all()  # every second point is a vertex
+    assert at_end[1::2].mean() == pytest.approx(2 / 3, abs=0.02)
+    assert ((times > 0.0) & (times < 1.0)).all()  # switching times are never at an end
+    assert set(np.unique(rest[::2])) == {0.0, 1.0}
+    shares = values[::2].reshape(200, 2, 40).mean(2)  # of each input at each point
+    assert shares.std(0) == pytest.approx([12**-0.5] * 2, abs=0.04)  # uniform, rather than around 1/2
+    assert abs(np.corrcoef(shares.T)[0, 1]) < 0.2

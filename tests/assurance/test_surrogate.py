@@ -125,10 +125,8 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
         names.append(proposal.strategy.name)
         points.append(proposal.point)
         portfolio.tell(proposal, float(index % 7))
-    assert (
-        names[:11]
-        == ["vertices"] * 2 + ["constant vertices"] * 2 + ["vertices"] * 5 + ["constant vertices"] * 2
-    )
+    constant = ["constant vertices"] * 2
+    assert names[:11] == ["vertices"] * 2 + constant + ["input vertices"] * 5 + constant
     assert names[11:15] == ["perturbation"] * 4
     assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
     for surrogate in ("surrogate", "trust region"):
