@@ -103,8 +103,12 @@ class PetsPolicy(Policy):
 
     @torch.no_grad()
     def continuation(self, x0: Tensor) -> Tensor:
-        """Plans found quickly, by a single round of one search over the whole plan: (B, n) -> (B, T, m)."""
-        other = PetsPolicy(self.task, self._model, replace(self._config, ahead=0, rounds=1))
+        """Plans found quickly: (B, n) -> (B, T, m).
+
+        One search covers the whole plan, in a single round and with one particle per control sequence.
+        """
+        quick = replace(self._config, ahead=0, rounds=1, particles=1)
+        other = PetsPolicy(self.task, self._model, quick)
         generator = torch.Generator().manual_seed(self._config.seed)
         return other.sequence(x0.float(), generator).to(x0)
 
