@@ -26,7 +26,7 @@ from stlc.assurance.strategies import GradientVertices
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
-FALSIFIER_VERSION = 7
+FALSIFIER_VERSION = 8
 """Version of the search; results of older versions are recomputed."""
 CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""
@@ -155,7 +155,7 @@ class ViolationSearch:
             self._count(points, outcome, told)
         if outcome.sizes.shape[1] == 0:
             self.focus = Focus(self._requirement, self.focus.scales)
-            self._teach(outcome.admissible, told)
+            self._teach(outcome, told)
             return
         self._first += self._open
         self._sizes.append(outcome.sizes)
@@ -172,9 +172,10 @@ class ViolationSearch:
         self._counts[GradientVertices.name] += 1
         return found[list(self._part.coordinates)]
 
-    def _teach(self, admissible: NDArray[np.bool_], told: NDArray[np.float64]) -> None:
+    def _teach(self, outcome: Simulations, told: NDArray[np.float64]) -> None:
         for index, each in enumerate(self._open):
-            self._portfolio.tell(each, float(told[index]) if admissible[index] else math.inf)
+            value = float(told[index]) if outcome.admissible[index] else math.inf
+            self._portfolio.tell(each, value, float(outcome.decided[index]))
 
     def _count(self, points: NDArray[np.float64], outcome: Simulations, told: NDArray[np.float64]) -> None:
         """Count simulations, and examine violations; `told`, (count,), becomes what strategies are told."""

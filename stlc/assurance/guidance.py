@@ -41,17 +41,16 @@ class ScaledRobustness:
         found = {
             node.num: node for node in nodes(formula) if isinstance(node, ir.Predicate) and not node.guard
         }
-        alone = len(found) < 2 or _freezes(formula)
-        self.predicates: tuple[ir.Predicate, ...] = () if alone else tuple(found.values())
+        freezes = _freezes(formula)
+        self._deciding: tuple[ir.Predicate, ...] = () if freezes else tuple(found.values())
+        self.predicates: tuple[ir.Predicate, ...] = () if len(found) < 2 else self._deciding
 
     def sizes(self, columns: Columns) -> NDArray[np.float64]:
         """Sizes of the margins of the predicates in simulations, (batch, predicates): 90 % quantiles."""
         first = next(iter(columns.values()))
         found = np.zeros((first.shape[1], len(self.predicates)))
         for index, predicate in enumerate(self.predicates):
-            before, after = _offsets(predicate)
-            count = max(len(first) - before - after, 1)
-            values = evaluate([predicate], columns, ops=NUMPY, start=before, count=count)[0]
+            values = _series(predicate, columns)
             found[:, index] = np.quantile(np.abs(values), 0.9, axis=0) if np.ndim(values) else 0.0
         return found
 
@@ -69,6 +68,28 @@ class ScaledRobustness:
         count = next(iter(columns.values())).shape[1]
         found: NDArray[np.float64] = evaluate([self.scaled(scales)], columns, ops=NUMPY)[0][0]
         return np.broadcast_to(found, (count,))
+
+    def deciding(
+        self, columns: Columns, scales: tuple[float, ...] | None, values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Sample that decides the robustness: the last that a predicate of just this value reads, (batch,).
+
+        The exact robustness of a formula is the value of one of its predicates at one sample, which signals
+        after this sample do not affect. NaN if there is no such sample, or if predicates read frozen values.
+
+        Args:
+            columns: signals of the simulations.
+            scales: factor of each predicate; None: all 1.
+            values: guidance values of the simulations, (batch,).
+        """
+        found = np.full(len(values), np.nan)
+        for own in self._deciding:
+            before, after = _offsets(own)
+            predicate = _scaled(own, self.predicates, scales)
+            equal = _series(predicate, columns) == values
+            last = before + len(equal) - 1.0 - np.argmax(equal[::-1], axis=0) + after
+            found = np.fmax(found, np.where(equal.any(0), last, np.nan))
+        return found
 
 
 def scales_of(sizes: NDArray[np.float64]) -> tuple[float, ...] | None:
@@ -114,6 +135,15 @@ def _multiplied(formula: ir.Formula, factors: Mapping[ir.Num, float]) -> ir.Form
 def _freezes(formula: ir.Formula) -> bool:
     """True if a predicate may read a frozen value, which has no size outside of its formula."""
     return any(isinstance(node, ir.Freeze) for node in nodes(formula))
+
+
+def _series(predicate: ir.Formula, columns: Columns) -> NDArray[np.float64]:
+    """Values of a predicate at all samples at which it can be evaluated alone, (samples, batch or 1)."""
+    assert isinstance(predicate, ir.Predicate)
+    before, after = _offsets(predicate)
+    count = max(len(next(iter(columns.values()))) - before - after, 1)
+    found: NDArray[np.float64] = evaluate([predicate], columns, ops=NUMPY, start=before, count=count)[0]
+    return found
 
 
 def _offsets(predicate: ir.Predicate) -> tuple[int, int]:

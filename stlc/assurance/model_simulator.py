@@ -120,10 +120,11 @@ class ModelSimulator:
         if not inputs:
             return 1.0
         names = {each.name for each in inputs}
-        longest = max(float(each.duration) for each in inputs)
         read_by = (self.task.rules[requirement], *self.task.compiled.assumptions)
         last = max(rule.reach + bool(columns_read_by(rule.formula) & names) for rule in read_by)
-        return min(last * self.task.system.dt / longest, 1.0)  # an input is also read at the last sample
+        return min(
+            last * self.task.system.dt / _duration(self.task), 1.0
+        )  # an input is also read at the last sample
 
     def graded(self, requirement: int) -> bool:
         """True if the robustness varies with real signals, rather than with whole numbers."""
@@ -159,7 +160,8 @@ class ModelSimulator:
         if focus.scales is not None:
             guidance = np.where(np.isneginf(margins), -np.inf, guide(columns, focus.scales))
         sizes = guide.sizes(columns) if focus.sized else np.zeros((len(margins), 0))
-        return Simulations(margins, guidance, admissible & in_scope(task, columns), sizes)
+        decided = guide.deciding(columns, focus.scales, guidance) * task.system.dt / _duration(task)
+        return Simulations(margins, guidance, admissible & in_scope(task, columns), sizes, decided)
 
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None for a system in discrete time.
@@ -235,6 +237,11 @@ class ModelSimulator:
     @staticmethod
     def _plans(task: Task, count: int) -> Tensor:
         return torch.zeros((count, task.horizon, 0), dtype=torch.float64)
+
+
+def _duration(task: Task) -> float:
+    """Duration of the longest input signal in seconds; infinite if there are none."""
+    return max((float(each.duration) for each in task.system.decl.inputs), default=np.inf)
 
 
 def _halved(decl: SystemDecl, *, sampled: bool) -> dict[str, str]:

@@ -51,6 +51,7 @@ class _JudgedTrace:
         margin: exact robustness; +inf if the simulation failed.
         guidance: robustness with scaled predicates.
         sizes: sizes of the margins of the predicates, (predicates,); empty if they are not wanted.
+        decided: last sample that decides the guidance; NaN if it is unknown.
         inside: whether the assumptions of the specification hold.
         failed: whether there is no trace.
     """
@@ -58,6 +59,7 @@ class _JudgedTrace:
     margin: float
     guidance: float
     sizes: NDArray[np.float64]
+    decided: float = np.nan
     inside: bool = True
     failed: bool = False
 
@@ -82,23 +84,25 @@ class _Judging:
         verdict = self.monitor.check(run.outcome, require=(rule.name,))
         margin = float(verdict.requirements[0].high.min())
         inside = verdict.statuses[0] != "out of scope"
-        if not guide.predicates:
-            return _JudgedTrace(margin, margin, sizes, inside)
-        signals = arrange(run.outcome, needs_of(compiled, [rule]), plain=True)
+        signals, guidance = arrange(run.outcome, needs_of(compiled, [rule]), plain=True), margin
         if focus.sized:
             (sizes,) = guide.sizes(signals.env)
-        if focus.scales is None:
-            return _JudgedTrace(margin, margin, sizes, inside)
-        scaled = guide.scaled(focus.scales)
-        rule = replace(rule, formula=scaled, lowered=scaled)
-        starts = starts_of(rule, signals.samples, compiled.grid.horizon, None)
-        record = Record.of(signals.env, signals.ops)
-        _, high = rule_bounds(rule, record, starts, compiled.grid.horizon, "open")
-        return _JudgedTrace(margin, float(high.min()), sizes, inside)
+        if focus.scales is not None:
+            scaled = guide.scaled(focus.scales)
+            rule = replace(rule, formula=scaled, lowered=scaled)
+            starts = starts_of(rule, signals.samples, compiled.grid.horizon, None)
+            record = Record.of(signals.env, signals.ops)
+            _, high = rule_bounds(rule, record, starts, compiled.grid.horizon, "open")
+            guidance = float(high.min())
+        (decided,) = guide.deciding(signals.env, focus.scales, np.array([guidance]))
+        return _JudgedTrace(margin, guidance, sizes, decided, inside)
 
 
-def _together(found: Sequence[_JudgedTrace]) -> Simulations:
-    """Outcomes of several simulations; the sizes of failed ones are taken to be typical of the others."""
+def _together(found: Sequence[_JudgedTrace], step: float) -> Simulations:
+    """Outcomes of several simulations; the sizes of failed ones are taken to be typical of the others.
+
+    `step`: time step of the traces as a share of the inputs' duration.
+    """
     sizes = np.stack([each.sizes for each in found])
     failed = np.array([each.failed for each in found], dtype=np.bool_)
     if failed.any() and not failed.all():
@@ -108,6 +112,7 @@ def _together(found: Sequence[_JudgedTrace]) -> Simulations:
         np.array([each.guidance for each in found]),
         np.array([each.inside for each in found], dtype=np.bool_),
         sizes,
+        np.array([each.decided * step for each in found]),
     )
 
 
@@ -205,7 +210,7 @@ class PlantSimulator:
             known = any(np.array_equal(each.point, point) for each in self.findings)
             if isinstance(run.outcome, PlantFinding) and not known:
                 self.findings.append(FailedSimulation(point, run.outcome))
-        return _together([self._judging(run, focus) for run in runs])
+        return _together([self._judging(run, focus) for run in runs], self._step(self.plant))
 
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None if the plant file does not allow it.
@@ -219,7 +224,13 @@ class PlantSimulator:
             return None
         plant = self._finer.plant
         found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]
-        return _together([replace(each, margin=np.nan) if each.failed else each for each in found])
+        confirmed = [replace(each, margin=np.nan) if each.failed else each for each in found]
+        return _together(confirmed, self._step(plant))
+
+    @staticmethod
+    def _step(plant: Plant) -> float:
+        """Time step of a plant's traces as a share of the duration of its inputs."""
+        return float(plant.decl.dt) / float(plant.decl.duration)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
         """None: a black box has no gradient."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -189,13 +190,19 @@ class Portfolio:
         for each in self._learning():
             each.observe(point, value)
 
-    def tell(self, proposal: Proposal, value: float) -> None:
-        """Report the guidance value at a point to its strategy, and to those that learn from others."""
+    def tell(self, proposal: Proposal, value: float, decided: float = math.nan) -> None:
+        """Report the guidance value at a point to its strategy, and to those that learn from others.
+
+        Args:
+            proposal: the point and its strategy.
+            value: guidance value at the point.
+            decided: share of the inputs' duration at the sample that decides the value; NaN if unknown.
+        """
         self._values.append(value)
-        proposal.strategy.tell(proposal.point, value)
+        proposal.strategy.tell(proposal.point, value, decided)
         for other in self._learning():
             if other is not proposal.strategy:
-                other.observe(proposal.point, value)
+                other.observe(proposal.point, value, decided)
 
     def _learning(self) -> Sequence[Strategy]:
         """Strategies that learn from the points of others."""

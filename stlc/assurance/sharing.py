@@ -189,7 +189,8 @@ def _missing(count: int, sizes: NDArray[np.float64]) -> Simulations:
     """Outcomes of lost simulations; the sizes of their predicates are taken to be typical, of `sizes`."""
     typical = np.median(sizes, axis=0) if len(sizes) else np.zeros(sizes.shape[1])
     nothing = np.full(count, np.inf)
-    return Simulations(nothing, nothing, np.zeros(count, dtype=np.bool_), np.tile(typical, (count, 1)))
+    unknown, outside = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
+    return Simulations(nothing, nothing, outside, np.tile(typical, (count, 1)), unknown)
 
 
 @dataclass(frozen=True, slots=True)

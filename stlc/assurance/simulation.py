@@ -44,17 +44,21 @@ class Simulations:
         admissible: whether the initial state meets the conditions of `where`, (count,).
         sizes: sizes of the margins of the predicates, (count, predicates); no columns if they are not
             wanted, or there is nothing to compare.
+        decided: share of the inputs' duration at the sample that decides the guidance, (count,): only inputs
+            before it affect the value there. NaN if it is unknown.
     """
 
     margins: NDArray[np.float64]
     guidance: NDArray[np.float64]
     admissible: NDArray[np.bool_]
     sizes: NDArray[np.float64]
+    decided: NDArray[np.float64]
 
     @classmethod
     def unscaled(cls, margins: NDArray[np.float64], admissible: NDArray[np.bool_]) -> Simulations:
         """Outcomes whose guidance is the exact robustness."""
-        return cls(margins, margins, admissible, np.zeros((len(margins), 0)))
+        unknown = np.full(len(margins), np.nan)
+        return cls(margins, margins, admissible, np.zeros((len(margins), 0)), unknown)
 
     @classmethod
     def joined(cls, parts: Sequence[Simulations]) -> Simulations:
@@ -64,6 +68,7 @@ class Simulations:
             np.concatenate([part.guidance for part in parts]),
             np.concatenate([part.admissible for part in parts]),
             np.concatenate([part.sizes for part in parts]),
+            np.concatenate([part.decided for part in parts]),
         )
 
 

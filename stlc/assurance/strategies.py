@@ -7,6 +7,7 @@ import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -27,6 +28,11 @@ CMA_WIDTH, CMA_NARROW = 0.3, 0.1
 """First step width of CMA-ES, in general and in a small space, whose vertices have all been simulated."""
 CMA_LENGTH, CMA_DIMENSIONS = 400, 200
 """Evaluations after which CMA-ES restarts, and coordinates up to which it is used."""
+REDRAWN = 0.35
+"""Share of the changes that draw a value anew, at an end of its range or uniform between them."""
+LOOKING_BACK, RECENT = 0.5, 0.35
+"""Share of the changes that are made before the sample that decides the robustness, and the probability that
+each of the pieces before it is the changed one, if no later one is."""
 PERTURBED = (0.02, 0.05)
 """Least and greatest width of a perturbation of all values."""
 SHORTEST, LONGEST = 0.01, 0.5
@@ -57,12 +63,15 @@ class Strategy(ABC):
     def propose(self) -> Point | None:
         """Return the next point, (dim,); None if the strategy is finished."""
 
-    def tell(self, point: Point, value: float) -> None:  # noqa: ARG002
-        """Take the guidance value at a point that this strategy proposed; less is closer to a violation."""
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: ARG002
+        """Take the guidance value at a point that this strategy proposed; less is closer to a violation.
+
+        `decided`: share of the inputs' duration at the sample that decides the value; NaN if unknown.
+        """
         self.best = min(self.best, value)
 
-    def observe(self, point: Point, value: float) -> None:  # noqa: B027
-        """Take the guidance value at a point that another strategy proposed."""
+    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: B027
+        """Take the guidance value at a point that another strategy proposed; arguments as of `tell`."""
 
 
 class ConstantVertices(Strategy):
@@ -157,6 +166,21 @@ class CoarseVertices(CoarseSampling):
     ends = ENDS
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """Simulated point.
+
+    Attributes:
+        point: the point, (dim,).
+        value: its guidance value.
+        decided: share of the inputs' duration at the sample that decides the value; NaN if unknown.
+    """
+
+    point: Point
+    value: float
+    decided: float = math.nan
+
+
 class _Start:
     """The best of the last points that were simulated, from which a local search starts.
 
@@ -165,29 +189,29 @@ class _Start:
     """
 
     def __init__(self) -> None:
-        self._best: list[tuple[float, int, Point]] = []
+        self._best: list[Told] = []
         self.seen = 0
 
     @property
     def point(self) -> Point | None:
         """The best point; None if there is none."""
-        return self._best[0][2] if self._best else None
+        return self._best[0].point if self._best else None
 
     @property
     def value(self) -> float:
         """Guidance value of the best point."""
-        return self._best[0][0] if self._best else math.inf
+        return self._best[0].value if self._best else math.inf
 
-    def add(self, point: Point, value: float) -> None:
+    def add(self, told: Told) -> None:
         """Take a point into account; the earlier one of equally good points is the better one."""
         self.seen += 1
-        if math.isfinite(value):
-            self._best = sorted([*self._best, (value, self.seen, point)])[:KEPT]
+        if math.isfinite(told.value):
+            self._best = sorted([*self._best, told], key=lambda each: each.value)[:KEPT]
 
-    def one_of_the_best(self, generator: np.random.Generator) -> Point:
+    def one_of_the_best(self, generator: np.random.Generator) -> Told:
         """The best point with probability one half, else the second best with one half, and so on."""
         index = min(int(generator.geometric(0.5)) - 1, len(self._best) - 1)
-        return self._best[index][2]
+        return self._best[index]
 
 
 class LocalSearch(Strategy):
@@ -197,12 +221,12 @@ class LocalSearch(Strategy):
         super().__init__(space, generator)
         self._start = _Start()
 
-    def tell(self, point: Point, value: float) -> None:
-        super().tell(point, value)
-        self._start.add(point, value)
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
+        super().tell(point, value, decided)
+        self._start.add(Told(point, value, decided))
 
-    def observe(self, point: Point, value: float) -> None:
-        self._start.add(point, value)
+    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
+        self._start.add(Told(point, value, decided))
 
 
 class HillClimbing(LocalSearch):
@@ -226,22 +250,50 @@ class HillClimbing(LocalSearch):
             return self._coarse[int(self.generator.integers(2))].propose()
         return self._neighbour(self._start.one_of_the_best(self.generator))
 
-    def tell(self, point: Point, value: float) -> None:
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
         self._failed = 0 if value < self._start.value else self._failed + 1
-        super().tell(point, value)
+        super().tell(point, value, decided)
         if self._failed > PATIENCE:
             self._restart()
 
-    def _neighbour(self, point: Point) -> Point:
+    def _neighbour(self, start: Told) -> Point:
         """Copy of a point with a few coordinates, or with a run of successive values of an input, changed."""
-        generator, changed = self.generator, point.copy()
+        generator, changed = self.generator, start.point.copy()
         width = math.exp(generator.uniform(math.log(NARROW), math.log(WIDE)))
-        for picked in self._picked(point):
-            if generator.random() < 0.35:
+        for picked in self._picked_before(start) if self._looks_back(start) else self._picked(start.point):
+            if generator.random() < REDRAWN:
                 changed[picked] = generator.choice((0.0, 1.0, generator.random()))
             else:
                 changed[picked] = np.clip(changed[picked] + width * generator.standard_normal(), 0.0, 1.0)
         return changed
+
+    def _looks_back(self, start: Told) -> bool:
+        """Whether to change only values that act before the sample that decides the robustness.
+
+        Changes of later ones cannot lower the robustness at that sample, but may lower it at another one, so
+        both kinds are tried.
+        """
+        known = bool(self.space.blocks) and math.isfinite(start.decided)
+        return known and self.generator.random() < LOOKING_BACK
+
+    def _picked_before(self, start: Told) -> Iterator[list[int]]:
+        """One or two groups of values of an input, mostly of those that act shortly before that sample.
+
+        A group is a value, the stretch around it over which the input has the same value (even if it lasts
+        longer), or a run of values that ends with it.
+        """
+        generator = self.generator
+        for _ in range(1 + (generator.random() < 0.5)):
+            block = self.space.blocks[int(generator.integers(len(self.space.blocks)))]
+            last = max(block.acting_before(start.decided) - int(generator.geometric(RECENT)), 0)
+            kind = generator.random()
+            if kind < 0.25:
+                yield [block.values[last]]
+            elif kind < 0.5:
+                yield _piece(start.point, block.values, last)
+            else:
+                first = max(last + 1 - int(generator.geometric(0.5)), 0)
+                yield list(block.values[first : last + 1])
 
     def _picked(self, point: Point) -> Iterator[list[int]]:
         """One or two groups of coordinates; those of a group are changed together.
@@ -374,8 +426,8 @@ class PeriodicInputs(Strategy):
         at = np.asarray(fractions) if fractions else np.arange(count) / count
         point[list(values)] = np.floor((at + 0.5 / count) / half + phase) % 2
 
-    def tell(self, point: Point, value: float) -> None:
-        super().tell(point, value)
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
+        super().tell(point, value, decided)
         waves = self._open.pop(id(point))
         if value < self._value:
             self._waves, self._value, self._width = waves, value, 0.15
@@ -418,8 +470,8 @@ class CovarianceAdaptation(LocalSearch):
             return np.asarray(self._search.ask(1)[0])
         return self._open.pop()
 
-    def tell(self, point: Point, value: float) -> None:
-        super().tell(point, value)
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
+        super().tell(point, value, decided)
         if any(point is each for each in self._asked):
             self._told.append((point, value))
         if self._told and len(self._told) == len(self._asked):

@@ -16,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.strategies import HillClimbing, UniformSampling, VertexSampling
+from stlc.assurance.strategies import HillClimbing, InputVertices, Told, UniformSampling, VertexSampling
 
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)
 """Length scales that are compared, times the root of the number of coordinates."""
 NOISES = (1e-3, 1e-2, 1e-1, 1.0)
 """Variances of the noise that are compared, times that of the robustness. Chattering is noise."""
+WEIGHTS = (0.0, 1.0, 2.0, 4.0)
+"""Weights of the means of inputs that are compared."""
 JITTER = 1e-6
 """Least variance of the noise, for the sake of the numerics."""
 FITTED = 300
@@ -45,23 +47,34 @@ DIGITS = 6
 class RobustnessProcess:
     """Gaussian process with a Matern kernel (smoothness 5/2) and a constant mean.
 
-    Length scale and noise are those of a small grid that make the values most likely.
+    The distance of two points is that of their coordinates and, with a weight, of the means of their inputs
+    over time: how much an input is high often matters more than when. Length scale, noise and this weight
+    are those of a small grid that make the values most likely.
     """
 
-    def __init__(self) -> None:
-        self._length, self._noise, self._chosen_at = 1.0, 1.0, 0
+    def __init__(self, space: SearchSpace | None = None) -> None:
+        """Fit to points of a space whose inputs' means count; None: to coordinates alone."""
+        blocks = () if space is None else space.blocks
+        self._inputs = [list(block.values) for block in blocks if len(block.values) > 1]
+        self._length, self._noise, self._weight, self._chosen_at = 1.0, 1.0, 0.0, 0
 
     def fit(self, points: NDArray[np.float64], values: NDArray[np.float64]) -> None:
         """Fit the process to values (count,) at points (count, dim)."""
-        self._points, self._mean = points, float(values.mean())
+        self._mean = float(values.mean())
         rest = values - self._mean
-        distances = _distances(points, points)
         if len(points) > GROWN * self._chosen_at:
             self._chosen_at = len(points)
             root = math.sqrt(points.shape[1])
-            grid = [(length * root, noise) for length in LENGTHS for noise in NOISES]
-            fits = [_likelihood(distances, rest, length, noise) for length, noise in grid]
-            self._length, self._noise = grid[int(np.argmax(np.round(fits, DIGITS)))]
+            grid, fits = [], []
+            for weight in WEIGHTS if self._inputs else (0.0,):
+                weighted = self._weighted(points, weight)
+                distances = _distances(weighted, weighted)
+                chosen = [(length * root, noise, weight) for length in LENGTHS for noise in NOISES]
+                fits += [_likelihood(distances, rest, length, noise) for length, noise, _ in chosen]
+                grid += chosen
+            self._length, self._noise, self._weight = grid[int(np.argmax(np.round(fits, DIGITS)))]
+        self._points = self._weighted(points, self._weight)
+        distances = _distances(self._points, self._points)
         covariance = _matern(distances, self._length) + (self._noise + JITTER) * np.eye(len(points))
         self._inverse = np.linalg.inv(covariance)
         self._weights = self._inverse @ rest
@@ -69,10 +82,21 @@ class RobustnessProcess:
 
     def predict(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Means and standard deviations, (count,) each, of values without noise at points (count, dim)."""
-        covariance = _matern(_distances(points, self._points), self._length)
+        weighted = self._weighted(points, self._weight)
+        covariance = _matern(_distances(weighted, self._points), self._length)
         means = self._mean + covariance @ self._weights
         left = 1.0 - (covariance @ self._inverse * covariance).sum(1)
         return means, np.sqrt(np.maximum(left, 0.0) * max(self._variance, 0.0))
+
+    def _weighted(self, points: NDArray[np.float64], weight: float) -> NDArray[np.float64]:
+        """Points (count, dim) with the weighted means of the inputs as further coordinates.
+
+        With the weight 1, a mean adds to the squared distance as much as equal changes of all its values do.
+        """
+        if not weight:
+            return points
+        means = [weight * math.sqrt(len(each)) * points[:, each].mean(1) for each in self._inputs]
+        return np.column_stack((points, *means))
 
 
 def _distances(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,8 +145,10 @@ class SurrogateSearch(HillClimbing):
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
-        self._process = RobustnessProcess()
-        self._samplers = (*self._coarse, VertexSampling(space, generator), UniformSampling(space, generator))
+        self._process = RobustnessProcess(space)
+        several = len(space.blocks) > 1 and not space.small
+        vertices = (InputVertices if several else VertexSampling)(space, generator)
+        self._samplers = (*self._coarse, vertices, UniformSampling(space, generator))
         self._points: list[Point] = []
         self._values: list[float] = []
         self._known: set[bytes] = set()
@@ -161,12 +187,12 @@ class SurrogateSearch(HillClimbing):
         found += [self._samplers[index % len(self._samplers)].propose() for index in range(CANDIDATES - near)]
         return found
 
-    def tell(self, point: Point, value: float) -> None:
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
         self.best = min(self.best, value)
-        self.observe(point, value)
+        self.observe(point, value, decided)
 
-    def observe(self, point: Point, value: float) -> None:
-        self._start.add(point, value)
+    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
+        self._start.add(Told(point, value, decided))
         self._points.append(point)
         self._values.append(value)
         self._known.add(point.tobytes())
@@ -189,7 +215,7 @@ class TrustRegionSearch(SurrogateSearch):
         if self._start.point is None:
             return self._coarse[0].propose()
         self._adapt()
-        centre = self._start.one_of_the_best(self.generator)
+        centre = self._start.one_of_the_best(self.generator).point
         distances = _distances(centre[None], np.array(self._points))[0]
         near = np.argsort(np.round(distances, DIGITS), kind="stable")[:NEAREST]
         candidates = [self._moved(centre) for _ in range(CANDIDATES)]

@@ -186,6 +186,42 @@ def test_guidance_has_the_sign_of_the_margin_and_scales_the_larger_predicate():
     assert scales_of(np.array([[1.0, 2.0], [2.0, 1.0]])) is None
 
 
+@pytest.mark.parametrize("name", ["resonance", "early", "mixed"])
+def test_inputs_after_the_deciding_sample_do_not_make_up_for_it(name: str):
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    index, generator = simulator.requirements.index(name), np.random.default_rng(1)
+    part = simulator.space.visible(simulator.seen(index))
+    points = generator.random((40, part.space.dim))
+
+    def outcome(points, scales=None):
+        return simulator.simulate(np.stack([part.whole(each) for each in points]), Focus(index, scales))
+
+    scales = (0.5, 0.002) if name == "mixed" else None
+    found = outcome(points, scales)
+    assert ((found.decided >= 0.0) & (found.decided <= simulator.seen(index))).all()
+    (block,) = part.space.blocks
+    later = np.zeros(points.shape, dtype=bool)
+    for row, share in enumerate(found.decided):
+        later[row, list(block.values[block.acting_before(share) :])] = True
+    assert later.any(1).sum() > 10
+    changed = np.where(later, generator.random(points.shape), points)
+    assert (outcome(changed, scales).guidance <= found.guidance).all()  # `always`: the sample is still there
+    earlier = np.where(later, points, generator.random(points.shape))
+    assert (outcome(earlier, scales).guidance > found.guidance).any()
+
+
+def test_the_deciding_sample_is_one_at_which_a_predicate_has_the_value_of_the_formula():
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    generator, guide = np.random.default_rng(2), ScaledRobustness(simulator.task.rules[3].formula)
+    columns = {each: generator.normal(size=(201, 20)) for each in ("x", "v", "f")}
+    columns["f"][:] = np.nan  # which the requirement does not read
+    values = guide(columns, None)
+    samples = guide.deciding(columns, None, values).astype(int)
+    both = np.stack([1.5 - columns["x"], 500.0 - 1000.0 * columns["v"]])
+    assert (both[:, samples, np.arange(20)] == values).any(0).all()
+    assert np.isnan(guide.deciding(columns, None, values + 0.123)).all()
+
+
 def test_the_command_writes_what_it_can_replay(capsys):
     assert main(["falsify", "oscillator.stl", "--require", "early", "--simulations", "30"]) == 1
     assert "early: violated, robustness -" in capsys.readouterr().out

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stlc.assurance import strategies
 from stlc.assurance.falsify import coverage
 from stlc.assurance.search_space import SearchSpace, SignalBlock
 from stlc.assurance.strategies import (
@@ -18,6 +19,7 @@ from stlc.assurance.strategies import (
     InputVertices,
     PeriodicInputs,
     Perturbation,
+    Told,
     VertexSampling,
     quantiles_of,
 )
@@ -48,6 +50,20 @@ def test_many_other_numbers_stay_at_their_medians():
     space = SearchSpace(20, (SignalBlock("u", (0, 1)),))
     points = list(space.constant_vertices())
     assert [tuple(point[:3]) for point in points] == [(1.0, 1.0, 0.5), (0.0, 0.0, 0.5)]
+
+
+@pytest.mark.parametrize("kind", [HillClimbing, SurrogateSearch])
+def test_changes_before_the_deciding_sample_leave_later_values_as_they_are(kind, monkeypatch):
+    monkeypatch.setattr(strategies, "LOOKING_BACK", 1.0)
+    strategy, start = kind(LONG, np.random.default_rng(0)), np.random.default_rng(1).random(LONG.dim)
+    strategy.observe(start, 1.0, 0.5)
+    changed = np.zeros(LONG.dim, dtype=int)
+    for _ in range(300):
+        changed += strategy._neighbour(Told(start, 1.0, 0.5)) != start
+    assert not changed[30:].any()
+    assert changed[29] > changed[25] > 0
+    unknown = [strategy._neighbour(Told(start, 1.0)) != start for _ in range(300)]
+    assert np.any(unknown, axis=0).all()
 
 
 def test_inputs_beyond_the_horizon_of_a_requirement_are_not_searched():

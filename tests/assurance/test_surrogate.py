@@ -47,6 +47,24 @@ def test_chattering_is_noise():
     assert means.std() < 0.5 * values.std()
 
 
+def test_a_process_learns_from_few_points_how_much_an_input_should_be_high():
+    generator = np.random.default_rng(3)
+    blocks = tuple(SignalBlock(name, tuple(range(at, at + 20))) for name, at in (("a", 0), ("b", 20)))
+
+    def drawn(count):
+        shares = generator.random((count, 2)).repeat(20, axis=1)
+        points = (generator.random((count, 40)) < shares).astype(float)
+        return points, np.abs(points[:, :20].mean(1) - 0.3) + np.abs(points[:, 20:].mean(1) - 0.8)
+
+    (points, values), (others, expected) = drawn(20), drawn(200)
+    errors = []
+    for space in (SearchSpace(40, blocks), None):
+        process = RobustnessProcess(space)
+        process.fit(points, values)
+        errors.append(np.abs(process.predict(others)[0] - expected).mean())
+    assert errors[0] < 0.5 * errors[1]
+
+
 def test_the_search_needs_fewer_simulations_than_sampling():
     found = [least(SurrogateSearch(SearchSpace(DIM), np.random.default_rng(seed)), 40) for seed in range(3)]
     drawn = [least(UniformSampling(SearchSpace(DIM), np.random.default_rng(seed)), 400) for seed in range(3)]
