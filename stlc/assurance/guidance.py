@@ -38,12 +38,11 @@ class ScaledRobustness:
 
     def __init__(self, formula: ir.Formula) -> None:
         self._formula = formula
-        found = {
-            node.num: node for node in nodes(formula) if isinstance(node, ir.Predicate) and not node.guard
-        }
-        freezes = _freezes(formula)
-        self._deciding: tuple[ir.Predicate, ...] = () if freezes else tuple(found.values())
-        self.predicates: tuple[ir.Predicate, ...] = () if len(found) < 2 else self._deciding
+        found = () if _freezes(formula) else nodes(formula)
+        every = [node for node in found if isinstance(node, ir.Predicate) and not node.guard]
+        self._deciding = tuple(dict.fromkeys(every))  # also those that differ in the sign only
+        sized = {node.num: node for node in every}
+        self.predicates: tuple[ir.Predicate, ...] = tuple(sized.values()) if len(sized) > 1 else ()
 
     def sizes(self, columns: Columns) -> NDArray[np.float64]:
         """Sizes of the margins of the predicates in simulations, (batch, predicates): 90 % quantiles."""
@@ -85,8 +84,7 @@ class ScaledRobustness:
         found = np.full(len(values), np.nan)
         for own in self._deciding:
             before, after = _offsets(own)
-            predicate = _scaled(own, self.predicates, scales)
-            equal = _series(predicate, columns) == values
+            equal = _series(_scaled(own, self.predicates, scales), columns) == values
             last = before + len(equal) - 1.0 - np.argmax(equal[::-1], axis=0) + after
             found = np.fmax(found, np.where(equal.any(0), last, np.nan))
         return found

@@ -94,7 +94,10 @@ class ModelSimulator:
             if len(found) == len(each.values):
                 shares = tuple(float(end / each.duration) for end in each.ends[: each.points])
                 values = tuple(found[name] for name in each.values)
-                blocks.append(SignalBlock(each.name, values, first, () if first else shares, each.lead))
+                length = float(each.duration) / _duration(self.task)
+                blocks.append(
+                    SignalBlock(each.name, values, first, () if first else shares, each.lead, length)
+                )
         return SearchSpace(self.points.dim, tuple(blocks))
 
     def _time_coordinates(self, names: Sequence[str]) -> tuple[int, ...]:
@@ -122,9 +125,8 @@ class ModelSimulator:
         names = {each.name for each in inputs}
         read_by = (self.task.rules[requirement], *self.task.compiled.assumptions)
         last = max(rule.reach + bool(columns_read_by(rule.formula) & names) for rule in read_by)
-        return min(
-            last * self.task.system.dt / _duration(self.task), 1.0
-        )  # an input is also read at the last sample
+        # an input is also read at the last sample
+        return min(last * self.task.system.dt / _duration(self.task), 1.0)
 
     def graded(self, requirement: int) -> bool:
         """True if the robustness varies with real signals, rather than with whole numbers."""

@@ -19,12 +19,12 @@ from stlc.assurance.strategies import (
     CovarianceAdaptation,
     GradientVertices,
     HillClimbing,
-    InputVertices,
     PeriodicInputs,
     Perturbation,
     Strategy,
     UniformSampling,
     VertexSampling,
+    vertex_sampling,
 )
 from stlc.assurance.surrogate import SurrogateSearch, TrustRegionSearch
 
@@ -95,8 +95,7 @@ class Portfolio:
         self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
         self._guided = not random and not space.sparse and graded and space.dim > 0
         uniform, even = UniformSampling(space, generator), VertexSampling(space, generator)
-        several = self._guided and not space.small and len(space.blocks) > 1
-        vertices = InputVertices(space, generator) if several else even
+        vertices = vertex_sampling(space, generator)
         self._vertices: tuple[Strategy, Strategy] = even, vertices
         self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, even]
         self._samplers: list[Strategy] = [vertices, uniform]

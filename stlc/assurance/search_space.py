@@ -29,6 +29,7 @@ class SignalBlock:
         times: coordinates of its free switching times, in the order of time; empty if they are fixed.
         fractions: times of the values as shares of the signal's duration if the times are fixed, (pieces,).
         lead: number of pieces by which a value acts before its time, where the signal is interpolated.
+        length: duration of the signal as a share of that of the longest one.
     """
 
     name: str
@@ -36,12 +37,15 @@ class SignalBlock:
     times: tuple[int, ...] = ()
     fractions: tuple[float, ...] = ()
     lead: int = 0
+    length: float = 1.0
 
     def acting_before(self, share: float) -> int:
-        """Number of the values, at least one, that act before a share of the duration, 0 to 1."""
+        """Number of the values, at least one, that act before a share of the longest duration, 0 to 1."""
         if self.times or not self.fractions:
             return len(self.values)
-        return min(max(sum(each < share for each in self.fractions), 1) + self.lead, len(self.values))
+        return min(
+            max(sum(each * self.length < share for each in self.fractions), 1) + self.lead, len(self.values)
+        )
 
 
 @dataclass(frozen=True, slots=True)

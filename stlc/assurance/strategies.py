@@ -31,8 +31,8 @@ CMA_LENGTH, CMA_DIMENSIONS = 400, 200
 REDRAWN = 0.35
 """Share of the changes that draw a value anew, at an end of its range or uniform between them."""
 LOOKING_BACK, RECENT = 0.5, 0.35
-"""Share of the changes that are made before the sample that decides the robustness, and the probability that
-each of the pieces before it is the changed one, if no later one is."""
+"""Share of the neighbours that differ before the deciding sample only, and the parameter of the geometric
+distribution of the number of pieces that the change lies before it."""
 PERTURBED = (0.02, 0.05)
 """Least and greatest width of a perturbation of all values."""
 SHORTEST, LONGEST = 0.01, 0.5
@@ -145,6 +145,12 @@ class InputVertices(VertexSampling):
             at_end, high, drawn = self.generator.random((3, len(block.values)))
             point[list(block.values)] = np.where(at_end < ends, high < share, drawn)
         return point
+
+
+def vertex_sampling(space: SearchSpace, generator: np.random.Generator) -> VertexSampling:
+    """Vertices for a space: with a share of high values per input if there are several inputs."""
+    several = len(space.blocks) > 1 and not space.small
+    return InputVertices(space, generator) if several else VertexSampling(space, generator)
 
 
 class CoarseSampling(Strategy):
@@ -268,7 +274,7 @@ class HillClimbing(LocalSearch):
         return changed
 
     def _looks_back(self, start: Told) -> bool:
-        """Whether to change only values that act before the sample that decides the robustness.
+        """True, at random, if only values that act before the deciding sample are to be changed.
 
         Changes of later ones cannot lower the robustness at that sample, but may lower it at another one, so
         both kinds are tried.

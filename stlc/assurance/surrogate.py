@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.strategies import HillClimbing, InputVertices, Told, UniformSampling, VertexSampling
+from stlc.assurance.strategies import HillClimbing, Told, UniformSampling, vertex_sampling
 
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)
 """Length scales that are compared, times the root of the number of coordinates."""
@@ -146,9 +146,8 @@ class SurrogateSearch(HillClimbing):
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
         self._process = RobustnessProcess(space)
-        several = len(space.blocks) > 1 and not space.small
-        vertices = (InputVertices if several else VertexSampling)(space, generator)
-        self._samplers = (*self._coarse, vertices, UniformSampling(space, generator))
+        vertices, uniform = vertex_sampling(space, generator), UniformSampling(space, generator)
+        self._samplers = (*self._coarse, vertices, uniform)
         self._points: list[Point] = []
         self._values: list[float] = []
         self._known: set[bytes] = set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
+from stlc.compile.ir import nodes as ir
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.trace import load_trace
 
@@ -220,6 +221,25 @@ def test_the_deciding_sample_is_one_at_which_a_predicate_has_the_value_of_the_fo
     both = np.stack([1.5 - columns["x"], 500.0 - 1000.0 * columns["v"]])
     assert (both[:, samples, np.arange(20)] == values).any(0).all()
     assert np.isnan(guide.deciding(columns, None, values + 0.123)).all()
+
+
+def test_inputs_of_different_durations_are_cut_at_the_same_time(home: Path):
+    inputs = (
+        "{f: {range: [-1, 1], pieces: 10, duration: 10 s}, g: {range: [-1, 1], pieces: 10, duration: 5 s}}"
+    )
+    file = SYSTEM.replace("{f: {range: [-1, 1], pieces: 10, duration: 10 s}}", inputs)
+    (home / "oscillator.yaml").write_text(file.replace("f - x", "f + g - x"))
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    blocks = simulator.space.visible(simulator.seen(simulator.requirements.index("early"))).space.blocks
+    assert [len(block.values) for block in blocks] == [2, 4]  # pieces of 1 s and of .5 s, until 2 s
+
+
+def test_a_predicate_and_its_negation_can_both_decide():
+    simulator = ModelSimulator.load("oscillator.stl", None, {})
+    (predicate, _) = ScaledRobustness(simulator.task.rules[3].formula).predicates
+    guide = ScaledRobustness(ir.BoolOp("and", (predicate, replace(predicate, sign=-predicate.sign))))
+    columns = {each: np.random.default_rng(4).normal(size=(5, 30)) for each in ("x", "v", "f")}
+    assert (guide.deciding(columns, None, guide(columns, None)) == 0.0).all()
 
 
 def test_the_command_writes_what_it_can_replay(capsys):
