@@ -68,6 +68,7 @@ SERIES = (BLUE, GREEN, PINK, SKY, ORANGE)  # requirements, in order; RED is kept
 _RC: Any = {
     "font.size": 8.5,
     "font.family": "DejaVu Sans",
+    "text.hinting": "none",  # the layout measures texts as SVG draws them, else long labels are cut off
     "axes.titlesize": 9,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",

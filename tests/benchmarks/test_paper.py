@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -320,6 +321,15 @@ def test_both_figures_are_drawn(tmp_path: Path) -> None:
     )
     assert pictures[1].figure.axes[0].get_xscale() == "log"
     assert draw([facets[1]], tmp_path) == ()
+
+
+def test_long_names_are_not_cut_off(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    bars = tuple(Bar(name, 0.5, (0.4, 0.6), plans=True) for name in ("search", "plan:gradient:paper"))
+    (picture, _) = draw([Facet(name, bars, ()) for name in "abcdef"], tmp_path)
+    starts = re.findall(r"translate\(([-\d.]+) [-\d.]+\) scale", picture.svg())
+    assert starts
+    assert min(map(float, starts)) > 0.0
 
 
 def test_a_drive_is_stored_with_guard_and_size(tmp_path: Path) -> None:
