@@ -14,13 +14,13 @@ from stlc.assurance.sensitive import SensitiveClimbing
 from stlc.assurance.strategies import (
     PIECES,
     CoarseSampling,
-    CoarseVertices,
     ConstantVertices,
     CovarianceAdaptation,
     GradientVertices,
     HillClimbing,
     PeriodicInputs,
     Perturbation,
+    SettlingInputs,
     Strategy,
     UniformSampling,
     VertexSampling,
@@ -100,8 +100,8 @@ class Portfolio:
         self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, even]
         self._samplers: list[Strategy] = [vertices, uniform]
         if self._guided and any(len(block.values) > max(PIECES) for block in space.blocks):
-            coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
-            self._samplers = [*coarse, vertices]
+            simple = CoarseSampling(space, generator), SettlingInputs(space, generator)
+            self._samplers = [*simple, vertices]
         self._leading: list[Strategy] = [surrogate]
         self._drawn = [*self._samplers]
         self._others: list[Strategy] = []

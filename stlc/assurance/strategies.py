@@ -30,9 +30,11 @@ CMA_LENGTH, CMA_DIMENSIONS = 400, 200
 """Evaluations after which CMA-ES restarts, and coordinates up to which it is used."""
 REDRAWN = 0.35
 """Share of the changes that draw a value anew, at an end of its range or uniform between them."""
+RETIMED = 0.25
+"""Share of the neighbours whose inputs, or switches of an input, are moved in time."""
 LOOKING_BACK, RECENT = 0.5, 0.35
-"""Share of the neighbours that differ before the deciding sample only, and the parameter of the geometric
-distribution of the number of pieces that the change lies before it."""
+"""Share of the other neighbours that differ before the deciding sample only, and the parameter of the
+geometric distribution of the number of pieces that the change lies before it."""
 PERTURBED = (0.02, 0.05)
 """Least and greatest width of a perturbation of all values."""
 SHORTEST, LONGEST = 0.01, 0.5
@@ -43,6 +45,10 @@ ENDS = 2.0 / 3.0
 """Share of the values of vertices at the ends of their ranges."""
 PIECES = (1, 2, 3, 5)
 """Maximum numbers of pieces of coarse inputs; one of them is drawn for each point."""
+SETTLING = (0.1, 0.2, 0.5)
+"""Mean lengths, as shares of the duration, of the stretches after which an input settles, one per point."""
+SECOND_STRETCH = 1.0 / 3.0
+"""Probability of a second such stretch."""
 
 
 class Strategy(ABC):
@@ -157,19 +163,33 @@ class CoarseSampling(Strategy):
     """Inputs of a few long pieces with uniform values."""
 
     name = "coarse"
-    ends = 0.0
 
     def propose(self) -> Point:
         most = PIECES[int(self.generator.integers(len(PIECES)))]
-        labels = self.space.held(self.generator, most)
-        return _values(self.space, self.generator, labels, self.ends)
+        return _values(self.space, self.generator, self.space.held(self.generator, most), 0.0)
 
 
-class CoarseVertices(CoarseSampling):
-    """Inputs of a few long pieces: each at the low end, at the high end, or uniform, a third each."""
+class SettlingInputs(Strategy):
+    """Inputs that settle: one or two stretches with uniform values at first, then one end of the range.
 
-    name = "coarse vertices"
-    ends = ENDS
+    So a plant is moved and then left to itself, as in a test of its step response. Other coordinates are
+    those of vertices.
+    """
+
+    name = "settling"
+
+    def propose(self) -> Point:
+        generator = self.generator
+        point = _values(self.space, generator, np.arange(self.space.dim), ENDS)
+        share = SETTLING[int(generator.integers(len(SETTLING)))]
+        for block in self.space.blocks:
+            count, first = len(block.values), 0
+            values = np.full(count, float(generator.integers(2)))
+            for _ in range(1 + (generator.random() < SECOND_STRETCH)):
+                last = first + int(generator.geometric(1.0 / max(share * count, 1.0)))
+                values[first:last], first = generator.random(), last
+            point[list(block.values)] = values
+        return point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,7 +265,7 @@ class HillClimbing(LocalSearch):
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
-        self._coarse = CoarseSampling(space, generator), CoarseVertices(space, generator)
+        self._coarse = CoarseSampling(space, generator), SettlingInputs(space, generator)
         self._restart()
 
     def _restart(self) -> None:
@@ -263,8 +283,12 @@ class HillClimbing(LocalSearch):
             self._restart()
 
     def _neighbour(self, start: Told) -> Point:
-        """Copy of a point with a few coordinates, or with a run of successive values of an input, changed."""
+        """Copy of a point with other values, of a few coordinates or successive values, or at other times."""
         generator, changed = self.generator, start.point.copy()
+        if self.space.blocks and generator.random() < RETIMED:
+            retimed = self._shifted(changed) if generator.random() < 0.5 else self._switched(changed)
+            if not np.array_equal(retimed, start.point):
+                return retimed
         width = math.exp(generator.uniform(math.log(NARROW), math.log(WIDE)))
         for picked in self._picked_before(start) if self._looks_back(start) else self._picked(start.point):
             if generator.random() < REDRAWN:
@@ -272,6 +296,38 @@ class HillClimbing(LocalSearch):
             else:
                 changed[picked] = np.clip(changed[picked] + width * generator.standard_normal(), 0.0, 1.0)
         return changed
+
+    def _shifted(self, point: Point) -> Point:
+        """Copy of a point at which one input, or all of them, is some pieces earlier or later.
+
+        The first or last value is held where pieces are missing.
+        """
+        generator, blocks, moved = self.generator, self.space.blocks, point.copy()
+        pieces = int(generator.geometric(0.5)) * int(generator.choice((-1, 1)))
+        shortest = min(block.length / len(block.values) for block in blocks)
+        if generator.random() < 0.5:
+            blocks = (blocks[int(generator.integers(len(blocks)))],)
+            shortest = blocks[0].length / len(blocks[0].values)
+        for block in blocks:
+            values = list(block.values)
+            own = round(pieces * shortest * len(values) / block.length)
+            moved[values] = point[values][np.clip(np.arange(len(values)) - own, 0, len(values) - 1)]
+        return moved
+
+    def _switched(self, point: Point) -> Point:
+        """Copy of a point at which an input switches some pieces earlier or later."""
+        generator, blocks, moved = self.generator, self.space.blocks, point.copy()
+        block = blocks[int(generator.integers(len(blocks)))]
+        values = point[list(block.values)]
+        switches = np.flatnonzero(np.diff(values)) + 1
+        if len(switches):
+            at, by = int(generator.choice(switches)), int(generator.geometric(0.6))
+            if generator.random() < 0.5:
+                values[at : at + by] = values[at - 1]
+            else:
+                values[max(at - by, 0) : at] = values[at]
+            moved[list(block.values)] = values
+        return moved
 
     def _looks_back(self, start: Told) -> bool:
         """True, at random, if only values that act before the deciding sample are to be changed.

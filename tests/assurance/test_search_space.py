@@ -12,13 +12,13 @@ from stlc.assurance.falsify import coverage
 from stlc.assurance.search_space import SearchSpace, SignalBlock
 from stlc.assurance.strategies import (
     CoarseSampling,
-    CoarseVertices,
     CovarianceAdaptation,
     GradientVertices,
     HillClimbing,
     InputVertices,
     PeriodicInputs,
     Perturbation,
+    SettlingInputs,
     Told,
     VertexSampling,
     quantiles_of,
@@ -55,6 +55,7 @@ def test_many_other_numbers_stay_at_their_medians():
 @pytest.mark.parametrize("kind", [HillClimbing, SurrogateSearch])
 def test_changes_before_the_deciding_sample_leave_later_values_as_they_are(kind, monkeypatch):
     monkeypatch.setattr(strategies, "LOOKING_BACK", 1.0)
+    monkeypatch.setattr(strategies, "RETIMED", 0.0)
     strategy, start = kind(LONG, np.random.default_rng(0)), np.random.default_rng(1).random(LONG.dim)
     strategy.observe(start, 1.0, 0.5)
     changed = np.zeros(LONG.dim, dtype=int)
@@ -94,7 +95,7 @@ def test_held_values_change_at_most_four_times(seed):
 @given(
     st.integers(0, 200),
     st.sampled_from(
-        [CoarseSampling, CoarseVertices, VertexSampling, HillClimbing, PeriodicInputs, SurrogateSearch]
+        [CoarseSampling, SettlingInputs, VertexSampling, HillClimbing, PeriodicInputs, SurrogateSearch]
     ),
 )
 def test_strategies_stay_in_the_cube(seed, kind):
@@ -128,13 +129,30 @@ LONG = SearchSpace(60, (SignalBlock("u", tuple(range(60)), fractions=tuple(np.ar
 
 
 def test_coarse_inputs_have_few_pieces_and_vertices_many_ends():
-    coarse, ends = (kind(LONG, np.random.default_rng(0)) for kind in (CoarseSampling, CoarseVertices))
-    for _ in range(50):
-        assert len(set(coarse.propose())) <= 5
-        assert len(set(ends.propose())) <= 5
+    coarse = CoarseSampling(LONG, np.random.default_rng(0))
+    assert all(len(set(coarse.propose())) <= 5 for _ in range(50))
     vertices = VertexSampling(LONG, np.random.default_rng(1))
     share = np.isin(np.stack([vertices.propose() for _ in range(40)]), (0.0, 1.0)).mean()
     assert share == pytest.approx(2 / 3, abs=0.1)
+
+
+def test_settling_inputs_have_one_or_two_stretches_and_then_stay_at_an_end():
+    settling = SettlingInputs(LONG, np.random.default_rng(0))
+    switches, ends = [], []
+    for _ in range(400):
+        point = settling.propose()
+        cuts = np.flatnonzero(np.diff(point)) + 1
+        assert len(cuts) <= 2
+        switches.append(int(cuts.max(initial=0)) / 60)
+        ends.append(point[-1])
+    settled = np.isin(ends, (0.0, 1.0))
+    assert settled.mean() > 0.85  # the others have not settled yet at the end
+    assert np.mean(np.array(ends)[settled]) == pytest.approx(0.5, abs=0.1)
+    assert float(np.median(switches)) == pytest.approx(0.2, abs=0.1)
+    inside = SettlingInputs(TWO, np.random.default_rng(0))
+    points = np.stack([inside.propose() for _ in range(200)])
+    assert len(np.unique(points[:, list(TWO.rest)])) > 20
+    assert np.isin(points[:, list(TWO.rest)], (0.0, 1.0)).mean() == pytest.approx(2 / 3, abs=0.15)
 
 
 def test_a_climb_begins_at_the_best_points_that_others_have_found_and_moves_whole_pieces():
@@ -145,6 +163,35 @@ def test_a_climb_begins_at_the_best_points_that_others_have_found_and_moves_whol
     moved = [np.flatnonzero(strategy.propose() != good) for _ in range(60)]
     assert float(np.mean([len(each) for each in moved])) < 40
     assert sum(len(each) == 20 for each in moved) > 10
+
+
+def test_neighbours_move_inputs_and_their_switches_in_time():
+    two = SearchSpace(
+        60, (SignalBlock("u", tuple(range(40))), SignalBlock("v", tuple(range(40, 60)), length=0.5))
+    )
+    start = np.concatenate((np.repeat([0.2, 0.9], 20), np.repeat([0.3, 0.6], 10)))
+    climb = HillClimbing(two, np.random.default_rng(4))
+    climb.observe(start, 1.0)
+    shifted = [climb._shifted(start) for _ in range(200)]
+    switched = [climb._switched(start) for _ in range(200)]
+    both = set()
+    for point in (*shifted, *switched):
+        assert len(np.unique(point[:40])) <= 2  # values as before, at other times
+        assert len(np.unique(point[40:])) <= 2
+    for point in shifted:
+        at = [20 - int((point[:40] == 0.2).sum()), 10 - int((point[40:] == 0.3).sum())]
+        both.add(at[0] == at[1] != 0)  # as many pieces, since these last equally long
+    assert both == {True, False}
+    assert all((point != start).any() for point in (*shifted, *switched))
+    assert any((point[:20] == 0.9).any() for point in switched)
+    assert any((point[20:40] == 0.2).any() for point in switched)
+    constant = two.middle()
+    assert (climb._switched(constant) == constant).all()
+    climb = HillClimbing(two, np.random.default_rng(4))
+    for _ in range(10):
+        climb.observe(constant, 1.0)
+    changed = [(climb.propose() != constant).any() for _ in range(100)]
+    assert np.mean(changed) > 0.95  # no simulation is wasted on the same point
 
 
 def test_a_climb_without_progress_starts_anew():

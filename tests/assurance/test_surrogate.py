@@ -193,6 +193,6 @@ def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.M
         progress = 5.0 if names[-1] == "hill climbing" else 0.0
         portfolio.tell(proposal, 1.0 + index % 7 - progress)
     late = names[-60:]
-    drawn = sum(late.count(each) for each in ("coarse", "coarse vertices", "vertices"))
+    drawn = sum(late.count(each) for each in ("coarse", "settling", "vertices"))
     assert drawn == pytest.approx(20, abs=3)  # more, as some strategies have nothing to propose
     assert late.count("hill climbing") > 20 > late.count("surrogate") >= 3
