@@ -123,17 +123,19 @@ def campaign(order: Campaign) -> Iterator[Progress]:
     )
     every = order.seeds or tuple(range(SEED, SEED + max(1, order.most // each)))
     parts: list[Sample] = []
-    known, batches = 0, 0
+    known, batches, left_out = 0, 0, 0
     while known < len(every):
         count = len(every) if fixed else math.ceil((BATCH if known else first) / each)
         seeds = every[known : known + count]
-        parts += (part for part in order.subject.observed(seeds) if part.drives)
+        for part in order.subject.observed(seeds):
+            left_out += part.left_out
+            parts += [part] if part.drives else []
         known, batches = known + len(seeds), batches + 1
         if not parts:
             continue
         if not fixed and claim.calibration is None:  # the same units, however many follow
             claim = replace(claim, calibration=min(first, sum(part.count for part in parts)))
-        assessment = assess(joined(parts), claim)
+        assessment = assess(replace(joined(parts), left_out=left_out), claim)
         done = known == len(every) or _answered(assessment, order.width)
         yield Progress(assessment, every[:known], batches, done)
         if done:
@@ -222,14 +224,11 @@ def compared(
 
 
 def _wrong_seeds(document: Mapping[str, Any]) -> tuple[str, ...]:
-    """The entry of the seeds, if they do not give as many drives as a certificate counts.
-
-    Simulations of a plant or system may be fewer: those in which an assumption does not hold are left out.
-    """
+    """The entry of the seeds, if they do not give as many drives as a certificate counts or leaves out."""
     conditions, drives = document["conditions"], int(document["overall"]["drives"])
     seeds = sum(int(last) - int(first) + 1 for first, last in conditions["seeds"])
-    given = drives <= seeds if "kind" in document else drives == seeds * int(conditions["agents"])
-    return () if given else ("conditions.seeds",)
+    expected = seeds if "kind" in document else seeds * int(conditions["agents"])
+    return () if drives + int(document.get("left_out", 0)) == expected else ("conditions.seeds",)
 
 
 def _different(then: Mapping[str, Any], present: Mapping[str, Any]) -> tuple[Difference, ...]:

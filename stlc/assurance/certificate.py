@@ -69,6 +69,10 @@ class Judged:
     violated: NDArray[np.bool_]
     robustness: NDArray[np.float64]
 
+    def of(self, kept: NDArray[np.bool_]) -> Judged:
+        """Verdicts on the drives that are kept, (drives,)."""
+        return Judged(self.name, self.unit, self.satisfied[kept], self.violated[kept], self.robustness[kept])
+
 
 @dataclass(frozen=True, slots=True)
 class Sample:
@@ -80,6 +84,7 @@ class Sample:
         units: unit of each drive, (drives,): numbers from 0 without gaps.
         noun: what a unit is.
         predicted: robustness of the plan followed at each step, (drives, steps); None if not recorded.
+        left_out: number of further drives, in which an assumption of the specification does not hold.
     """
 
     overall: Judged
@@ -87,6 +92,7 @@ class Sample:
     units: NDArray[np.int64]
     noun: Noun
     predicted: NDArray[np.float64] | None = None
+    left_out: int = 0
 
     @property
     def drives(self) -> int:
@@ -102,6 +108,20 @@ class Sample:
     def sizes(self) -> NDArray[np.int64]:
         """Number of drives of each unit, (units,)."""
         return np.bincount(self.units, minlength=self.count)
+
+    def in_scope(self, kept: NDArray[np.bool_]) -> Sample:
+        """The drives that are kept, (drives,), as those in which the assumptions of a specification hold."""
+        if kept.all():
+            return self
+        _, units = np.unique(self.units[kept], return_inverse=True)
+        return Sample(
+            self.overall.of(kept),
+            tuple(each.of(kept) for each in self.requirements),
+            units.astype(np.int64),
+            self.noun,
+            None if self.predicted is None else self.predicted[kept],
+            self.left_out + int((~kept).sum()),
+        )
 
     def shares(self, marked: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Share of the marked drives of each unit, (units,)."""
@@ -133,6 +153,7 @@ def joined(samples: Sequence[Sample]) -> Sample:
         np.concatenate(units),
         max((sample.noun for sample in samples), key=lambda noun: noun == "world"),
         np.concatenate(predicted) if same else None,
+        sum(sample.left_out for sample in samples),
     )
 
 
@@ -404,6 +425,7 @@ class Assessment:
         online: bound while driving, on the plans' robustness; None if it was not asked for or not recorded.
         adaptive: adaptive bound on the next drive; None if it was not asked for.
         calibration: number of units that calibrated the conformal bounds.
+        left_out: number of further drives, in which an assumption of the specification does not hold.
     """
 
     claim: Claim
@@ -414,6 +436,7 @@ class Assessment:
     online: OnlineBound | None
     adaptive: AdaptiveBound | None
     calibration: int
+    left_out: int = 0
 
     @property
     def answer(self) -> Answer:
@@ -445,6 +468,7 @@ class Assessment:
             "sequential": claim.any_time,
             "unit": self.noun,
             "calibration": self.calibration,
+            "left_out": self.left_out,
             "needed": {
                 "units": drives_needed(claim.target, claim.confidence, any_time=claim.any_time),
                 "robustness": drives_for_bound(claim.confidence, claim.shift),
@@ -484,6 +508,7 @@ def assess(sample: Sample, claim: Claim) -> Assessment:
         _online(sample, claim) if claim.online else None,
         None if ordered is None else adaptive_bound(ordered, claim.confidence),
         min(sample.count, claim.calibration or sample.count),
+        sample.left_out,
     )
 
 
@@ -527,6 +552,8 @@ def _assumptions(found: Assessment) -> Iterator[str]:
     yield f"a bound on the next robustness holds on average over such samples, not given these {plural}"
     if found.overall.undecided:
         yield f"{found.overall.undecided} {plural} without a verdict count as not satisfied in lower bounds"
+    if found.left_out:
+        yield f"{found.left_out} {plural} that violate an assumption of the specification are left out"
     yield from claim.further
     if noun in ("world", "drive"):
         yield "nothing is said about what the simulated world leaves out"

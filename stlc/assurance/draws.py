@@ -86,8 +86,8 @@ class PlantDraws:
         for run in self.judge.runs(points, seeds, jobs=self.jobs, stream=self.judge.long):
             if run.finding is not None:
                 self.findings.append(run.finding)
-            if run.status != "out of scope":
-                yield _sample(rules, [_judged(run, rule.name) for rule in rules])
+            sample = _sample(rules, [_judged(run, rule.name) for rule in rules])
+            yield sample.in_scope(np.array([run.status != "out of scope"]))
 
     def record(self, seeds: Sequence[int]) -> dict[str, Any]:
         """Entries of the certificate on the plant, its files, its failures, and the conditions."""
@@ -162,14 +162,12 @@ class ModelDraws:
         scope = in_scope(task, columns)
         margins = np.stack([np.broadcast_to(each[0], len(seeds)) for each in self._evaluated(rules, columns)])
         finite = np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
-        margins = np.where(finite & ~np.isnan(margins), margins, -np.inf)[:, scope]
-        yield _sample(
-            rules,
-            [
-                Judged(rule.name, rule.unit, row >= -TOLERANCE, row < -TOLERANCE, row)
-                for rule, row in zip(rules, margins, strict=True)
-            ],
-        )
+        margins = np.where(finite & ~np.isnan(margins), margins, -np.inf)
+        judged = [
+            Judged(rule.name, rule.unit, row >= -TOLERANCE, row < -TOLERANCE, row)
+            for rule, row in zip(rules, margins, strict=True)
+        ]
+        yield _sample(rules, judged).in_scope(scope)
 
     @staticmethod
     def _evaluated(rules: Sequence[CompiledRequirement], columns: Mapping[str, Any]) -> Sequence[Any]:

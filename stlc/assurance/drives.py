@@ -26,6 +26,8 @@ from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from stlc.controller.deployment.simulator import DeploymentRecording, Watch
     from stlc.controller.problem.task import Task
     from stlc.controller.training.run import Run
@@ -43,7 +45,7 @@ def sample_of(
     rules: Rules | None = None,
     require: Sequence[str] = (),
 ) -> Sample:
-    """Judge a recorded deployment drive by drive.
+    """Judge a recorded deployment drive by drive; drives in which an assumption does not hold are left out.
 
     Independent observations are the worlds, or single drives if the agents of a world are independent.
 
@@ -57,50 +59,66 @@ def sample_of(
         UsageError: U101, there is no such requirement.
         SpecError: the rules use names that the system does not have.
     """
-    if rules is None:
-        judged, weights = _judged_by_plans(task, recording)
-    else:
-        judged, weights = _judged_by_rules(task, recording, rules)
-    names = [each.name for each in judged]
+    found = _judged_by_plans(task, recording) if rules is None else _judged_by_rules(task, recording, rules)
+    names = [each.name for each in found.judged]
     for name in require:
         if name not in names:
             raise unknown_requirement(name, names)
-    chosen = tuple(each for each in judged if each.name in require or not require)
+    chosen = tuple(each for each in found.judged if each.name in require or not require)
     rows = len(recording.states)
     alone = recording.agents == 1 or independent_agents(world_type(task.system.decl))
     units = np.arange(rows) if alone else np.arange(rows) // recording.agents
     noun: Noun = "drive" if alone and recording.agents > 1 else "world"
-    return Sample(together(chosen, weights), chosen, units, noun, recording.rho)
+    return Sample(together(chosen, found.weights), chosen, units, noun, recording.rho).in_scope(found.inside)
 
 
-def _judged_by_plans(
-    task: Task, recording: DeploymentRecording
-) -> tuple[tuple[Judged, ...], Mapping[str, float]]:
+@dataclass(frozen=True, slots=True)
+class _Verdicts:
+    """Verdicts on recorded drives.
+
+    Attributes:
+        judged: verdicts under each requirement.
+        weights: requirement -> factor of its robustness, weight / scale.
+        inside: whether the assumptions of the specification hold, (drives,).
+    """
+
+    judged: tuple[Judged, ...]
+    weights: Mapping[str, float]
+    inside: NDArray[np.bool_]
+
+
+def _judged_by_plans(task: Task, recording: DeploymentRecording) -> _Verdicts:
     """Verdicts by the specification of the plans; undecided where a drive ends before a window does."""
+    from stlc.assurance.model_simulator import in_scope
+
     found = executed_robustness(task, recording)
     judged = tuple(
         Judged(rule.name, rule.unit, low >= -TOLERANCE, high < -TOLERANCE, low)
         for rule, (low, high) in ((rule, found[rule.name]) for rule in task.rules)
     )
-    return judged, {rule.name: rule.weight / rule.scale for rule in task.rules}
+    columns = dict(zip(task.system.names, np.moveaxis(recording.states, -1, 0).swapaxes(1, 2), strict=True))
+    weights = {rule.name: rule.weight / rule.scale for rule in task.rules}
+    return _Verdicts(judged, weights, in_scope(task, columns))
 
 
-def _judged_by_rules(
-    task: Task, recording: DeploymentRecording, rules: Rules
-) -> tuple[tuple[Judged, ...], Mapping[str, float]]:
+def _judged_by_rules(task: Task, recording: DeploymentRecording, rules: Rules) -> _Verdicts:
+    verdict = verdict_on_runs(rules, task, recording)
+    scope = verdict.requirements[0].scope
     found = [
         (
             judgement.rule,
             np.array(judgement.statuses),
             np.nan_to_num(judgement.low.min(0), nan=-np.inf, posinf=np.inf, neginf=-np.inf),
         )
-        for judgement in verdict_on_runs(rules, task, recording)
+        for judgement in verdict
     ]
     judged = tuple(
         Judged(rule.name, rule.unit, statuses == "satisfied", statuses == "violated", least)
         for rule, statuses, least in found
     )
-    return judged, {rule.name: rule.weight / rule.scale for rule, _, _ in found}
+    weights = {rule.name: rule.weight / rule.scale for rule, _, _ in found}
+    inside = np.ones(len(recording.states), dtype=np.bool_) if scope is None else np.asarray(scope)
+    return _Verdicts(judged, weights, np.broadcast_to(inside, (len(recording.states),)))
 
 
 # ---------------------------------------------------------------------- deploying

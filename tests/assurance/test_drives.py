@@ -12,12 +12,12 @@ import torch
 from helpers.small_systems import moved_by_steps
 
 from stlc.assurance.campaign import BATCH, FIRST, SEED, Campaign, campaign
-from stlc.assurance.certificate import Claim, Judged, Sample
+from stlc.assurance.certificate import Claim, Judged, Sample, assess
 from stlc.assurance.drives import PolicyDrives, sample_of
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
-from stlc.controller.evaluation.rules import rules_of
+from stlc.controller.evaluation.rules import Rules, rules_of
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.problem.task import Task
@@ -98,6 +98,31 @@ def test_a_drive_that_ends_before_a_window_may_be_undecided(
     assert found.satisfied.tolist() == [satisfied] * 2
     assert found.violated.tolist() == [violated] * 2
     assert found.robustness.tolist() == [least] * 2
+
+
+def test_drives_that_violate_an_assumption_are_left_out(tmp_path: Path) -> None:
+    (tmp_path / "cart.yaml").write_text(moved_by_steps("cart", "uniform(0, 1)", horizon=3))
+    spec = parse(
+        Source("cart.stl", "signal x\nassume calm: always[0 s, 3 s] x < 4\nrequire r: always[0 s, 3 s] x < 2")
+    )
+    task = Task.of(spec, System.load(tmp_path / "cart.yaml"))
+    states = np.zeros((4, 4, len(task.system.names)))
+    states[:, :, task.system.names.index("x")] = [[0, 1, 1, 1], [0, 1, 5, 1], [0, 3, 3, 3], [0, 1, 1, 9]]
+    each, none = np.zeros((4, 3)), np.zeros((4, 3), dtype=np.int64)
+    recording = DeploymentRecording(
+        2, states, each[..., None], none, none, each, each, none > 0, ({},) * 4, {}, {}
+    )
+    judge = Rules(spec, "cart.stl")
+    for rules in (None, judge):
+        found = sample_of(task, recording, rules)
+        assert (found.drives, found.left_out, found.count) == (2, 2, 2)
+        assert found.units.tolist() == [0, 1]
+        assert found.overall.satisfied.tolist() == [True, False]
+        assert found.requirements[0].violated.tolist() == [False, True]
+        assert len(found.predicted) == 2
+    bounds = assess(found, Claim(0.9))
+    assert bounds.summary()["left_out"] == 2
+    assert "2 drives that violate an assumption of the specification are left out" in bounds.assumptions()
 
 
 def test_a_campaign_is_repeatable_and_counts_its_seeds(run: Run) -> None:

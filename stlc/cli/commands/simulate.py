@@ -383,8 +383,9 @@ def _bounds_shown(document: Simulation, guard: Mode) -> Iterator[str]:
 
 def _certified(document: Simulation, guard: Mode) -> int:
     """Exit code of `--certify`: 0 if the share is certified in all scenarios, 1 if refuted in one, else 4."""
-    answers = {record["answer"] for record in _bounds(document, guard).values()}
-    return 1 if "refuted" in answers else 0 if answers == {"certified"} else 4
+    answers = [record["answer"] for record in _bounds(document, guard).values()]
+    every = len(answers) == 1 + len(document.get("scenarios", {}))
+    return 1 if "refuted" in answers else 0 if every and {*answers} == {"certified"} else 4
 
 
 def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
@@ -470,18 +471,26 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
     made: Any = as_json(found, order.setting, facts)
     if order.certify is not None:
         for name, each in found.items():
-            made["guards"][name]["assurance"] = _assured(run, each, rules, order.certify)
+            assurance = _assured(run, each, rules, order.certify)
+            if assurance is None:
+                say(f"guard `{name}`: no bounds, as every drive violates an assumption of the specification")
+            else:
+                made["guards"][name]["assurance"] = assurance
     document: Simulation = made
     run.dir.write_json(SIMULATION, document)
     return document
 
 
-def _assured(run: Run, found: Deployment, rules: Rules | None, share: float) -> Assurance:
-    """Bounds on the share of drives that satisfy everything; the number of drives was fixed in advance."""
+def _assured(run: Run, found: Deployment, rules: Rules | None, share: float) -> Assurance | None:
+    """Bounds on the share of drives that satisfy everything; the number of drives was fixed in advance.
+
+    None if every drive violates an assumption of the specification.
+    """
     from stlc.assurance.certificate import Claim, assess
     from stlc.assurance.drives import sample_of
 
-    return bounds_record(assess(sample_of(run.task, found.recording, rules), Claim(share, online=True)))
+    sample = sample_of(run.task, found.recording, rules)
+    return bounds_record(assess(sample, Claim(share, online=True))) if sample.drives else None
 
 
 # ------------------------------------------------------------------------- pictures

@@ -69,6 +69,7 @@ class Assurance(TypedDict):
     sequential: bool
     unit: Literal["world", "drive", "trace", "simulation"]
     calibration: Count
+    left_out: Count
     needed: NeededUnits
     overall: ShareStatement
     requirements: list[ShareStatement]

@@ -110,8 +110,8 @@ def test_drives_stop_when_the_share_is_certified(there: RunDir, capsys: pytest.C
 
 
 GOLDEN = """adaptive answer assumptions batches calibration certificate conditions confidence finished
-hardware inputs made needed online overall requirements run sequential share shift spec system unit versions
-width"""
+hardware inputs left_out made needed online overall requirements run sequential share shift spec system unit
+versions width"""
 GOLDEN_INPUTS = "functions guard_version policy rules spec system world"
 GOLDEN_CONDITIONS = "agents guard margin overrides replan require scenario seeds steps time_limit"
 
