@@ -131,7 +131,9 @@ class Forms:
         return Forms(self.centre, generators, rest, self.floor, self.ceiling)
 
     def __neg__(self) -> Forms:
-        return self.times(-1.0)
+        floor = None if self.ceiling is None else -self.ceiling
+        ceiling = None if self.floor is None else -self.floor
+        return Forms(-self.centre, -self.generators, self.rest, floor, ceiling)
 
 
 Operand: TypeAlias = Forms | float
@@ -271,12 +273,16 @@ class FormOps(FloatConstants):
         return Forms(found.centre, found.generators, found.rest, floor, ceiling)
 
     def maximum(self, a: Operand, b: Operand) -> Forms:
-        """Elementwise maximum."""
-        return self.add(self.relu(self.sub(a, b)), b)
+        """Elementwise maximum, which is known to be at least as large as either operand."""
+        found = self.add(self.relu(self.sub(a, b)), b)
+        plain = INTERVALS.maximum(*_ranges(a, b))
+        return Forms(found.centre, found.generators, found.rest, plain.low, plain.high)
 
     def minimum(self, a: Operand, b: Operand) -> Forms:
-        """Elementwise minimum."""
-        return self.sub(a, self.relu(self.sub(a, b)))
+        """Elementwise minimum, which is known to be at most as large as either operand."""
+        found = self.sub(a, self.relu(self.sub(a, b)))
+        plain = INTERVALS.minimum(*_ranges(a, b))
+        return Forms(found.centre, found.generators, found.rest, plain.low, plain.high)
 
     def clamp(self, x: Forms, low: float | None, high: float | None) -> Forms:
         """Clamp `x` to [low, high]; the plain range where the form of the result is twice as wide."""
@@ -284,7 +290,7 @@ class FormOps(FloatConstants):
         first, last = np.clip(bound.low, low, high), np.clip(bound.high, low, high)
         x = x if low is None else self.maximum(x, low)
         x = x if high is None else self.minimum(x, high)
-        return _bounded(x, Intervals(_below(first), _above(last)))
+        return _bounded(x, Intervals(first, last))
 
     def abs(self, x: Forms) -> Forms:
         """`|x|`."""
@@ -440,12 +446,16 @@ class FormOps(FloatConstants):
         return NUMPY.quiet()
 
     def _by_range(self, name: str, *args: Any) -> Forms:
-        ranges = [each.range if isinstance(each, Forms) else each for each in args]
-        found = getattr(INTERVALS, name)(*ranges)
+        found = getattr(INTERVALS, name)(*_ranges(*args))
         return Forms.between(found.low, found.high)
 
     def __getattr__(self, name: str) -> Any:
         return lambda *args: self._by_range(name, *args)
+
+
+def _ranges(*args: Any) -> list[Any]:
+    """The ranges of forms, and other operands as they are."""
+    return [each.range if isinstance(each, Forms) else each for each in args]
 
 
 def picked(mask: Any, yes: Forms, no: Forms) -> Forms:

@@ -94,6 +94,21 @@ def test_what_follows_a_relu_has_a_root() -> None:
         FORMS.sqrt(FORMS.add(FORMS.maximum(symbol(-1.0, 1.0), 0.0), -0.5))
 
 
+@pytest.mark.parametrize(
+    "kept",
+    [
+        lambda x: FORMS.maximum(x, 1e-18),
+        lambda x: FORMS.clamp(x, 1e-18, None),
+        lambda x: FORMS.clamp(x, 1e-18, 1.0),
+        lambda x: -FORMS.minimum(-x, -1e-18),
+    ],
+)
+def test_a_divisor_that_is_kept_away_from_zero_is_never_zero(kept: Callable[[Forms], Forms]) -> None:
+    """So `sweep` divides by the squared length of a segment, however short."""
+    found = FORMS.clamp(FORMS.div(symbol(-1.0, 1.0), kept(symbol(-1e-9, 2e-9))), 0.0, 1.0).range
+    assert 0.0 <= found.low[0] <= found.high[0] <= 1.0
+
+
 def test_the_tangent_is_followed() -> None:
     for low, high in ((-3.0, 2.0), (0.5, 0.6), (-9.0, 9.0), (2.0, 2.0)):
         x = symbol(low, high)

@@ -167,7 +167,7 @@ OTHERS = [
     ("ship_track", "ship_track", 3e-3),
     ("manipulation", "panda", 3e-3),
     ("reach_n_avoid", "maze", 1e-3),
-    pytest.param("navigation", "rover", 1e-3, marks=pytest.mark.slow),
+    ("navigation", "rover", 1e-3),
 ]
 
 
