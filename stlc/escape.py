@@ -104,6 +104,11 @@ def _raw(char: str) -> bool:
     return "\udc80" <= char <= "\udcff"
 
 
+def encodable(text: str) -> str:
+    """The text without what UTF-8 cannot encode, such as the invalid bytes of a file name."""
+    return text if text.isascii() else _SURROGATE.sub("\ufffd", text)
+
+
 # ------------------------------------------------------------------------- C
 
 
@@ -113,7 +118,7 @@ def c_string(text: str) -> str:
     A byte that is not printable ASCII is written as a backslash and three octal digits. Question marks are
     written so that they form no trigraphs. The literal is not a format string: print it with `%s`.
     """
-    data = _SURROGATE.sub("\ufffd", text).encode()
+    data = encodable(text).encode()
     return '"' + "".join(_C_BYTES.get(byte) or f"\\{byte:03o}" for byte in data) + '"'
 
 

@@ -110,3 +110,21 @@ def test_a_vector_of_too_many_components(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=np.arange(4.0), x=np.ones(4), wide=np.zeros((4, 1001)))
     with pytest.raises(TraceError, match="4 x 1001"):
         load_trace(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("before", ["", "\n\n"])
+def test_a_wrong_cell_of_a_piece_has_the_line_of_the_file(tmp_path: Path, before: str) -> None:
+    rows = [f"{k},{k}" for k in range(40)]
+    rows[33] = "33,oops"
+    (tmp_path / "a.csv").write_text(before + "\n".join(["t,x", *rows]))
+    found = []
+    for read in (
+        lambda: load_trace(tmp_path / "a.csv"),
+        lambda: list(pieces(tmp_path / "a.csv", 10, Reading())),
+    ):
+        with pytest.raises(TraceError) as caught:
+            read()
+        span = caught.value.diagnostics[0].span
+        assert span is not None
+        found.append((span.line, span.column))
+    assert found == [(35 + len(before), 4)] * 2

@@ -184,3 +184,20 @@ def test_a_record_of_ours_that_lies(tmp_path: Path) -> None:
             assert load_trace(tmp_path / "b.mcap", Reading()).samples == 3
         except StlcError as error:
             assert error.diagnostics[0].code == "E603"  # noqa: PT017
+
+
+@pytest.mark.parametrize("order", [("sec", "nanosec"), ("nanosec", "sec")])
+@pytest.mark.parametrize("names", [("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos")])
+def test_the_fields_of_a_time_stamp_may_have_any_order(
+    tmp_path: Path, order: tuple[str, str], names: tuple[str, str]
+) -> None:
+    values = dict(zip(("sec", "nanosec"), zip(names, (3, 500_000_000), strict=True), strict=True))
+    text = json.dumps({"st": dict(values[each] for each in order)}).encode()
+    path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])
+    assert load_trace(path).data["state.st"].tolist() == [[3.5, 3.5]]
+
+
+def test_names_that_utf_8_cannot_encode_are_replaced(tmp_path: Path) -> None:
+    text = b'{"x\\ud800": 1}'
+    path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])
+    assert [*load_trace(path).data] == ["state.x\ufffd"]

@@ -10,7 +10,7 @@ from typing import Any
 
 from stlc.cli.check.outcome import Outcome, VerdictRow
 from stlc.diagnostics import usage
-from stlc.escape import spreadsheet
+from stlc.escape import encodable, spreadsheet
 from stlc.files import write_atomic
 
 COLUMNS = {
@@ -52,7 +52,7 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
     Raises:
         MissingError: R201, the disk is full, or the user may not write there.
     """
-    rows = [row for outcome in outcomes for row in _rows(outcome)]
+    rows = [tuple(map(_encodable, row)) for outcome in outcomes for row in _rows(outcome)]
     if path.suffix.lower() == ".parquet":
         from stlc.trace.formats.parquet import write_columns
 
@@ -65,6 +65,10 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
     writer.writerow(COLUMNS)
     writer.writerows(map(_cell, row) for row in rows)
     write_atomic(path, text.getvalue())
+
+
+def _encodable(value: Any) -> Any:
+    return encodable(value) if isinstance(value, str) else value
 
 
 def _cell(value: Any) -> Any:

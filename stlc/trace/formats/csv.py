@@ -77,11 +77,26 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
     """
     only = OneTrace(str(path))
     with path.open(encoding="latin-1") as file:  # every byte a letter, and every line ending `\n`
-        header = next((line for line in file if line.strip()), "")
+        before = list(islice(file, 1))
+        while before and not before[-1].strip():
+            before += islice(file, 1) or [""]
+        known, header = len(before), before[-1] if before else ""
+        blank = "\n" * (known - 1)
         while lines := list(islice(file, samples)):
             if any(map(str.strip, lines)):
-                text = (header + "".join(lines)).encode("latin-1")
-                yield of_table(path, table_of_text(path, text), only=only)
+                body = "".join(lines).encode("latin-1")
+                yield of_table(path, _table_of_chunk(path, header, body, blank, known), only=only)
+            known += len(lines)
+
+
+def _table_of_chunk(path: Path, header: str, body: bytes, blank: str, known: int) -> Table:
+    """Columns of the lines `body`; `known` lines come before them, those of `blank` above the header."""
+    head = header.encode("latin-1")
+    try:
+        return table_of_text(path, head + body)
+    except TraceError:  # again, so that the finding has the number of the line in the file
+        table_of_text(path, blank.encode() + head + b"\n" * (known - len(blank) - 1) + body)
+        raise
 
 
 def read_csv(path: Path) -> Table:

@@ -19,6 +19,7 @@ import numpy as np
 
 from stlc.escape import topic as topic_of
 from stlc.files import atomic_path
+from stlc.jsontext import loads
 from stlc.trace.formats.messages import (
     DEEPEST,
     HEADER,
@@ -31,6 +32,7 @@ from stlc.trace.formats.messages import (
     Room,
     mapped,
     numbers_of,
+    seconds_of,
 )
 from stlc.trace.formats.registry import damage, needed, unreadable
 from stlc.trace.formats.ros import decoder
@@ -153,7 +155,7 @@ def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
 
 
 def _of_json(data: bytes) -> Iterable[MessageNumber]:
-    return numbers_of(json.loads(data))
+    return numbers_of(loads(data.decode()))
 
 
 def _protobuf(schema: Any) -> Decode:
@@ -182,8 +184,7 @@ def _protobuf(schema: Any) -> Decode:
 def _proto_fields(name: str, message: Any, depth: int) -> Iterator[MessageNumber]:
     fields = message.DESCRIPTOR.fields
     if {each.name for each in fields} in STAMPS:
-        seconds, parts = (getattr(message, each.name) for each in fields)
-        yield MessageNumber(name, seconds + 1e-9 * parts)
+        yield MessageNumber(name, seconds_of({each.name: getattr(message, each.name) for each in fields}))
         return
     for each in fields:
         if each.name != HEADER:

@@ -33,6 +33,8 @@ DEEPEST = 12
 """Greatest nesting depth of a number that is a signal."""
 STAMPS = ({"sec", "nanosec"}, {"secs", "nsecs"}, {"sec", "nsec"}, {"seconds", "nanos"})
 """Field names of a time stamp in the message languages."""
+SECONDS = frozenset({"sec", "secs", "seconds"})
+"""Names of the fields that count seconds; the others count nanoseconds."""
 HEADER = "header"
 """The field that is no signal: its time stamp repeats the clock."""
 
@@ -194,6 +196,11 @@ def numbers_of(content: object) -> Iterator[MessageNumber]:
     yield from _walk("", content, 0)
 
 
+def seconds_of(stamp: Mapping[str, float]) -> float:
+    """Seconds of a time stamp, name of the field -> value, whose fields may stand in any order."""
+    return math.fsum(value if name in SECONDS else 1e-9 * value for name, value in stamp.items())
+
+
 def _walk(name: str, value: object, depth: int) -> Iterator[MessageNumber]:
     if isinstance(value, (int, float)):
         yield MessageNumber(name, float(value), isinstance(value, int))
@@ -211,8 +218,8 @@ def _walk(name: str, value: object, depth: int) -> Iterator[MessageNumber]:
 
 def _entries(name: str, value: Mapping[str, object], depth: int) -> Iterator[MessageNumber]:
     if set(value) in STAMPS:
-        seconds, parts = (v if isinstance(v, (int, float)) else math.nan for v in value.values())
-        yield MessageNumber(name, seconds + 1e-9 * parts)
+        parts = {key: v if isinstance(v, (int, float)) else math.nan for key, v in value.items()}
+        yield MessageNumber(name, seconds_of(parts))
         return
     for key, item in value.items():
         if key != HEADER:

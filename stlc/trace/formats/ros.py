@@ -16,7 +16,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from stlc.trace.formats.messages import DEEPEST, HEADER, LONGEST, STAMPS, DamageError, MessageNumber
+from stlc.trace.formats.messages import (
+    DEEPEST,
+    HEADER,
+    LONGEST,
+    STAMPS,
+    DamageError,
+    MessageNumber,
+    seconds_of,
+)
 
 Form = Literal["ros1", "cdr"]
 
@@ -248,8 +256,10 @@ class _Cursor:
             yield MessageNumber(name, seconds + 1e-9 * parts)
 
     def stamp(self, name: str, layout: _Layout) -> MessageNumber:
-        seconds, parts = (number.value for number in self.fields("", layout, 0))
-        return MessageNumber(name, seconds + 1e-9 * parts)
+        values = (number.value for number in self.fields("", layout, 0))
+        return MessageNumber(
+            name, seconds_of({each.name: value for each, value in zip(layout.fields, values, strict=True)})
+        )
 
     def text(self, kind: str) -> None:
         (length,) = self.take("I")

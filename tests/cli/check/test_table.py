@@ -265,3 +265,20 @@ def test_the_first_violation_is_the_one_that_an_online_monitor_reports(seed: int
                 first.setdefault(decision.requirement, decision.sample)
     found = {j.name: first_violation(j, verdict.subject) for j in verdict if j.overall == "violated"}
     assert found == first
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_names_that_utf_8_cannot_encode_are_written_without_what_it_cannot(name: str) -> None:
+    if name.endswith(".parquet"):
+        pytest.importorskip("pyarrow")
+    recording("odd/a.csv")
+    recording("odd/b\udcff.csv")
+    Path("odd/c\udcfe.csv").write_text("t,a\n0,1\n0.1,oops\n")
+    assert check("odd/*.csv", "--table", name) == 3
+    if name == "t.csv":
+        assert {row["file"] for row in rows_of(name)} == {"odd/a.csv", "odd/b\ufffd.csv", "odd/c\ufffd.csv"}
+
+
+def test_a_huge_piece_is_the_whole_file() -> None:
+    recording("a.csv")
+    assert check("a.csv", "--chunk", str(2**63)) == 0

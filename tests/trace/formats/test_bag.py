@@ -232,3 +232,11 @@ def test_a_bag_is_found_by_its_folder(tmp_path: Path) -> None:
         find_trace(str(folder))
     (folder / "drive_0.db3").write_bytes(robot_logs.bag2(X.tolist()))
     assert find_trace(str(folder)) == folder
+
+
+@pytest.mark.parametrize("fields", ["int32 sec\nuint32 nanosec", "uint32 nanosec\nint32 sec"])
+def test_the_fields_of_a_time_stamp_may_have_any_order(fields: str) -> None:
+    text = f"p/Stamp st\n{'=' * 80}\nMSG: p/Stamp\n{fields}\n"
+    values = (3, 500_000_000) if fields.startswith("int32") else (500_000_000, 3)
+    data = b"\0\1\0\0" + struct.pack("<ii", *values)
+    assert [each.value for each in decoder(text, "cdr")(data)] == [3.5]
