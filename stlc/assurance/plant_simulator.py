@@ -44,6 +44,19 @@ class FailedSimulation:
 
 
 @dataclass(frozen=True, slots=True)
+class RepeatedSimulation:
+    """Trace of a point that was simulated once more.
+
+    Attributes:
+        trace: the trace, with the specification.
+        margin: its exact robustness.
+    """
+
+    trace: Trace
+    margin: float
+
+
+@dataclass(frozen=True, slots=True)
 class _JudgedTrace:
     """One simulation under one requirement.
 
@@ -256,6 +269,16 @@ class PlantSimulator:
         """Simulate one point, (dim,); return its trace, or the failure."""
         (run,) = self.plant.simulate(self.plant.points_of(point[None]))
         return run.outcome
+
+    def repeated(self, point: Point, requirement: int) -> RepeatedSimulation:
+        """Simulate a point, (dim,), once more, and judge what is kept of it.
+
+        Raises:
+            SystemFileError: S401, the simulation fails, as it did not before.
+        """
+        trace = self.trace(point[None])
+        low = self.monitor.check(trace, require=(self.requirements[requirement],)).requirements[0].high
+        return RepeatedSimulation(trace, float(low.min()))
 
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002
         """Simulate one point, (1, dim), and return its trace, with the specification.

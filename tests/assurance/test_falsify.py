@@ -332,6 +332,52 @@ def test_a_counterexample_whose_plant_fails_now(capsys):
     assert "the simulation fails, before: a violation of up; error at t = 0 s" in capsys.readouterr().out
 
 
+def test_a_counterexample_outside_of_the_assumptions_violates_nothing(home: Path, capsys):
+    assert main(["falsify", "oscillator.stl", "--require", "early", "--simulations", "30"]) == 1
+    before = (home / "oscillator.stl").read_text()
+    (home / "oscillator.stl").write_text(before + "assume never: f <= -2\n")
+    replay = ["falsify", "oscillator.stl", "--replay", "counterexamples/early.json"]
+    capsys.readouterr()
+    assert main(replay) == 0
+    assert "early: out of scope" in capsys.readouterr().out
+    assert main([*replay, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert not misfits(document, load_schema("falsify/1"))
+    assert document["result"]["verdict"] == "out of scope"
+    assert main(["falsify", "oscillator.stl", "--require", "early", "--simulations", "5"]) == 2
+    assert re.search("`assume` or `where` excludes all of .* points", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "changed", [{"trace": "a\0b"}, {"trace": ""}, {"trace": "x/y.npz"}, {"margin": "nan"}]
+)
+def test_an_edited_counterexample_is_none(changed, capsys):
+    assert main(["falsify", "oscillator.stl", "--require", "early", "--simulations", "30"]) == 1
+    stored = json.loads(Path("counterexamples/early.json").read_text())
+    Path("counterexamples/edited.json").write_text(json.dumps({**stored, **changed}))
+    capsys.readouterr()
+    assert main(["falsify", "oscillator.stl", "--replay", "counterexamples/edited.json"]) == 2
+    assert "is not a counterexample" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("fall")
+def test_a_plant_that_does_not_repeat_itself_is_told(capsys):
+    """What the file of the counterexample says is about its trace."""
+    count = "TIMES = [0]\n\n\n"
+    Path("fall.py").write_text(count + FALL.replace("    return", "    TIMES[0] += 1\n    return", 1))
+    text = Path("fall.py").read_text()
+    Path("fall.py").write_text(re.sub(r"return \[(.*?),", r"return [\1 + 1e-3 * TIMES[0],", text, count=1))
+    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
+    assert main([*command, "--json"]) == 1
+    (found,) = json.loads(capsys.readouterr().out)["result"]["requirements"]
+    assert found["trace_margin"] != (found["simpler"] or found["found"])["margin"]
+    assert found["trace_margin"] == json.loads(Path(found["file"]).read_text())["margin"]
+    trace = load_trace("counterexamples/up.npz")
+    assert float(trace.data["h"][0, :13].min()) == pytest.approx(found["trace_margin"], abs=1e-9)
+    assert main(command) == 1
+    assert "the plant does not repeat itself" in capsys.readouterr().out
+
+
 @dataclass(frozen=True)
 class Oscillator:
     """The oscillator, for processes that load it."""

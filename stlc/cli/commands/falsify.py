@@ -139,6 +139,7 @@ def falsify(
                 result = next(results)
             found.append(_written(source, simulator, result, output))
     failed = [*getattr(simulator, "findings", ()), *(() if workers is None else workers.findings)]
+    _require_simulations(found, failures=len(failed))
     document: FalsifiedSystem = {
         "target": target,
         "simulations": simulations,
@@ -313,6 +314,17 @@ def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:
 # ------------------------------------------------------------------------ counterexamples
 
 
+def _require_simulations(found: Sequence[FalsifiedRequirement], *, failures: int) -> None:
+    """Check that something was simulated.
+
+    Raises:
+        UsageError: U101, the conditions of the specification hold in no simulation.
+    """
+    rejected = sum(each["rejected"] for each in found)
+    if rejected and not failures and not any(each["simulations"] for each in found):
+        raise usage(f"`assume` or `where` excludes all of {rejected:,} points", "weaken these conditions")
+
+
 def _written(
     source: _Source, simulator: _Simulator, result: Falsification, folder: Path
 ) -> FalsifiedRequirement:
@@ -324,14 +336,22 @@ def _written(
 
     best = result.shrunk or result.found
     path = folder / f"{file_part(result.requirement, empty='requirement')}.json"
+    margin = math.nan if best is None else best.margin
     if best is not None:
         folder.mkdir(parents=True, exist_ok=True)
         trace = path.with_suffix(".npz")
-        save_trace(trace, simulator.trace(best.point[None]))
+        if source.target.plant is None:
+            save_trace(trace, simulator.trace(best.point[None]))
+        else:
+            repeated = _plant_of(simulator, path).repeated(
+                best.point, simulator.requirements.index(result.requirement)
+            )
+            save_trace(trace, repeated.trace)
+            margin = repeated.margin
         stored = {
             "format": FORMAT,
             "requirement": result.requirement,
-            "margin": best.margin,
+            "margin": margin,
             "trace": trace.name,
             "settings": source.settings(),
             "point": best.point.tolist(),
@@ -351,6 +371,7 @@ def _written(
         "strategies": result.strategies,
         "file": None if best is None else str(path),
         "replay": None if best is None else _command(source, path),
+        "trace_margin": None if best is None else margin,
     }
 
 
@@ -391,22 +412,25 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
         _optional(given.get("seed")) or 0,
     )
     changed = given.get("set")
-    before = {str(name): str(text) for name, text in changed.items()} if isinstance(changed, dict) else {}
-    simulator = again.simulator({**before, **overrides}, runs)
+    kept = {str(name): str(text) for name, text in changed.items()} if isinstance(changed, dict) else {}
+    simulator = again.simulator({**kept, **overrides}, runs)
     if stored["format"] == findings.FORMAT:
         point = _point(stored, simulator.space.dim, path)
         return findings.replayed(_plant_of(simulator, path), point, stored)
     index = _wanted(simulator.requirements, [stored["requirement"]])[0]
     point = _point(stored, simulator.space.dim, path)
-    margin = float(simulator.simulate(point[None], Focus(index)).margins[0])
+    outcome = simulator.simulate(point[None], Focus(index))
+    margin, inside = float(outcome.margins[0]), bool(outcome.admissible[0])
+    violated = inside and margin < -TOLERANCE
     if getattr(simulator, "findings", ()):
-        violated = {"reason": f"a violation of {stored['requirement']}"}
-        return findings.replayed(_plant_of(simulator, path), point, violated)
+        before = {"reason": f"a violation of {stored['requirement']}"}
+        return findings.replayed(_plant_of(simulator, path), point, before)
     different = _different(
         load_trace(path.parent / Path(str(stored["trace"])).name), simulator.trace(point[None])
     )
     document: ReplayedCounterexample = {
         "requirement": stored["requirement"],
+        "verdict": "out of scope" if not inside else "violated" if violated else "satisfied",
         "margin": margin,
         "stored_margin": stored["margin"],
         "identical": not different,
@@ -414,11 +438,11 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
     }
 
     def show() -> None:
-        verdict = "violated" if margin < -TOLERANCE else "satisfied"
+        verdict = document["verdict"] if inside else "out of scope (`assume` or `where` excludes it)"
         same = "the trace is the same, bit for bit" if not different else f"different: {', '.join(different)}"
         emit(f"{document['requirement']}: {verdict}, robustness {margin:.6g}; {same}")
 
-    return Answer(document, show, int(margin < -TOLERANCE))
+    return Answer(document, show, int(violated))
 
 
 def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:
@@ -468,6 +492,9 @@ def _stored(path: Path) -> dict[str, Any]:
             found["margin"] = float(found["margin"])  # an infinite one is a text
         except (ValueError, OverflowError):
             raise wrong from None
+        name = str(found["trace"])
+        if math.isnan(found["margin"]) or "\0" in name or Path(name).name != name or name in ("", ".."):
+            raise wrong
     return dict(found)
 
 
@@ -537,4 +564,9 @@ def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:
     simpler = each["simpler"]
     if simpler is not None and simpler["margin"] != found["margin"]:
         lines.append(f"  simpler: robustness {float(simpler['margin']):.4g}")
+    if each["trace_margin"] != (simpler or found)["margin"]:
+        lines += [
+            f"  the plant does not repeat itself: simulated again for the trace, {each['trace_margin']:.4g}",
+            "  (`limit: {fresh: true}` starts a process per simulation; seed random numbers in `reset`)",
+        ]
     return [*lines, f"  {each['replay']}"]

@@ -220,6 +220,7 @@ class FalsifiedRequirement(TypedDict):
     strategies: dict[str, int]
     file: str | None
     replay: str | None
+    trace_margin: Num | None
 
 
 class FalsifiedFinding(TypedDict):
@@ -252,6 +253,7 @@ class ReplayedCounterexample(TypedDict):
     """Counterexample that was simulated again, and how it differs from its trace."""
 
     requirement: str
+    verdict: Literal["violated", "satisfied", "out of scope"]
     margin: Num
     stored_margin: Num
     identical: bool
