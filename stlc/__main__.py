@@ -1,6 +1,7 @@
 """Execution of stlc as `python -m stlc`."""
 
 import gc
+import os
 import sys
 
 from stlc import stopping
@@ -11,6 +12,9 @@ GARBAGE = (10_000, 10, 50)
 
 def main() -> int:
     """Run the command line and return its exit code; Ctrl-C while modules are imported gives 130."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller, as by some daemons
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115, PTH123
     try:
         gc.set_threshold(*GARBAGE)
         stopping.arm()

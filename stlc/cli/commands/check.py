@@ -35,6 +35,9 @@ from stlc.registry import SEMANTICS
 if TYPE_CHECKING:
     from stlc.cli.check.outcome import Outcome
 
+MOST_SAMPLES = 2**31 - 1
+"""Samples of a chunk at most, as readers count them."""
+
 
 @command(
     "stlc check trace.npz",
@@ -125,6 +128,8 @@ def check(
     if not 0 <= tolerance < math.inf:
         raise usage(f"`--tolerance {tolerance}` is not a number from 0 on")
     require_claim(certify, fail_under)
+    if certify is not None:
+        _require_distinct(traces)
     if STDIN in traces:
         _require_alone(traces, certify, out, cluster)
     errors = uncertainties(parse_pairs(uncertain, "--uncertain", "SIGNAL=ERROR", "x=0.1m"))
@@ -148,7 +153,7 @@ def check(
         color = wants_color(sys.stdout)
         works = [
             Work(
-                *(name, question, reading.runs, path, chunk, color, COLOR.get()),
+                *(name, question, reading.runs, path, min(chunk, MOST_SAMPLES), color, COLOR.get()),
                 certify=certify is not None,
                 table=table is not None,
             )
@@ -244,6 +249,23 @@ def _expanded(names: Sequence[str], written: Sequence[Path]) -> list[str]:
     if not found:
         raise UsageError(Diagnostic("U102", f"no trace matches `{names[0]}`"))
     return found
+
+
+def _require_distinct(traces: Sequence[str]) -> None:
+    """Check that no recording is named twice, since `--certify` takes recordings as independent.
+
+    Raises:
+        UsageError: U101, two names lead to the same file.
+    """
+    known: dict[Path, str] = {}
+    for name in traces:
+        place = real(Path(name))
+        other = known.get(place)
+        if other is not None:
+            same = f"`{other}` and `{name}` are the same file"
+            message = f"`{name}` is named twice" if other == name else same
+            raise usage(f"{message}, and `--certify` counts independent traces", "name each trace once")
+        known[place] = name
 
 
 def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, list[str]]:

@@ -223,6 +223,8 @@ class Program:
                 words = [*front, *rest]
                 with PULSE.beating():
                     code = self.parser(name).main(args=words, prog_name=self.name, standalone_mode=False)
+                if stopped and code == INTERRUPTED:  # the parser turns Ctrl-C into an exit code
+                    code = report_error(SystemExit(stopped[0]), rest)
         except BaseException as error:  # the boundary
             code = report_error(SystemExit(stopped[0]) if stopped else error, rest)
         _flush()

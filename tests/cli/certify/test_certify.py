@@ -430,3 +430,21 @@ def test_bounds_on_traces_need_no_torch(traces: list[str]) -> None:
     )
     words = ["check", "s.stl", *traces, "--certify", ".95", "-q"]
     assert subprocess.run([sys.executable, "-c", program, *words], check=False).returncode == 0
+
+
+def test_a_recording_counts_once(traces: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "s.stl", traces[0], traces[1], traces[0], "--certify", ".5"]) == 2
+    assert f"`{traces[0]}` is named twice" in capsys.readouterr().err
+    Path("link.npz").symlink_to(traces[0])
+    assert main(["check", "s.stl", "*.npz", "--certify", ".5"]) == 2
+    assert f"`{traces[0]}` and `link.npz` are the same file" in capsys.readouterr().err
+    assert main(["check", "s.stl", traces[0], traces[0]]) == 0
+
+
+def test_seeds_of_a_certificate_are_apart(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = json.loads(file.read_text())
+    ((first, last),) = document["conditions"]["seeds"]
+    document["conditions"]["seeds"] = [[first, first], [first, last - 1]]
+    Path("twice.json").write_text(json.dumps(document))
+    assert main(["certify", "--verify", "twice.json"]) == 1
+    assert "conditions.seeds does not follow from the counts" in capsys.readouterr().out

@@ -418,3 +418,30 @@ def test_help_is_a_command(capsys):
         assert main(["help", *words]) == main([*words, "--help"]) == 0
         first, second = capsys.readouterr().out.split("Usage: ")[1:]
         assert first.rstrip() == second.rstrip()
+
+
+def test_ctrl_c_prints_one_json_document(boundary, capsys):
+    """The parser turns Ctrl-C into an exit code of its own."""
+
+    def action():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert boundary(action, "--json") == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    out, err = capsys.readouterr()
+    assert (json.loads(out)["exit_code"], err) == (130, "")
+
+
+@pytest.mark.parametrize("closed", ["stdin", "stdout", "stderr"])
+def test_closed_streams_are_no_bug(closed, tmp_path):
+    (tmp_path / "s.stl").write_text("signal a\nrequire low: always a < 2\n")
+    (tmp_path / "a.csv").write_text("t,a\n0,1\n0.1,1\n")
+    number = {"stdin": "0<&-", "stdout": ">&-", "stderr": "2>&-"}[closed]
+    words = f'"{sys.executable}" -m stlc check s.stl a.csv'
+    for more in ("", " --json"):
+        line = ["sh", "-c", f"{words}{more} {number}"]
+        assert subprocess.run(line, cwd=tmp_path, check=False, capture_output=True).returncode == 0
