@@ -112,6 +112,22 @@ def test_a_vector_of_too_many_components(tmp_path: Path) -> None:
         load_trace(tmp_path / "a.npz")
 
 
+@pytest.mark.parametrize("late", ["1", "go"])
+def test_a_column_holds_words_or_numbers_in_all_pieces(tmp_path: Path, late: str) -> None:
+    early = {"1": "go", "go": "1"}[late]
+    rows = [f"{k},{early if k < 15 else late}" for k in range(40)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,mode", *rows]))
+    found = []
+    for read in (
+        lambda reading: [load_trace(tmp_path / "a.csv", reading)],
+        lambda reading: list(pieces(tmp_path / "a.csv", 10, reading)),
+    ):
+        with pytest.raises(TraceError) as caught:
+            read(Reading(words={"mode": {"go": 1.0}}))
+        found.append(caught.value.diagnostics[0].code)
+    assert found == ["E603"] * 2
+
+
 @pytest.mark.parametrize("before", ["", "\n\n"])
 def test_a_wrong_cell_of_a_piece_has_the_line_of_the_file(tmp_path: Path, before: str) -> None:
     rows = [f"{k},{k}" for k in range(40)]

@@ -81,21 +81,23 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
         while before and not before[-1].strip():
             before += islice(file, 1) or [""]
         known, header = len(before), before[-1] if before else ""
-        blank = "\n" * (known - 1)
+        blank, kinds = "\n" * (known - 1), dict[int, bool]()
         while lines := list(islice(file, samples)):
             if any(map(str.strip, lines)):
                 body = "".join(lines).encode("latin-1")
-                yield of_table(path, _table_of_chunk(path, header, body, blank, known), only=only)
+                yield of_table(path, _table_of_chunk(path, header, body, blank, known, kinds), only=only)
             known += len(lines)
 
 
-def _table_of_chunk(path: Path, header: str, body: bytes, blank: str, known: int) -> Table:
+def _table_of_chunk(
+    path: Path, header: str, body: bytes, blank: str, known: int, kinds: dict[int, bool]
+) -> Table:
     """Columns of the lines `body`; `known` lines come before them, those of `blank` above the header."""
     head = header.encode("latin-1")
     try:
-        return table_of_text(path, head + body)
+        return table_of_text(path, head + body, kinds)
     except TraceError:  # again, so that the finding has the number of the line in the file
-        table_of_text(path, blank.encode() + head + b"\n" * (known - len(blank) - 1) + body)
+        table_of_text(path, blank.encode() + head + b"\n" * (known - len(blank) - 1) + body, kinds)
         raise
 
 
@@ -113,16 +115,23 @@ def read_csv(path: Path) -> Table:
     return table_of_text(path, _read(path))
 
 
-def table_of_text(path: Path, data: bytes) -> Table:
+def table_of_text(path: Path, data: bytes, kinds: dict[int, bool] | None = None) -> Table:
     """Return the columns of a `.csv` file whose content is `data`; `path` is used in messages.
 
     Raises TraceError in the same cases as `read_csv`.
+
+    Args:
+        path: path of the file.
+        data: its content, or the header and some lines of it.
+        kinds: whether a column contains words: index -> True or False, as far as earlier lines tell. It is
+            completed. None: there are no earlier lines.
     """
-    if len(data) >= LARGE and (table := _read_large(path, data)) is not None:
+    kinds = {} if kinds is None else kinds
+    if len(data) >= LARGE and (table := _read_large(path, data, kinds)) is not None:
         return table
     sheet = _sheet(path, data)
     names, units = _read_header(sheet)
-    texts = _text_columns(sheet, len(names))
+    texts = _text_columns(sheet, len(names), kinds)
     return Table(dict(zip(names, _read_body(sheet, len(names), texts), strict=True)), units)
 
 
@@ -134,8 +143,8 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _read_large(path: Path, data: bytes) -> Table | None:
-    """Read the columns of a large file of numbers in one step.
+def _read_large(path: Path, data: bytes, kinds: dict[int, bool]) -> Table | None:
+    """Read the columns of a large file of numbers in one step; `kinds` as of `table_of_text`.
 
     None is returned if the file contains something that only the slower reader can read.
     """
@@ -144,7 +153,7 @@ def _read_large(path: Path, data: bytes) -> Table | None:
         names, units = _read_header(sheet)
     except TraceError:
         return None
-    if _text_columns(sheet, len(names)):
+    if _text_columns(sheet, len(names), kinds):
         return None
     start = 0
     for _ in range(sheet.source.text.count("\n", 0, sheet.body_at)):
@@ -246,19 +255,18 @@ def _placed(source: Source, start: int, cells: Iterable[str]) -> Iterator[tuple[
         start += len(raw) + 1
 
 
-def _text_columns(sheet: _Sheet, width: int) -> frozenset[int]:
-    """Indices of the columns whose first non-empty cell is a word."""
-    words: set[int] = set()
-    open_ = set(range(width))
+def _text_columns(sheet: _Sheet, width: int, kinds: dict[int, bool]) -> frozenset[int]:
+    """Indices of the columns whose first non-empty cell is a word; `kinds` as of `table_of_text`."""
+    open_ = set(range(width)) - kinds.keys()
     for line in _FILLED.finditer(sheet.source.text, sheet.body_at):
         cells = line[0].split(sheet.delimiter)[:width]
         texts = {i: cell.strip().strip('"').strip() for i, cell in enumerate(cells) if i in open_}
         filled = {i for i, text in texts.items() if text}
-        words |= {i for i in filled if value_of(texts[i]) is None}
+        kinds |= {i: value_of(texts[i]) is None for i in filled}
         open_ -= filled
         if not open_:
             break
-    return frozenset(words)
+    return frozenset(i for i, word in kinds.items() if word)
 
 
 def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
