@@ -455,7 +455,7 @@ def test_bounds_of_random_numbers_contain_every_point(num, trace, width, seed) -
 
 
 @pytest.mark.bench
-@settings(max_examples=5000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
 @given(any_formula, any_trace, ends, widths, seeds)
 def test_bounds_of_many_formulas(written, trace, end, width, seed) -> None:
     check_formula(lowered(written), trace, end, width, seed)
