@@ -10,6 +10,7 @@ import numpy as np
 
 from stlc.assurance.campaign import CertificateVerification, compared, seed_ranges
 from stlc.assurance.certificate import Judged, Noun, Sample, together
+from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
@@ -89,8 +90,6 @@ class _Verdicts:
 
 def _judged_by_plans(task: Task, recording: DeploymentRecording) -> _Verdicts:
     """Verdicts by the specification of the plans; undecided where a drive ends before a window does."""
-    from stlc.assurance.model_simulator import in_scope
-
     found = executed_robustness(task, recording)
     judged = tuple(
         Judged(rule.name, rule.unit, low >= -TOLERANCE, high < -TOLERANCE, low)

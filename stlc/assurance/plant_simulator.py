@@ -277,8 +277,8 @@ class PlantSimulator:
             SystemFileError: S401, the simulation fails, as it did not before.
         """
         trace = self.trace(point[None])
-        low = self.monitor.check(trace, require=(self.requirements[requirement],)).requirements[0].high
-        return RepeatedSimulation(trace, float(low.min()))
+        verdict = self.monitor.check(trace, require=(self.requirements[requirement],))
+        return RepeatedSimulation(trace, float(verdict.requirements[0].high.min()))
 
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:  # noqa: ARG002
         """Simulate one point, (1, dim), and return its trace, with the specification.

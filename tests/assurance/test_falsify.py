@@ -278,6 +278,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     assert main(["falsify", "fall.stl", "--plant", "fall.yaml", "--simulations", "20"]) == 1
     text = capsys.readouterr().out
     assert "up: violated, robustness -" in text
+    assert "does not repeat itself" not in text
     assert "deep: no violation in 20 simulations" in text
     assert re.search(r"failed, error at t = \S+ s: RuntimeError: below the ground", text)
     replay = ["--plant", "fall.yaml", "--replay", "counterexamples/up.json"]
@@ -362,7 +363,7 @@ def test_an_edited_counterexample_is_none(changed, capsys):
 
 @pytest.mark.usefixtures("fall")
 def test_a_plant_that_does_not_repeat_itself_is_told(capsys):
-    """What the file of the counterexample says is about its trace."""
+    """The file of the counterexample has the robustness of its trace."""
     count = "TIMES = [0]\n\n\n"
     Path("fall.py").write_text(count + FALL.replace("    return", "    TIMES[0] += 1\n    return", 1))
     text = Path("fall.py").read_text()

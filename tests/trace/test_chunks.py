@@ -40,6 +40,13 @@ def test_a_clock_that_changes_between_pieces(tmp_path: Path, kind: str, row: str
     assert caught.value.diagnostics[0].code in ("E602", "E603")
 
 
+@pytest.mark.parametrize("text", ["", "\n", "\n\n \n"])
+def test_pieces_of_blank_lines(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(TraceError, match="it holds no samples"):
+        list(pieces(tmp_path / "a.csv", 7, Reading()))
+
+
 def test_pieces_of_what_cannot_be_cut(tmp_path: Path) -> None:
     (tmp_path / "a.mat").write_bytes(b"")
     with pytest.raises(StlcError, match="cannot be read in pieces"):

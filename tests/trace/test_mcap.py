@@ -197,6 +197,12 @@ def test_the_fields_of_a_time_stamp_may_have_any_order(
     assert load_trace(path).data["state.st"].tolist() == [[3.5, 3.5]]
 
 
+def test_a_time_stamp_that_is_no_number(tmp_path: Path) -> None:
+    text = b'{"st": {"sec": 1e999, "nanosec": -1e999}}'
+    path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])
+    assert np.isnan(load_trace(path).data["state.st"]).all()
+
+
 def test_names_that_utf_8_cannot_encode_are_replaced(tmp_path: Path) -> None:
     text = b'{"x\\ud800": 1}'
     path = a_log(tmp_path / "a.mcap", ("json", "jsonschema"), b"{}", [(0, text), (10**9, text)])

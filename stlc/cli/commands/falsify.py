@@ -564,9 +564,10 @@ def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:
     simpler = each["simpler"]
     if simpler is not None and simpler["margin"] != found["margin"]:
         lines.append(f"  simpler: robustness {float(simpler['margin']):.4g}")
-    if each["trace_margin"] != (simpler or found)["margin"]:
+    kept = each["trace_margin"]
+    if kept is not None and kept != (simpler or found)["margin"]:
         lines += [
-            f"  the plant does not repeat itself: simulated again for the trace, {each['trace_margin']:.4g}",
+            f"  the plant does not repeat itself: simulated again for the trace, {float(kept):.4g}",
             "  (`limit: {fresh: true}` starts a process per simulation; seed random numbers in `reset`)",
         ]
     return [*lines, f"  {each['replay']}"]

@@ -77,10 +77,7 @@ def chunks(path: Path, samples: int) -> Iterator[Recording]:
     """
     only = OneTrace(str(path))
     with path.open(encoding="latin-1") as file:  # every byte a letter, and every line ending `\n`
-        before = list(islice(file, 1))
-        while before and not before[-1].strip():
-            before += islice(file, 1) or [""]
-        known, header = len(before), before[-1] if before else ""
+        known, header = next(((at, line) for at, line in enumerate(file, 1) if line.strip()), (0, ""))
         blank, kinds = "\n" * (known - 1), dict[int, bool]()
         while lines := list(islice(file, samples)):
             if any(map(str.strip, lines)):

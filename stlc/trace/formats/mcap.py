@@ -155,7 +155,7 @@ def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
 
 
 def _of_json(data: bytes) -> Iterable[MessageNumber]:
-    return numbers_of(loads(data.decode()))
+    return numbers_of(loads(data.decode(json.detect_encoding(data))))
 
 
 def _protobuf(schema: Any) -> Decode:

@@ -198,7 +198,7 @@ def numbers_of(content: object) -> Iterator[MessageNumber]:
 
 def seconds_of(stamp: Mapping[str, float]) -> float:
     """Seconds of a time stamp, name of the field -> value, whose fields may stand in any order."""
-    return math.fsum(value if name in SECONDS else 1e-9 * value for name, value in stamp.items())
+    return sum(value if name in SECONDS else 1e-9 * value for name, value in stamp.items())
 
 
 def _walk(name: str, value: object, depth: int) -> Iterator[MessageNumber]:
