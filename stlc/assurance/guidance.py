@@ -23,7 +23,7 @@ from stlc.signature import Signature
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Signals of simulations: name -> (time, batch)."""
-SAMPLES = 10
+SAMPLES = 9
 """Simulations from which the sizes of margins are measured."""
 ALIKE = 3.0
 """Ratio of sizes up to which predicates are not scaled."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sensitive import SensitiveClimbing
 from stlc.assurance.strategies import (
     PIECES,
+    AlternatingVertices,
     CoarseSampling,
     ConstantVertices,
     CovarianceAdaptation,
@@ -26,7 +27,7 @@ from stlc.assurance.strategies import (
     VertexSampling,
     vertex_sampling,
 )
-from stlc.assurance.surrogate import SurrogateSearch, TrustRegionSearch
+from stlc.assurance.surrogate import SurrogateSearch, TrendSampling, TrustRegionSearch
 
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
@@ -34,8 +35,8 @@ OPENING = 12
 """Points of random pieces with which a search begins, after vertices and constant inputs."""
 SMALL_OPENING = 4
 """The same in a small space, all of whose vertices come first."""
-PERTURBATIONS = 4
-"""Small perturbations of the best vertex, before these points."""
+PERTURBATIONS = 16
+"""Small perturbations of the best vertex at most, before these points, unless there are several inputs."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
 BLIND, BLIND_TURNS = 4, 12
@@ -52,10 +53,17 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True)
 class _Opening:
-    """Points with which a search begins: those of one strategy, as many as given; None: all that it has."""
+    """Points with which a search begins: those of one strategy, as many as given.
+
+    Attributes:
+        strategy: the strategy.
+        count: number of its points; None: all that it has.
+        worthwhile: condition under which it goes on.
+    """
 
     strategy: Strategy
     count: int | None = 1
+    worthwhile: Callable[[], bool] = lambda: True
 
 
 class Portfolio:
@@ -96,12 +104,13 @@ class Portfolio:
         self._guided = not random and not space.sparse and graded and space.dim > 0
         uniform, even = UniformSampling(space, generator), VertexSampling(space, generator)
         vertices = vertex_sampling(space, generator)
-        self._vertices: tuple[Strategy, Strategy] = even, vertices
+        self._even, self._vertices = even, vertices
         self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, even]
         self._samplers: list[Strategy] = [vertices, uniform]
+        trends: list[Strategy] = []
         if self._guided and any(len(block.values) > max(PIECES) for block in space.blocks):
-            simple = CoarseSampling(space, generator), SettlingInputs(space, generator)
-            self._samplers = [*simple, vertices]
+            trends.append(TrendSampling(space, generator))
+            self._samplers = [*trends, CoarseSampling(space, generator), SettlingInputs(space, generator)]
         self._leading: list[Strategy] = [surrogate]
         self._drawn = [*self._samplers]
         self._others: list[Strategy] = []
@@ -122,8 +131,8 @@ class Portfolio:
                     self._leading, self._drawn = [adaptation, surrogate], [adaptation, uniform]
                 else:
                     self._others.append(adaptation)
-            constant = ConstantVertices(space, generator)
-            self._first.extend(self._opening(space, constant, perturbation, climb))
+            self._late += trends
+            self._first.extend(self._opening(space, generator, perturbation, climb))
         elif not random and not graded:
             self._blind = [*[uniform] * (BLIND_TURNS - 1), even]
             self._first.append(_Opening(even, BLIND))
@@ -131,18 +140,24 @@ class Portfolio:
         self._values: deque[float] = deque(maxlen=FLAT_VALUES)
 
     def _opening(
-        self, space: SearchSpace, constant: Strategy, perturbation: Strategy, climb: Strategy
+        self, space: SearchSpace, generator: np.random.Generator, perturbation: Perturbation, climb: Strategy
     ) -> Sequence[_Opening]:
         """Points with which a guided search begins."""
-        even, vertices = self._vertices
+        constant = ConstantVertices(space, generator)
         if space.small:
             uniform = _Opening(self._samplers[-1], SMALL_OPENING)
-            return _Opening(even, 2), _Opening(constant, None), uniform, _Opening(climb, None)
+            return _Opening(self._even, 2), _Opening(constant, None), uniform, _Opening(climb, None)
         drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
-        return (
-            *(_Opening(even, 2), _Opening(constant, 2), _Opening(vertices, 5), _Opening(constant, None)),
-            *(_Opening(perturbation, PERTURBATIONS), *drawn[:4], _Opening(climb, None), *drawn[4:]),
+        simple = (
+            _Opening(AlternatingVertices(space, generator)),
+            _Opening(VertexSampling(space, generator, (1.0,))),
+            *(_Opening(constant, 2), _Opening(self._vertices, 5)),
         )
+        constants, descent = _Opening(constant, None), _Opening(climb, None)
+        if len(space.blocks) > 1:
+            return (*simple, *drawn[:4], descent, constants, *drawn[4:])
+        perturbed = _Opening(perturbation, PERTURBATIONS, lambda: perturbation.scattered)
+        return (*simple, constants, perturbed, *drawn[:4], descent, *drawn[4:])
 
     @property
     def flat(self) -> bool:
@@ -154,12 +169,12 @@ class Portfolio:
         """Return the next point and the strategy that proposes it."""
         while self._first:
             opening = self._first.popleft()
-            point = opening.strategy.propose()
+            point = opening.strategy.propose() if opening.worthwhile() else None
             if point is None:
                 continue
             if opening.count is None or opening.count > 1:
                 left = None if opening.count is None else opening.count - 1
-                self._first.appendleft(_Opening(opening.strategy, left))
+                self._first.appendleft(replace(opening, count=left))
             return Proposal(opening.strategy, point)
         while True:
             strategy = self._chosen()

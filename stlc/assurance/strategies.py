@@ -6,9 +6,10 @@ import importlib.util
 import math
 import warnings
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, cycle
 from typing import Any
 
 import numpy as np
@@ -37,12 +38,19 @@ LOOKING_BACK, RECENT = 0.5, 0.35
 geometric distribution of the number of pieces that the change lies before it."""
 PERTURBED = (0.02, 0.05)
 """Least and greatest width of a perturbation of all values."""
+SCATTER, JUDGED = 0.05, 3
+"""Standard deviation of the robustness among perturbations, as a share of that among other points, from which
+it counts as scattered; and the number of perturbations that are judged at least."""
+REMEMBERED = 100
+"""Points at most by which the scatter is judged."""
 SHORTEST, LONGEST = 0.01, 0.5
 """Half periods of periodic inputs, as shares of the duration."""
 SWEPT = 12
 """Half periods that are tried before the best is refined."""
 ENDS = 2.0 / 3.0
 """Share of the values of vertices at the ends of their ranges."""
+SHARES = (1.0, ENDS)
+"""The same for vertices of several inputs, for one point after the other."""
 PIECES = (1, 2, 3, 5)
 """Maximum numbers of pieces of coarse inputs; one of them is drawn for each point."""
 SETTLING = (0.1, 0.2, 0.5)
@@ -120,31 +128,50 @@ class UniformSampling(Strategy):
         return self.generator.random(self.space.dim)
 
 
+class AlternatingVertices(Strategy):
+    """Inputs that switch between the ends of their ranges after every piece.
+
+    Each input begins at a random end, and all other coordinates are at random ends. Free switching times
+    divide the duration evenly.
+    """
+
+    name = "alternating vertices"
+
+    def propose(self) -> Point:
+        point: Point = np.round(self.generator.random(self.space.dim))
+        for block in self.space.blocks:
+            count, times = len(block.values), len(block.times)
+            point[list(block.values)] = (np.arange(count) + self.generator.integers(2)) % 2
+            point[list(block.times)] = quantiles_of(np.arange(1, times + 1) / (times + 1))
+        return point
+
+
 class VertexSampling(Strategy):
-    """Each value independently at the low end, at the high end, or uniform between them, a third each."""
+    """Each value independently at a random end of its range, or uniform between the ends."""
 
     name = "vertices"
 
+    def __init__(
+        self, space: SearchSpace, generator: np.random.Generator, ends: Sequence[float] = (ENDS,)
+    ) -> None:
+        """Draw points whose values are at ends with the probabilities `ends`, of one point each in turn."""
+        super().__init__(space, generator)
+        self._ends = cycle(ends)
+
     def propose(self) -> Point:
-        return _values(self.space, self.generator, np.arange(self.space.dim), ENDS)
+        return _values(self.space, self.generator, np.arange(self.space.dim), next(self._ends))
 
 
 class InputVertices(VertexSampling):
     """Vertices at which each input has its own share of values at the high end, drawn for each point.
 
-    So there are points at which one input is high nearly always and another one hardly ever. At every second
-    point a third of the values is uniform between the ends.
+    So there are points at which one input is high nearly always and another one hardly ever.
     """
 
     name = "input vertices"
 
-    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
-        super().__init__(space, generator)
-        self._proposed = 0
-
     def propose(self) -> Point:
-        self._proposed += 1
-        ends = 1.0 if self._proposed % 2 else ENDS
+        ends = next(self._ends)
         point = _values(self.space, self.generator, np.arange(self.space.dim), ends)
         for block in self.space.blocks:
             share = self.generator.random()
@@ -153,10 +180,15 @@ class InputVertices(VertexSampling):
         return point
 
 
-def vertex_sampling(space: SearchSpace, generator: np.random.Generator) -> VertexSampling:
-    """Vertices for a space: with a share of high values per input if there are several inputs."""
+def vertex_sampling(
+    space: SearchSpace, generator: np.random.Generator, ends: Sequence[float] = SHARES
+) -> VertexSampling:
+    """Vertices for a space: with a share of high values per input if there are several inputs.
+
+    `ends`: probabilities that a value of several inputs is at an end, of one point each in turn.
+    """
     several = len(space.blocks) > 1 and not space.small
-    return InputVertices(space, generator) if several else VertexSampling(space, generator)
+    return InputVertices(space, generator, ends) if several else VertexSampling(space, generator)
 
 
 class CoarseSampling(Strategy):
@@ -386,6 +418,28 @@ class Perturbation(LocalSearch):
     """
 
     name = "perturbation"
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._own: deque[float] = deque(maxlen=REMEMBERED)
+        self._others: deque[float] = deque(maxlen=REMEMBERED)
+
+    @property
+    def scattered(self) -> bool:
+        """True if the robustness varies among perturbations as among other points, or too few are known."""
+        if len(self._own) < JUDGED or not self._others:
+            return True
+        return float(np.std(self._own)) >= SCATTER * float(np.std(self._others))
+
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
+        super().tell(point, value, decided)
+        if math.isfinite(value):
+            self._own.append(value)
+
+    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
+        super().observe(point, value, decided)
+        if math.isfinite(value):
+            self._others.append(value)
 
     def propose(self) -> Point | None:
         if self._start.point is None:

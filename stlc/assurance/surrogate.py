@@ -1,14 +1,15 @@
-"""Search by a surrogate: a Gaussian process of the robustness chooses which of many candidates is simulated.
+"""Search by a surrogate: a model of the robustness chooses which of many candidates is simulated.
 
 A simulation tells more than whether its point is better than the best one. A Gaussian process (Rasmussen and
 Williams 2006), fitted to all points so far or to those near a good one, predicts the robustness of candidates
 with an uncertainty. The candidate with the least lower confidence bound (Srinivas and others 2010) is
-simulated.
+simulated. A linear model, which needs few points, does the same for random vertices.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from statistics import NormalDist
 
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.strategies import HillClimbing, Told, UniformSampling, vertex_sampling
+from stlc.assurance.strategies import ENDS, HillClimbing, Strategy, Told, UniformSampling, vertex_sampling
 
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)
 """Length scales that are compared, times the root of the number of coordinates."""
@@ -40,6 +41,14 @@ FIRST_WIDTH, LEAST_WIDTH, MOST_WIDTH = 0.2, 0.02, 0.5
 """Standard deviations of the changes in a trust region: at first, and their bounds."""
 WIDENED, NARROWED, FAILURES = 1.5, 0.7, 8
 """Factors of the width after progress, and after this number of proposals without any."""
+SCREENED = 100
+"""Vertices of which a linear model chooses one."""
+SLOPE = 3.0
+"""Variance of the slopes of the linear model before it has seen points, times that of the robustness."""
+LEAST_NOISE = 0.05
+"""Least variance of what the linear model leaves unexplained, times that of the robustness."""
+MODELLED = 1000
+"""Last points to which the linear model is fitted."""
 DIGITS = 6
 """Decimal digits of what is compared, so that rounding, which depends on the machine, decides nothing."""
 
@@ -238,3 +247,59 @@ class TrustRegionSearch(SurrogateSearch):
         steps = np.where(changed, self._width * generator.standard_normal(dim), 0.0)
         moved: Point = np.clip(centre + steps, 0.0, 1.0)
         return moved
+
+
+class TrendSampling(Strategy):
+    """The least robust one of many random vertices, as expected by a linear model.
+
+    How much each input is high often tells where violations are, though not which of the points there is one.
+    So the model knows the mean of each input and all other numbers, and nothing else: it learns from few
+    points, and what it chooses is otherwise random, whereas neighbours of the best point share its faults.
+    Its coefficients are drawn from their distribution after the points so far (Thompson 1933), so that it
+    explores what it does not know yet.
+    """
+
+    name = "trend"
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._vertices = vertex_sampling(space, generator, (ENDS,))
+        self._groups = [list(each) for each in space.handles]
+        self._features: deque[NDArray[np.float64]] = deque(maxlen=MODELLED)
+        self._values: deque[float] = deque(maxlen=MODELLED)
+
+    def propose(self) -> Point:
+        if len(self._values) < len(self._groups) + 3:
+            return self._vertices.propose()
+        candidates = [self._vertices.propose() for _ in range(SCREENED)]
+        expected = np.array([self._described(each) for each in candidates]) @ self._coefficients()
+        return candidates[int(np.argmin(np.round(expected, DIGITS)))]
+
+    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
+        super().tell(point, value, decided)
+        self.observe(point, value, decided)
+
+    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: ARG002
+        if math.isfinite(value):
+            self._features.append(self._described(point))
+            self._values.append(value)
+
+    def _described(self, point: Point) -> NDArray[np.float64]:
+        """One, and the mean of each input and the other numbers, from -1 to 1: (1 + groups,)."""
+        return np.array([1.0, *(2.0 * point[each].mean() - 1.0 for each in self._groups)])
+
+    def _coefficients(self) -> NDArray[np.float64]:
+        """Coefficients (1 + groups,), drawn from their distribution given the points so far.
+
+        It is normal if that of the noise and, before the first point, of the slopes is (Bayesian linear
+        regression, Rasmussen and Williams 2006, section 2.1). The constant is free.
+        """
+        features, values = np.array(self._features), _normal_scores(np.array(self._values))
+        precision = np.full(features.shape[1], 1.0 / SLOPE)
+        precision[0] = JITTER
+        covariance = np.linalg.inv(features.T @ features + np.diag(precision))
+        means = covariance @ features.T @ values
+        noise = max(float(((values - features @ means) ** 2).mean()), LEAST_NOISE)
+        drawn = np.linalg.cholesky(noise * covariance) @ self.generator.standard_normal(len(means))
+        found: NDArray[np.float64] = means + drawn
+        return found

@@ -290,7 +290,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
 @pytest.mark.usefixtures("fall")
 def test_a_failure_is_a_file_that_replays(capsys):
     command = ["falsify", "fall.stl", "--plant", "fall.yaml"]
-    assert main([*command, "--require", "deep", "--simulations", "8", "--json"]) == 1
+    assert main([*command, "--require", "deep", "--simulations", "12", "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
     assert not misfits(document, load_schema("falsify/1"))
     result = document["result"]

@@ -11,6 +11,7 @@ from stlc.assurance import strategies
 from stlc.assurance.falsify import coverage
 from stlc.assurance.search_space import SearchSpace, SignalBlock
 from stlc.assurance.strategies import (
+    AlternatingVertices,
     CoarseSampling,
     CovarianceAdaptation,
     GradientVertices,
@@ -304,7 +305,7 @@ def test_vertices_of_inputs_differ_in_the_share_of_high_values():
         SignalBlock("brake", tuple(range(40, 80)), tuple(range(80, 119))),
     )
     space = SearchSpace(121, blocks)  # the last two coordinates belong to no input
-    drawn = InputVertices(space, np.random.default_rng(3))
+    drawn = InputVertices(space, np.random.default_rng(3), (1.0, 2 / 3))
     points = np.stack([drawn.propose() for _ in range(400)])
     assert 0.0 <= points.min() <= points.max() <= 1.0
     values, times, rest = points[:, :80], points[:, 80:119], points[:, 119:]
@@ -316,3 +317,22 @@ def test_vertices_of_inputs_differ_in_the_share_of_high_values():
     shares = values[::2].reshape(200, 2, 40).mean(2)  # of each input at each point
     assert shares.std(0) == pytest.approx([12**-0.5] * 2, abs=0.04)  # uniform, rather than around 1/2
     assert abs(np.corrcoef(shares.T)[0, 1]) < 0.2
+
+
+def test_alternating_vertices_switch_after_every_piece():
+    blocks = (
+        SignalBlock("throttle", tuple(range(6)), fractions=tuple(np.arange(6) / 6)),
+        SignalBlock("brake", (6, 7, 8, 9), (10, 11, 12)),
+    )
+    space = SearchSpace(14, blocks)  # the last coordinate belongs to no input
+    alternating = AlternatingVertices(space, np.random.default_rng(3))
+    points = np.stack([alternating.propose() for _ in range(64)])
+    for values in (points[:, :6], points[:, 6:10]):
+        assert (np.abs(np.diff(values)) == 1.0).all()
+        assert set(np.unique(values[:, 0])) == {0.0, 1.0}
+    assert len(np.unique(points[:, [0, 6, 13]], axis=0)) == 8  # each begins at its own end
+    drawn = np.random.default_rng(0).random((4000, 3))
+    left = np.cumprod(drawn ** (1 / np.array([3, 2, 1])), 1)  # share of the duration after each time
+    assert 1.0 - left.mean(0) == pytest.approx([0.25, 0.5, 0.75], abs=0.02)
+    left = np.cumprod(points[0, 10:13] ** (1 / np.array([3, 2, 1])))
+    assert 1.0 - left == pytest.approx([0.25, 0.5, 0.75])

@@ -8,7 +8,13 @@ import pytest
 from stlc.assurance.portfolio import Portfolio
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.strategies import Strategy, UniformSampling
-from stlc.assurance.surrogate import CANDIDATES, RobustnessProcess, SurrogateSearch, TrustRegionSearch
+from stlc.assurance.surrogate import (
+    CANDIDATES,
+    RobustnessProcess,
+    SurrogateSearch,
+    TrendSampling,
+    TrustRegionSearch,
+)
 
 DIM = 6
 TARGET = np.linspace(0.15, 0.85, DIM)
@@ -144,12 +150,52 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
         points.append(proposal.point)
         portfolio.tell(proposal, float(index % 7))
     constant = ["constant vertices"] * 2
-    assert names[:11] == ["vertices"] * 2 + constant + ["input vertices"] * 5 + constant
-    assert names[11:15] == ["perturbation"] * 4
+    assert names[:9] == ["alternating vertices", "vertices", *constant, *["input vertices"] * 5]
+    assert names[9:15] == ["trend", "coarse", "settling", "trend", *constant]
     assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
     for surrogate in ("surrogate", "trust region"):
-        assert names[27:].count(surrogate) == pytest.approx(1 / 3 * len(names[27:]), abs=2)
-    assert {"hill climbing", "periodic"} <= set(names)
+        assert names[23:].count(surrogate) == pytest.approx(1 / 3 * len(names[23:]), abs=2)
+    assert {"hill climbing", "perturbation", "periodic"} <= set(names)
+
+
+@pytest.mark.parametrize(("scatter", "count"), [(1.0, 16), (0.01, 3)])
+def test_the_best_vertex_of_one_input_is_perturbed_while_robustness_scatters_there(
+    scatter: float, count: int
+):
+    space = SearchSpace(8, (SignalBlock("reference", tuple(range(8))),))
+    portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
+    names = []
+    for index in range(30):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        own = names[-1] == "perturbation"
+        portfolio.tell(proposal, 1.0 + (scatter if own else 1.0) * float(index % 7))
+    assert names[9 : 9 + count] == ["perturbation"] * count
+    assert names[9 + count :][:3] == ["trend", "coarse", "settling"]
+
+
+def test_a_trend_of_the_means_of_inputs_is_seen_in_few_points_that_scatter_much():
+    blocks = tuple(
+        SignalBlock(name, tuple(range(at, at + 20))) for name, at in (("throttle", 0), ("brake", 20))
+    )
+    space, scatter = SearchSpace(40, blocks), np.random.default_rng(8)
+
+    def value(point):
+        return float(point[:20].mean() - 0.5 * point[20:].mean() + 0.2 * scatter.standard_normal())
+
+    throttle, brake = [], []
+    for seed in range(20):
+        strategy = TrendSampling(space, np.random.default_rng(seed))
+        first = strategy.propose()  # nothing is known yet
+        strategy.tell(first, value(first))
+        for point in np.random.default_rng(100 + seed).random((14, 40)):
+            strategy.observe(np.round(point), value(np.round(point)))
+        strategy.observe(np.zeros(40), np.inf)  # not admissible
+        chosen = np.stack([strategy.propose() for _ in range(5)])
+        assert 0.15 < ((chosen > 0.0) & (chosen < 1.0)).mean() < 0.5  # not only ends
+        throttle.append(chosen[:, :20].mean())
+        brake.append(chosen[:, 20:].mean())
+    assert np.mean(throttle) < 0.35 < 0.6 < np.mean(brake)
 
 
 def test_where_robustness_is_no_guide_a_search_begins_with_vertices_and_goes_on_at_random():
@@ -187,12 +233,12 @@ def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.M
     block = SignalBlock("throttle", tuple(range(8)))
     portfolio = Portfolio(SearchSpace(8, (block,)), np.random.default_rng(0), lambda _: None)
     names = []
-    for index in range(90):
+    for index in range(120):
         proposal = portfolio.next()
         names.append(proposal.strategy.name)
         progress = 5.0 if names[-1] == "hill climbing" else 0.0
         portfolio.tell(proposal, 1.0 + index % 7 - progress)
     late = names[-60:]
-    drawn = sum(late.count(each) for each in ("coarse", "settling", "vertices"))
+    drawn = sum(late.count(each) for each in ("trend", "coarse", "settling"))
     assert drawn == pytest.approx(20, abs=3)  # more, as some strategies have nothing to propose
     assert late.count("hill climbing") > 20 > late.count("surrogate") >= 3
