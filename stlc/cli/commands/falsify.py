@@ -386,13 +386,17 @@ def _violation(found: Counterexample) -> Any:
 
 def _command(source: _Source, path: Path) -> str:
     """Command that replays a counterexample."""
-    target = source.target
-    words = ["stlc", "falsify", target.name]
+    from stlc.rundir import LATEST, RunDir
+
+    target, name = source.target, source.target.name
+    if name == LATEST:  # it may be another run later
+        name = RunDir.open(name, source.runs).shown
+    words = ["stlc", "falsify", name]
     if target.plant is not None:
         words += ["--plant", str(target.plant)]
     if target.system is not None:
         words += ["--system", target.system]
-    if not target.model and source.runs != RUNS:
+    if not target.model and source.runs != RUNS and name == target.name:
         words += ["--runs", str(source.runs)]
     return shlex.join([*words, "--replay", str(path)])
 
