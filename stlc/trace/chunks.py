@@ -129,4 +129,5 @@ class _Clock:
                 f"time in `{self.name}` is not uniform: t[{self.samples + i}] = {times[i]:.6g} s, "
                 f"where {wanted[i]:.6g} s was expected"
             )
-            raise TraceError(Diagnostic("E602", message, help=(resample_advice(self.dt),)))
+            first = "a larger --chunk  if the times are rounded: the first chunk determines their step"
+            raise TraceError(Diagnostic("E602", message, help=(first, resample_advice(self.dt))))

@@ -40,6 +40,19 @@ def test_a_clock_that_changes_between_pieces(tmp_path: Path, kind: str, row: str
     assert caught.value.diagnostics[0].code in ("E602", "E603")
 
 
+def test_a_step_that_rounded_times_of_the_first_piece_do_not_tell(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t,x\n" + "".join(f"{k / 30:.3f},{k}\n" for k in range(9_000)))
+    whole = load_trace(path)
+    with pytest.raises(TraceError) as caught:
+        list(pieces(path, 5, Reading()))
+    (found,) = caught.value.diagnostics
+    assert found.code == "E602"
+    assert found.help[0].startswith("a larger --chunk ")
+    parts = list(pieces(path, 3_000, Reading()))
+    assert np.array_equal(np.concatenate([part.data["x"][0] for part in parts]), whole.data["x"][0])
+
+
 @pytest.mark.parametrize("text", ["", "\n", "\n\n \n"])
 def test_pieces_of_blank_lines(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.csv").write_text(text)
