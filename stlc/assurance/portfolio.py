@@ -144,19 +144,18 @@ class Portfolio:
     ) -> Sequence[_Opening]:
         """Points with which a guided search begins."""
         constant = ConstantVertices(space, generator)
+        constants, descent = _Opening(constant, None), _Opening(climb, None)
+        perturbed = _Opening(perturbation, PERTURBATIONS, lambda: perturbation.scattered)
         if space.small:
             uniform = _Opening(self._samplers[-1], SMALL_OPENING)
-            return _Opening(self._even, 2), _Opening(constant, None), uniform, _Opening(climb, None)
+            return _Opening(self._even, 2), constants, uniform, perturbed, descent
         drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
         simple = (
-            _Opening(AlternatingVertices(space, generator)),
-            _Opening(VertexSampling(space, generator, (1.0,))),
+            _Opening(AlternatingVertices(space, generator), None),
             *(_Opening(constant, 2), _Opening(self._vertices, 5)),
         )
-        constants, descent = _Opening(constant, None), _Opening(climb, None)
         if len(space.blocks) > 1:
             return (*simple, *drawn[:4], descent, constants, *drawn[4:])
-        perturbed = _Opening(perturbation, PERTURBATIONS, lambda: perturbation.scattered)
         return (*simple, constants, perturbed, *drawn[:4], descent, *drawn[4:])
 
     @property

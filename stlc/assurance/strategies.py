@@ -129,21 +129,31 @@ class UniformSampling(Strategy):
 
 
 class AlternatingVertices(Strategy):
-    """Inputs that switch between the ends of their ranges after every piece.
+    """Two opposite points at which inputs switch between the ends of their ranges after every piece.
 
-    Each input begins at a random end, and all other coordinates are at random ends. Free switching times
-    divide the duration evenly.
+    At the first point each input begins at a random end, and all other coordinates are at random ends. Free
+    switching times divide the duration evenly.
     """
 
     name = "alternating vertices"
 
-    def propose(self) -> Point:
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._left = self._points()
+
+    def propose(self) -> Point | None:
+        return next(self._left, None)
+
+    def _points(self) -> Iterator[Point]:
         point: Point = np.round(self.generator.random(self.space.dim))
         for block in self.space.blocks:
-            count, times = len(block.values), len(block.times)
-            point[list(block.values)] = (np.arange(count) + self.generator.integers(2)) % 2
-            point[list(block.times)] = quantiles_of(np.arange(1, times + 1) / (times + 1))
-        return point
+            values = np.arange(len(block.values)) + self.generator.integers(2)
+            point[list(block.values)] = values % 2
+        for vertex in (point, 1.0 - point):
+            for block in self.space.blocks:
+                count = len(block.times)
+                vertex[list(block.times)] = quantiles_of(np.arange(1, count + 1) / (count + 1))
+            yield vertex
 
 
 class VertexSampling(Strategy):

@@ -325,8 +325,14 @@ def test_alternating_vertices_switch_after_every_piece():
         SignalBlock("brake", (6, 7, 8, 9), (10, 11, 12)),
     )
     space = SearchSpace(14, blocks)  # the last coordinate belongs to no input
-    alternating = AlternatingVertices(space, np.random.default_rng(3))
-    points = np.stack([alternating.propose() for _ in range(64)])
+    pairs = []
+    for seed in range(40):
+        alternating = AlternatingVertices(space, np.random.default_rng(seed))
+        pairs.append((alternating.propose(), alternating.propose()))
+        assert alternating.propose() is None
+    points = np.concatenate(pairs)
+    not_times = [*range(10), 13]
+    assert all((first + second)[not_times].tolist() == [1.0] * 11 for first, second in pairs)
     for values in (points[:, :6], points[:, 6:10]):
         assert (np.abs(np.diff(values)) == 1.0).all()
         assert set(np.unique(values[:, 0])) == {0.0, 1.0}
