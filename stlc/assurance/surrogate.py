@@ -264,16 +264,19 @@ class TrendSampling(Strategy):
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
         self._vertices = vertex_sampling(space, generator, (ENDS,))
-        self._groups = [list(each) for each in space.handles]
+        self._averages = np.zeros((space.dim, len(space.handles)))
+        for index, each in enumerate(space.handles):
+            self._averages[list(each), index] = 1.0 / len(each)
         self._features: deque[NDArray[np.float64]] = deque(maxlen=MODELLED)
         self._values: deque[float] = deque(maxlen=MODELLED)
 
     def propose(self) -> Point:
-        if len(self._values) < len(self._groups) + 3:
+        if len(self._values) < self._averages.shape[1] + 3:
             return self._vertices.propose()
-        candidates = [self._vertices.propose() for _ in range(SCREENED)]
-        expected = np.array([self._described(each) for each in candidates]) @ self._coefficients()
-        return candidates[int(np.argmin(np.round(expected, DIGITS)))]
+        candidates = np.array([self._vertices.propose() for _ in range(SCREENED)])
+        expected = self._described(candidates) @ self._coefficients()
+        chosen: Point = candidates[int(np.argmin(np.round(expected, DIGITS)))]
+        return chosen
 
     def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
         super().tell(point, value, decided)
@@ -281,12 +284,15 @@ class TrendSampling(Strategy):
 
     def observe(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: ARG002
         if math.isfinite(value):
-            self._features.append(self._described(point))
+            self._features.append(self._described(point[None])[0])
             self._values.append(value)
 
-    def _described(self, point: Point) -> NDArray[np.float64]:
-        """One, and the mean of each input and the other numbers, from -1 to 1: (1 + groups,)."""
-        return np.array([1.0, *(2.0 * point[each].mean() - 1.0 for each in self._groups)])
+    def _described(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Features (count, 1 + groups) of points: one, and the mean of each input and the other numbers.
+
+        Means and numbers are from -1 to 1.
+        """
+        return np.column_stack((np.ones(len(points)), 2.0 * points @ self._averages - 1.0))
 
     def _coefficients(self) -> NDArray[np.float64]:
         """Coefficients (1 + groups,), drawn from their distribution given the points so far.
