@@ -36,7 +36,8 @@ OPENING = 12
 SMALL_OPENING = 4
 """The same in a small space, all of whose vertices come first."""
 PERTURBATIONS = 16
-"""Small perturbations of the best vertex at most, before these points, unless there are several inputs."""
+"""Greatest number of small perturbations of the best point, before these points and in a small space. Large
+spaces with several inputs have none."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
 BLIND, BLIND_TURNS = 4, 12
@@ -166,15 +167,15 @@ class Portfolio:
 
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
-        while self._first:
-            opening = self._first.popleft()
+        while (opening := next((each for each in self._first if each.strategy.ready), None)) is not None:
+            index = self._first.index(opening)
             point = opening.strategy.propose() if opening.worthwhile() else None
-            if point is None:
-                continue
-            if opening.count is None or opening.count > 1:
-                left = None if opening.count is None else opening.count - 1
-                self._first.appendleft(replace(opening, count=left))
-            return Proposal(opening.strategy, point)
+            if point is None or opening.count == 1:
+                del self._first[index]
+            elif opening.count is not None:
+                self._first[index] = replace(opening, count=opening.count - 1)
+            if point is not None:
+                return Proposal(opening.strategy, point)
         while True:
             strategy = self._chosen()
             point = strategy.propose()

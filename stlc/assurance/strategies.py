@@ -38,9 +38,9 @@ LOOKING_BACK, RECENT = 0.5, 0.35
 geometric distribution of the number of pieces that the change lies before it."""
 PERTURBED = (0.02, 0.05)
 """Least and greatest width of a perturbation of all values."""
-SCATTER, JUDGED = 0.05, 3
-"""Standard deviation of the robustness among perturbations, as a share of that among other points, from which
-it counts as scattered; and the number of perturbations that are judged at least."""
+SCATTER, JUDGED = 0.1, 3
+"""Interquartile range of the robustness of perturbations, as a share of that of other points, above which it
+counts as scattered; and the number of perturbations that are judged at least."""
 REMEMBERED = 100
 """Points at most by which the scatter is judged."""
 SHORTEST, LONGEST = 0.01, 0.5
@@ -72,6 +72,11 @@ class Strategy(ABC):
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         self.space, self.generator = space, generator
         self.best = math.inf
+
+    @property
+    def ready(self) -> bool:
+        """False if the strategy waits for the outcomes of other points."""
+        return True
 
     @abstractmethod
     def propose(self) -> Point | None:
@@ -289,6 +294,10 @@ class LocalSearch(Strategy):
         super().__init__(space, generator)
         self._start = _Start()
 
+    @property
+    def ready(self) -> bool:
+        return self._start.point is not None
+
     def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
         super().tell(point, value, decided)
         self._start.add(Told(point, value, decided))
@@ -433,16 +442,16 @@ class Perturbation(LocalSearch):
         super().__init__(space, generator)
         self._own: deque[float] = deque(maxlen=REMEMBERED)
         self._others: deque[float] = deque(maxlen=REMEMBERED)
+        self._judged = 0
 
     @property
     def scattered(self) -> bool:
         """True if the robustness varies among perturbations as among other points, or too few are known."""
-        if len(self._own) < JUDGED or not self._others:
-            return True
-        return float(np.std(self._own)) >= SCATTER * float(np.std(self._others))
+        return self._judged < JUDGED or _spread(self._own) > SCATTER * _spread(self._others)
 
     def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
         super().tell(point, value, decided)
+        self._judged += 1
         if math.isfinite(value):
             self._own.append(value)
 
@@ -459,6 +468,14 @@ class Perturbation(LocalSearch):
         moved = self._start.point + width * self.generator.standard_normal(self.space.dim)
         mirrored: Point = 1.0 - np.abs(1.0 - np.abs(moved) % 2.0)
         return mirrored
+
+
+def _spread(values: Sequence[float]) -> float:
+    """Interquartile range of values; 0 if there are fewer than two."""
+    if len(values) < 2:
+        return 0.0
+    low, high = np.quantile(values, (0.25, 0.75))
+    return float(high) - float(low)
 
 
 def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:

@@ -44,11 +44,11 @@ WIDENED, NARROWED, FAILURES = 1.5, 0.7, 8
 SCREENED = 100
 """Vertices of which a linear model chooses one."""
 SLOPE = 3.0
-"""Variance of the slopes of the linear model before it has seen points, times that of the robustness."""
+"""Variance of the slopes of the linear model before it has seen points, times that of its noise."""
 LEAST_NOISE = 0.05
-"""Least variance of what the linear model leaves unexplained, times that of the robustness."""
-MODELLED = 1000
-"""Last points to which the linear model is fitted."""
+"""Least variance of the noise of the linear model, times that of the robustness."""
+BEGUN, MODELLED = 20, 1000
+"""Points from which a linear model of many numbers begins, and last points to which it is fitted."""
 DIGITS = 6
 """Decimal digits of what is compared, so that rounding, which depends on the machine, decides nothing."""
 
@@ -136,9 +136,11 @@ def _likelihood(
 def _normal_scores(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values (count,) replaced by the quantiles of the normal distribution at their ranks.
 
-    Then a few very large values, of no interest, do not decide about the length scale.
+    Then a few very large values, of no interest, do not decide about the length scale. Equal values have the
+    mean of their ranks.
     """
-    ranks = np.argsort(np.argsort(values, kind="stable"), kind="stable")
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - 0.5 * (counts + 1))[places]
     normal, count = NormalDist(), len(values)
     return np.array([normal.inv_cdf((rank + 0.5) / count) for rank in ranks.tolist()])
 
@@ -252,11 +254,10 @@ class TrustRegionSearch(SurrogateSearch):
 class TrendSampling(Strategy):
     """The least robust one of many random vertices, as expected by a linear model.
 
-    How much each input is high often tells where violations are, though not which of the points there is one.
-    So the model knows the mean of each input and all other numbers, and nothing else: it learns from few
-    points, and what it chooses is otherwise random, whereas neighbours of the best point share its faults.
-    Its coefficients are drawn from their distribution after the points so far (Thompson 1933), so that it
-    explores what it does not know yet.
+    Where violations are frequent often depends on how much each input is high. So the model knows the mean of
+    each input and all other numbers, and nothing else: it learns from few points, and what it chooses is
+    otherwise random, whereas neighbours of the best point share its faults. Its coefficients are drawn from
+    their distribution after the points so far (Thompson 1933), so that it explores what it does not know yet.
     """
 
     name = "trend"
@@ -271,7 +272,7 @@ class TrendSampling(Strategy):
         self._values: deque[float] = deque(maxlen=MODELLED)
 
     def propose(self) -> Point:
-        if len(self._values) < self._averages.shape[1] + 3:
+        if len(self._values) < min(self._averages.shape[1] + 3, BEGUN):
             return self._vertices.propose()
         candidates = np.array([self._vertices.propose() for _ in range(SCREENED)])
         expected = self._described(candidates) @ self._coefficients()
@@ -297,12 +298,12 @@ class TrendSampling(Strategy):
     def _coefficients(self) -> NDArray[np.float64]:
         """Coefficients (1 + groups,), drawn from their distribution given the points so far.
 
-        It is normal if that of the noise and, before the first point, of the slopes is (Bayesian linear
-        regression, Rasmussen and Williams 2006, section 2.1). The constant is free.
+        Noise and slopes are taken as normally distributed (Bayesian linear regression, Rasmussen and Williams
+        2006, section 2.1), and the constant as any number.
         """
         features, values = np.array(self._features), _normal_scores(np.array(self._values))
         precision = np.full(features.shape[1], 1.0 / SLOPE)
-        precision[0] = JITTER
+        precision[0] = JITTER  # the constant may be any number
         covariance = np.linalg.inv(features.T @ features + np.diag(precision))
         means = covariance @ features.T @ values
         noise = max(float(((values - features @ means) ** 2).mean()), LEAST_NOISE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.rules import Rules
 from stlc.controller.training.run import Run
 from stlc.grammar.parse.parser import parse
+from stlc.rundir import RunDir
 from stlc.source import Source
 from stlc.trace import load_trace
 
@@ -76,6 +78,25 @@ def test_gusts_that_push_the_cart_out_are_found_and_replayed(capsys, tmp_path):
     assert not (tmp_path / "far.json").exists()
     assert main(["falsify", "latest", "--replay", str(tmp_path / "near.json")]) == 1
     assert "the same, bit for bit" in capsys.readouterr().out
+
+
+def test_a_replay_names_the_run_that_was_searched(capsys, tmp_path, monkeypatch):
+    """Another run that is made during the search is `latest` afterwards."""
+    load = DriveSimulator.__init__
+
+    def loaded(*arguments):
+        load(*arguments)
+        later = RunDir.create(Path("runs"), "cart", "later")
+        shutil.copy(f"runs/cart/{before}/run.json", later.path)
+
+    before = Path("runs/latest").resolve().name
+    links = {path: path.readlink() for path in (Path("runs/latest"), Path("runs/cart/latest"))}
+    monkeypatch.setattr(DriveSimulator, "__init__", loaded)
+    searched = found(capsys, "-o", str(tmp_path))
+    for path, target in links.items():
+        path.unlink()
+        path.symlink_to(target)
+    assert f"falsify runs/cart/{before} --replay" in searched["requirements"][0]["replay"]
 
 
 def test_a_baseline_draws_as_declared(capsys, tmp_path):

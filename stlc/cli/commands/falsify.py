@@ -108,19 +108,23 @@ def falsify(
     """Search for simulations that violate requirements.
 
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
-    the random numbers of the world in which its policy drives. Inputs that are constant at the ends of their
-    ranges come first, and inputs of few pieces. Then random points, hill climbing, CMA-ES (if the package
-    `cma` is installed), gradients and periodic inputs take turns; the numbers of a world are changed where
-    this has an effect. A violation counts only if it remains at half the time step. It is written as a
-    trace, simplified as far as it still violates the requirement, with a file for --replay. If nothing is
-    found, that is no proof. The same --seed and --batch give the same simulations, whatever processes there
-    are. Of a plant, simulations that fail are written, too. Exit code: 1 if a requirement is violated or a
-    simulation fails; else 5 if simulations were lost with their processes, three times each; else 0.
+    the random numbers of the world in which its policy drives. Inputs that alternate between the ends of
+    their ranges, or stay there, come first. Then models of the robustness choose most of the points, and
+    random ones, hill climbing, CMA-ES (if the package `cma` is installed), gradients and periodic inputs take
+    turns; the numbers of a world are changed where this has an effect. A violation counts only if it remains
+    at half the time step. It is written as a trace, simplified as far as it still violates the requirement,
+    with a file for --replay. If nothing is found, that is no proof. The same --seed and --batch give the same
+    simulations, whatever processes there are. Of a plant, simulations that fail are written, too. Exit code:
+    1 if a requirement is violated or a simulation fails; else 5 if simulations were lost with their
+    processes, three times each; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
     from stlc.files import require_folder
+    from stlc.rundir import RunDir
 
     made = _Target(target, system, plant, guard, agents, steps, scenario, seed)
+    if plant is None and not made.model:  # `latest` may be another run later
+        made = replace(made, name=RunDir.open(target, runs).shown)
     overrides = parse_overrides(set_)
     if replay is not None:
         return _replayed(made, replay, overrides, runs)
@@ -262,13 +266,14 @@ class _Source:
         """Processes that simulate; None if this one does, or a black box, which has its own."""
         from stlc.assurance.sharing import SimulatorWorkers
         from stlc.controller.parallel import workers_of
-        from stlc.rundir import RunDir
 
         if self.cluster is None and (self.jobs == 1 or self.target.plant is not None):
             return nullcontext()
-        target = self.target
-        if not target.model:  # `latest` may be another run later
-            target = replace(target, name=str(RunDir.open(target.name, self.runs).path))
+        target = (
+            self.target
+            if self.target.model
+            else replace(self.target, name=str(Path(self.target.name).resolve()))
+        )
         sent = replace(self, target=target, jobs=1, cluster=None)
         calls = workers_of(self.jobs, self.cluster, fresh=True)
         return SimulatorWorkers(sent, calls, sent.files())
@@ -386,18 +391,12 @@ def _violation(found: Counterexample) -> Any:
 
 def _command(source: _Source, path: Path) -> str:
     """Command that replays a counterexample."""
-    from stlc.rundir import LATEST, RunDir
-
-    target, name = source.target, source.target.name
-    if name == LATEST:  # it may be another run later
-        name = RunDir.open(name, source.runs).shown
-    words = ["stlc", "falsify", name]
+    target = source.target
+    words = ["stlc", "falsify", target.name]
     if target.plant is not None:
         words += ["--plant", str(target.plant)]
     if target.system is not None:
         words += ["--system", target.system]
-    if not target.model and source.runs != RUNS and name == target.name:
-        words += ["--runs", str(source.runs)]
     return shlex.join([*words, "--replay", str(path)])
 
 
