@@ -151,10 +151,8 @@ class Portfolio:
             uniform = _Opening(self._samplers[-1], SMALL_OPENING)
             return _Opening(self._even, 2), constants, uniform, perturbed, descent
         drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
-        simple = (
-            _Opening(AlternatingVertices(space, generator), None),
-            *(_Opening(constant, 2), _Opening(self._vertices, 5)),
-        )
+        alternating = _Opening(AlternatingVertices(space, generator), None)
+        simple = alternating, _Opening(constant, 2), _Opening(self._vertices, 5)
         if len(space.blocks) > 1:
             return (*simple, *drawn[:4], descent, constants, *drawn[4:])
         return (*simple, constants, perturbed, *drawn[:4], descent, *drawn[4:])

@@ -446,7 +446,7 @@ class Perturbation(LocalSearch):
 
     @property
     def scattered(self) -> bool:
-        """True if the robustness varies among perturbations as among other points, or too few are known."""
+        """True if the robustness varies much among perturbations, or too few of them are known."""
         return self._judged < JUDGED or _spread(self._own) > SCATTER * _spread(self._others)
 
     def tell(self, point: Point, value: float, decided: float = math.nan) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -141,6 +142,16 @@ def test_a_trust_region_ends_in_a_narrow_valley_that_is_noise_for_the_whole_spac
     assert least[TrustRegionSearch] < least[SurrogateSearch]
 
 
+def searched(portfolio: Portfolio, count: int, value: Callable[[str, int], float]) -> list[str]:
+    """Names of the strategies of `count` points; `value`: guidance value by the strategy and the index."""
+    names: list[str] = []
+    for index in range(count):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        portfolio.tell(proposal, float(value(names[-1], index)))
+    return names
+
+
 def test_a_search_begins_with_vertices_and_opposite_constants():
     blocks = tuple(
         SignalBlock(name, tuple(range(at, at + 8))) for name, at in (("throttle", 0), ("brake", 8))
@@ -167,25 +178,18 @@ def test_the_best_vertex_of_one_input_is_perturbed_while_robustness_scatters_the
 ):
     space = SearchSpace(8, (SignalBlock("reference", tuple(range(8))),))
     portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
-    names = []
-    for index in range(30):
-        proposal = portfolio.next()
-        names.append(proposal.strategy.name)
-        own = names[-1] == "perturbation"
-        portfolio.tell(proposal, 1.0 + (scatter if own else 1.0) * float(index % 7))
+    names = searched(
+        portfolio, 30, lambda name, k: 1.0 + (scatter if name == "perturbation" else 1.0) * (k % 7)
+    )
     assert names[9 : 9 + count] == ["perturbation"] * count
     assert names[9 + count :][:3] == ["trend", "coarse", "settling"]
 
 
-@pytest.mark.parametrize(("value", "near"), [(lambda _: 1.0, 1.0), (lambda k: float(k % 7), math.inf)])
+@pytest.mark.parametrize(("value", "near"), [(lambda _: 1.0, 1.0), (lambda k: k % 7, math.inf)])
 def test_perturbations_end_where_robustness_is_flat_or_points_are_not_admissible(value, near):
     space = SearchSpace(8, (SignalBlock("reference", tuple(range(8))),))
     portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
-    names = []
-    for index in range(18):
-        proposal = portfolio.next()
-        names.append(proposal.strategy.name)
-        portfolio.tell(proposal, near if names[-1] == "perturbation" else value(index))
+    names = searched(portfolio, 18, lambda name, k: near if name == "perturbation" else value(k))
     assert names.count("perturbation") == 3
 
 
@@ -242,11 +246,7 @@ def test_a_trend_of_the_means_of_inputs_is_seen_in_few_points_that_scatter_much(
 def test_where_robustness_is_no_guide_a_search_begins_with_vertices_and_goes_on_at_random():
     space = SearchSpace(16, (SignalBlock("throttle", tuple(range(16))),))
     portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None, graded=False)
-    names = []
-    for index in range(28):
-        proposal = portfolio.next()
-        names.append(proposal.strategy.name)
-        portfolio.tell(proposal, float(index % 7))
+    names = searched(portfolio, 28, lambda _, k: k % 7)
     assert names == ["vertices"] * 4 + (["uniform"] * 11 + ["vertices"]) * 2
 
 
@@ -274,12 +274,7 @@ def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.M
     monkeypatch.setattr("stlc.assurance.portfolio.SURROGATE_TURNS", 0)
     block = SignalBlock("throttle", tuple(range(8)))
     portfolio = Portfolio(SearchSpace(8, (block,)), np.random.default_rng(0), lambda _: None)
-    names = []
-    for index in range(120):
-        proposal = portfolio.next()
-        names.append(proposal.strategy.name)
-        progress = 5.0 if names[-1] == "hill climbing" else 0.0
-        portfolio.tell(proposal, 1.0 + index % 7 - progress)
+    names = searched(portfolio, 120, lambda name, k: 1.0 + k % 7 - (5.0 if name == "hill climbing" else 0.0))
     late = names[-60:]
     drawn = sum(late.count(each) for each in ("trend", "coarse", "settling"))
     assert drawn == pytest.approx(20, abs=3)  # more, as some strategies have nothing to propose

@@ -87,16 +87,23 @@ def test_a_replay_names_the_run_that_was_searched(capsys, tmp_path, monkeypatch)
     def loaded(*arguments):
         load(*arguments)
         later = RunDir.create(Path("runs"), "cart", "later")
-        shutil.copy(f"runs/cart/{before}/run.json", later.path)
+        shutil.copy("made/run.json", later.path)
 
+    shutil.copytree("runs", tmp_path / "runs", symlinks=True)
+    shutil.copytree(Path("runs/latest").resolve(), tmp_path / "made")
+    monkeypatch.chdir(tmp_path)
     before = Path("runs/latest").resolve().name
-    links = {path: path.readlink() for path in (Path("runs/latest"), Path("runs/cart/latest"))}
     monkeypatch.setattr(DriveSimulator, "__init__", loaded)
-    searched = found(capsys, "-o", str(tmp_path))
-    for path, target in links.items():
-        path.unlink()
-        path.symlink_to(target)
+    searched = found(capsys)
+    assert Path("runs/latest").resolve().name != before
     assert f"falsify runs/cart/{before} --replay" in searched["requirements"][0]["replay"]
+
+
+@pytest.mark.parametrize("option", ["--system", "--plant"])
+def test_a_missing_specification_is_told_where_there_is_no_run_either(option, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["falsify", option, "cart.yaml"]) == 2
+    assert "specification" in capsys.readouterr().err
 
 
 def test_a_baseline_draws_as_declared(capsys, tmp_path):

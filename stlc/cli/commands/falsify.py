@@ -123,7 +123,7 @@ def falsify(
     from stlc.rundir import RunDir
 
     made = _Target(target, system, plant, guard, agents, steps, scenario, seed)
-    if plant is None and not made.model:  # `latest` may be another run later
+    if plant is None and system is None and not made.model:  # `latest` may be another run later
         made = replace(made, name=RunDir.open(target, runs).shown)
     overrides = parse_overrides(set_)
     if replay is not None:
@@ -269,11 +269,9 @@ class _Source:
 
         if self.cluster is None and (self.jobs == 1 or self.target.plant is not None):
             return nullcontext()
-        target = (
-            self.target
-            if self.target.model
-            else replace(self.target, name=str(Path(self.target.name).resolve()))
-        )
+        target = self.target
+        if not target.model:  # processes elsewhere have other folders
+            target = replace(target, name=str(Path(target.name).resolve()))
         sent = replace(self, target=target, jobs=1, cluster=None)
         calls = workers_of(self.jobs, self.cluster, fresh=True)
         return SimulatorWorkers(sent, calls, sent.files())
