@@ -1,19 +1,22 @@
 /* Tables of numbers: text -> columns of doubles, each correctly rounded.
 
 A cell is a decimal number of up to 19 digits with blanks around it, or blank, which is NaN. What is neither is a
-doubt: its place is noted, and somebody else reads it. Lines without anything in them are left out. The text ends
-with a byte of 0 behind its last one. */
+doubt: its place is noted, and somebody else reads it. Cells of columns that nobody wants are passed over. A cell
+may be in quotes, as in RFC 4180. Lines without anything in them are left out. The text ends with a byte of 0
+behind its last one. */
 
 #include <math.h>
 #include <stdint.h>
 
 typedef unsigned __int128 wide;
 
-enum { POWERS = 28, DIGITS = 19 };
+enum { POWERS = 28 };
+
+static const uint64_t FULL = 1000000000000000000; /* with 19 digits; more might not fit */
 
 typedef struct {
     const char *at, *end;
-    char mark; /* between cells */
+    char mark, point; /* between cells, and besides `.` before decimals */
     uint64_t fives[POWERS];
 } reader;
 
@@ -69,14 +72,13 @@ static const char *number(const reader *r, const char *at, double *value) {
     at += negative || *at == '+';
     uint64_t m = 0;
     int64_t power = 0;
-    int count = 0, any = 0;
+    int any = 0;
     for (int behind = 0; behind < 2; behind++) {
         for (; is_digit(*at); at++, any = 1, power -= behind) {
+            if (m >= FULL) return 0;
             m = 10 * m + (uint64_t)(*at - '0');
-            count += m != 0;
-            if (count > DIGITS) return 0;
         }
-        if (*at != '.') break;
+        if (*at != '.' && *at != r->point) break;
         if (behind) return 0;
         at++;
     }
@@ -88,48 +90,77 @@ static const char *number(const reader *r, const char *at, double *value) {
     return at;
 }
 
-/* Reads one cell and stands behind it. Gives 0 for a blank one, 1 for a number, 2 for a doubt. */
+/* Where the cell in quotes at `at` ends; null where it does not, or where more than blanks follow it. */
+static const char *past_quotes(const reader *r, const char *at) {
+    do {
+        for (at++; *at != '"'; at++)
+            if (at == r->end) return 0;
+    } while (*++at == '"');
+    at = past_blanks(r, at);
+    return ends_cell(r, at) ? at : 0;
+}
+
+/* Reads one cell, if `value` is not null, and stands behind it.
+   Gives 0 for a blank one, 1 for a number, 2 for a doubt, -1 where its quotes are not closed. */
 static int cell(reader *r, double *value) {
-    const char *at = past_blanks(r, r->at);
-    *value = NAN;
-    if (ends_cell(r, at)) return r->at = at, 0;
-    const char *behind = number(r, at, value);
+    const char *at = r->at, *behind;
+    at = past_blanks(r, at);
+    if (*at == '"') {
+        for (behind = r->at; behind < at; behind++)
+            if (*behind != ' ') return -1;
+        if (value) *value = NAN;
+        int blank = *(behind = past_blanks(r, at + 1)) == '"' && behind[1] != '"';
+        behind = past_quotes(r, at);
+        return behind ? r->at = behind, blank ? 0 : 2 : -1;
+    }
+    behind = value && !ends_cell(r, at) ? number(r, at, value) : 0;
     if (behind) behind = past_blanks(r, behind);
     if (behind && ends_cell(r, behind)) return r->at = behind, 1;
+    if (value) *value = NAN;
+    if (ends_cell(r, at)) return r->at = at, 0;
     while (!ends_cell(r, at)) at++;
     return r->at = at, 2;
 }
 
+static int is_comment(const char *at) {
+    while (*at == ' ') at++;
+    return *at == '#' || *at == '%' || (*at == '/' && at[1] == '/');
+}
+
 /* All lines of `text`.
 
-   shape: bytes of text, cells of a line, rows there is room for, doubts there is room for, the mark.
-   out: (width, rows). doubts: how many, then row, column, first and last byte of each.
-   Gives the number of rows; -1 for a line with another number of cells, -2 for too many doubts. */
-int64_t read_cells(const char *text, const int64_t *shape, double *out, int64_t *doubts) {
+   shape: bytes of text, cells of a line, rows there is room for, doubts there is room for, the mark, the point.
+   places: for each column its place in `out`, -1 for one that is not wanted.
+   out: (wanted, rows). doubts: how many, then row, place, first and last byte of each.
+   Gives the number of rows; -1 for a line with fewer cells or with more that are not blank, for a comment and for
+   quotes that are not closed; -2 for too many doubts. */
+int64_t read_cells(const char *text, const int64_t *shape, const int64_t *places, double *out, int64_t *doubts) {
     int64_t width = shape[1], rows = shape[2], row = 0;
-    reader r = {.at = text, .end = text + shape[0], .mark = (char)shape[4], .fives = {1}};
+    reader r = {.at = text, .end = text + shape[0], .mark = (char)shape[4], .point = (char)shape[5], .fives = {1}};
     for (int i = 1; i < POWERS; i++) r.fives[i] = 5 * r.fives[i - 1];
     doubts[0] = 0;
     while (r.at < r.end) {
         int told = 0;
         int64_t column = 0;
+        if (is_comment(r.at)) return -1;
         for (;; r.at++, column++) {
             const char *first = r.at;
+            int64_t place = column < width && row < rows ? places[column] : -1;
             double value;
-            int kind = cell(&r, &value);
+            int kind = cell(&r, place < 0 ? 0 : &value);
             told |= kind;
-            if (kind && (column >= width || row >= rows)) return -1;
-            if (column < width && row < rows) out[column * rows + row] = value;
-            if (kind == 2) {
+            if (kind < 0 || (kind && (column >= width || row >= rows))) return -1;
+            if (place >= 0) out[place * rows + row] = value;
+            if (kind == 2 && place >= 0) {
                 if (doubts[0] >= shape[3]) return -2;
                 int64_t *doubt = doubts + 1 + 4 * doubts[0]++;
-                doubt[0] = row, doubt[1] = column, doubt[2] = first - text, doubt[3] = r.at - text;
+                doubt[0] = row, doubt[1] = place, doubt[2] = first - text, doubt[3] = r.at - text;
             }
             if (r.at == r.end || *r.at != r.mark) break;
         }
         r.at++;
         if (!told) continue;
-        if (column + 1 != width) return -1;
+        if (column + 1 < width) return -1;
         row++;
     }
     return row;

@@ -1,7 +1,7 @@
-"""Conversion of the cells of a table to numbers: one cell at a time or, for large files, all at once.
+"""Conversion of the cells of a table to numbers: of one cell, of a column, or of many lines at once.
 
-There are three readers of large texts. `cells.c` is used if there is a C compiler (`stlc.native`), else Arrow
-if it is installed, else NumPy in blocks. All give the same numbers. All reject texts with unusual cells. A
+`value_of` says what is a number. Two faster readers give the same numbers: `cells.c` for large texts, if
+there is a C compiler (`stlc.native`), and NumPy for blocks of lines. Both reject texts with unusual cells. A
 slower reader then reads these texts.
 """
 
@@ -11,10 +11,9 @@ import ctypes
 import io
 import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,125 +22,72 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
-
+_MISSING = re.compile(
+    r"n\.?/?a\.?|null|none|nil|nat|<na>|#na|#n/a(?: n/a)?|#(?:num|div/0|value|ref)!|-{1,3}|[?.]",
+    re.IGNORECASE,
+)
+"""Words that stand for a missing value, as an empty cell and `nan` do."""
 _WORDS = {"true": 1.0, "false": 0.0}
-_ANY = re.compile(r"\S")
+_OF_WINDOWS = re.compile(r"([+-]?)(?:1\.#(inf|ind|qnan|snan)0*|nan\((?:ind|snan)\))", re.IGNORECASE)
+"""Infinity and NaN, as C programs under Windows print them."""
 _SOURCE = Path(__file__).with_name("cells.c")
-STRETCH = 1 << 18
-"""Bytes, or characters, per block for NumPy's reader."""
-_PLAIN = bytes({*range(32, 127), *b"\t\n\r"} - {*b'"('})
-"""Characters that Arrow reads correctly: neither quotes nor `nan(1)`."""
 _DOUBTS = 32
 """Inverse of the greatest share of cells that may be unusual."""
-_TOO_MANY = -2
-
-
-@dataclass(frozen=True, slots=True)
-class TableText:
-    """The text of a table: it begins at byte `start`, after the header, and has `width` columns."""
-
-    data: bytes
-    start: int
-    width: int
-    delimiter: str
 
 
 def bare(raw: str) -> str:
     """Return the text of a cell without surrounding blanks and quotes."""
     text = raw.strip()
-    quoted = len(text) >= 2 and text[0] == text[-1] == '"'
-    return text[1:-1].strip() if quoted else text
+    return text[1:-1].strip() if len(text) >= 2 and text[0] == text[-1] == '"' else text
 
 
 def value_of(text: str) -> float | None:
-    """Return the number in a cell's text: NaN if it is empty, None if it is not a number."""
-    if NUMBER.fullmatch(text):
-        return float(text)
-    return _WORDS.get(text.lower()) if text else math.nan
+    """Return the number in a cell's text: NaN if it is empty or `NA`, None if it is not a number."""
+    try:
+        value = float(text)
+    except ValueError:
+        if found := _OF_WINDOWS.fullmatch(text):
+            return float(f"{found[1]}{'inf' if (found[2] or '').lower() == 'inf' else 'nan'}")
+        return math.nan if is_missing(text) else _WORDS.get(text.lower())
+    return None if "_" in text else value
+
+
+def is_missing(text: str) -> bool:
+    """True if a cell's text is empty, or a word that stands for a missing value."""
+    return not text or _MISSING.fullmatch(text) is not None
+
+
+def number_of(cell: str, *, comma: bool) -> float | None:
+    """Return the number in a cell, as `value_of`; if `comma` is set, it may have a decimal comma."""
+    text = bare(cell)
+    value = value_of(text)
+    return value_of(text.replace(",", ".")) if value is None and comma and "," in text else value
+
+
+def numbers(cells: Sequence[str], *, comma: bool) -> tuple[Array, list[int]]:
+    """Return the numbers in cells, and the indices of the cells that are not numbers, which are NaN.
+
+    If `comma` is set, numbers may have decimal commas.
+    """
+    if "_" not in "".join(cells):
+        with suppress(ValueError):
+            return np.fromiter(map(float, cells), np.float64, len(cells)), []
+    values = [number_of(cell, comma=comma) for cell in cells]
+    return np.array(values, dtype=np.float64), [i for i, value in enumerate(values) if value is None]
 
 
 def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """Return the numbers in the columns with indices `columns`, (lines, columns).
+    """Return the numbers of a block of lines, (lines, columns); None if a cell is not a plain number.
 
-    Empty cells are NaN, truth values are 0 and 1. Quotes around a number are removed. None is returned if
-    there are no lines, or if any other cell is not a number.
+    If `columns` is given, only the columns with these indices are read.
     """
-    if not _ANY.search(body):
+    if not body.strip():
         return None
-    values = _loaded(body, delimiter, columns)
-    if values is not None:
-        return values
-    mended = _mended(body.replace("\r\n", "\n").replace("\r", "\n"), delimiter)
-    return _loaded(mended, delimiter, columns) if mended else None
-
-
-def _loaded(body: str, delimiter: str, columns: Sequence[int] | None) -> Array | None:
+    body = body.replace(",", ".") if delimiter != "," else body
     lines = io.TextIOWrapper(io.BytesIO(body.encode()), "utf-8")  # a StringIO is four times as large
-    try:
-        with lines:
-            return np.loadtxt(
-                lines, delimiter=delimiter, comments=None, ndmin=2, dtype=np.float64, usecols=columns
-            )
-    except ValueError:
-        return None
-
-
-@dataclass(frozen=True, slots=True)
-class _Repair:
-    """Patterns of cells that NumPy's reader refuses, such as empty or quoted ones.
-
-    The function `_mended` uses them to rewrite these cells.
-    """
-
-    empty: re.Pattern[str]
-    quoted: re.Pattern[str]
-    truth: re.Pattern[str]
-    gap: re.Pattern[str]
-
-
-@cache
-def _repair(delimiter: str) -> _Repair:
-    mark = re.escape(delimiter)
-    blank, ends = "[ ]" if delimiter == "\t" else "[ \t]", f"(?={mark}|$)"
-    return _Repair(
-        re.compile(rf"^[ \t{mark}]*\n|^[ \t{mark}]+\Z", re.MULTILINE),
-        re.compile(rf'(^|{mark}){blank}*"([^"\n{mark}]*)"{blank}*{ends}', re.MULTILINE),
-        re.compile(rf"(^|{mark}){blank}*(true|false){blank}*{ends}", re.MULTILINE | re.IGNORECASE | re.ASCII),
-        re.compile(rf"(?<={mark}){blank}*{ends}|^{blank}*(?={mark})", re.MULTILINE),
-    )
-
-
-def _mended(body: str, delimiter: str) -> str:
-    """Text without empty lines, and with numbers in place of empty cells, truth values and quoted cells."""
-    repair = _repair(delimiter)
-    body = repair.empty.sub("", body)
-    if '"' in body:
-        body = repair.quoted.sub(lambda found: found[1] + (found[2].strip() or "nan"), body)
-    if any(letter in body for letter in "tTfF"):
-        body = repair.truth.sub(lambda found: found[1] + ("1" if found[2].lower() == "true" else "0"), body)
-    if " " in body or "\t" in body:
-        return repair.gap.sub("nan", body)
-    for _ in range(2):  # of `,,,` the second is found once the first has got its number
-        body = body.replace(delimiter * 2, f"{delimiter}nan{delimiter}")
-    body = body.replace(f"{delimiter}\n", f"{delimiter}nan\n").replace(f"\n{delimiter}", f"\nnan{delimiter}")
-    return f"{'nan' * body.startswith(delimiter)}{body}{'nan' * body.endswith(delimiter)}"
-
-
-def read_lines(lines: TableText) -> list[Array] | None:
-    """Return the columns of a table of numbers, (lines,) each; None if a line or cell is unusual.
-
-    Any line ending is allowed. A line is left out if all its cells are empty. In other lines, empty cells are
-    NaN.
-    """
-    library = _library()
-    if library is not None:
-        return _by_kernel(library, lines)
-    found = _by_arrow(lines)
-    return _by_numpy(lines) if found is None else found
-
-
-# ----------------------------------------------------------------------------- the kernel
+    with suppress(ValueError), lines:
+        return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=columns)
+    return None
 
 
 @cache
@@ -150,102 +96,48 @@ def _library() -> ctypes.CDLL | None:
     from stlc.native import load
 
     library = load(_SOURCE.read_text(encoding="utf-8"))
-    if library is None:
-        return None
-    library.read_cells.argtypes = [ctypes.c_void_p] * 4
-    library.read_cells.restype = ctypes.c_int64
+    if library is not None:
+        library.read_cells.argtypes = [ctypes.c_void_p] * 5
+        library.read_cells.restype = ctypes.c_int64
     return library
 
 
-def _by_kernel(library: ctypes.CDLL, lines: TableText) -> list[Array] | None:
-    text, width = np.frombuffer(lines.data, dtype=np.uint8)[lines.start :], lines.width
-    size = len(text)
-    rows = min(lines.data.count(b"\n") + lines.data.count(b"\r") + 1, size // width + 1)
-    most = rows * width // _DOUBTS + 1
-    shape = np.array([size, width, rows, most, ord(lines.delimiter)], dtype=np.int64)
+def read_lines(
+    data: bytes, start: int, width: int, delimiter: str, wanted: Sequence[int]
+) -> list[Array] | None:
+    """Return the columns `wanted` of a table of numbers in UTF-8 from byte `start` on, (lines,) each.
+
+    The table has `width` columns. If the delimiter is no comma, numbers may have decimal commas. Any line
+    ending is allowed. Lines of empty cells are left out; in others, empty cells are NaN. None is returned if
+    there is no C compiler, or if a line or a wanted cell is unusual.
+    """
+    library = _library()
+    if library is None:
+        return None
+    text, comma = np.frombuffer(data, dtype=np.uint8)[start:], delimiter != ","
+    ends = sum(data.count(end) for end in (b"\n", b"\r") if end in data)  # `in` is far cheaper
+    rows = min(ends, len(text) // width) + 1
+    most = rows * len(wanted) // _DOUBTS + 1
+    point = "," if comma else "."
+    shape = np.array([len(text), width, rows, most, ord(delimiter), ord(point)], dtype=np.int64)
+    places = np.full(width, -1, dtype=np.int64)
+    places[list(wanted)] = range(len(wanted))
     try:
-        out, doubts = np.empty((width, rows)), np.empty(1 + 4 * most, dtype=np.int64)
+        out, doubts = np.empty((len(wanted), rows)), np.empty(1 + 4 * most, dtype=np.int64)
     except MemoryError:
         return None
-    found: int = library.read_cells(*(array.ctypes.data for array in (text, shape, out, doubts)))
-    if found == _TOO_MANY:
-        return _by_numpy(lines)
+    found: int = library.read_cells(*(array.ctypes.data for array in (text, shape, places, out, doubts)))
     if found < 1:
         return None
-    for row, column, first, last in doubts[1 : 1 + 4 * int(doubts[0])].reshape(-1, 4).tolist():
-        value = _doubted(lines.data[lines.start + first : lines.start + last])
+    vague: set[int] = set()
+    for row, place, first, last in doubts[1 : 1 + 4 * int(doubts[0])].reshape(-1, 4).tolist():
+        cell = data[start + first : start + last].decode()
+        value = number_of(cell, comma=comma)
         if value is None:
             return None
-        out[column, row] = value
+        out[place, row] = value
+        if is_missing(bare(cell)):
+            vague.add(place)
+    if any(np.isnan(out[place, :found]).all() for place in vague):  # words, as far as anybody can tell
+        return None
     return list(out[:, :found])
-
-
-def _doubted(cell: bytes) -> float | None:
-    try:
-        return value_of(bare(cell.decode()))
-    except UnicodeDecodeError:
-        return None
-
-
-# ------------------------------------------------------------------------ without a compiler
-
-
-@cache
-def _arrow() -> Any:
-    """Arrow's module for reading tables; None if Arrow is not installed."""
-    try:
-        return import_module("pyarrow.csv")
-    except ImportError:
-        return None
-
-
-def _by_arrow(lines: TableText) -> list[Array] | None:
-    """Read all lines with Arrow; None if Arrow is not installed or a line is unusual."""
-    csv = _arrow()
-    if csv is None or lines.data[lines.start :].translate(None, _PLAIN):
-        return None
-    arrow = import_module("pyarrow")
-    names = [str(i) for i in range(lines.width)]
-    try:
-        table = csv.read_csv(
-            arrow.py_buffer(lines.data).slice(lines.start),
-            read_options=csv.ReadOptions(column_names=names),
-            parse_options=csv.ParseOptions(delimiter=lines.delimiter, quote_char=False),
-            convert_options=csv.ConvertOptions(
-                column_types=dict.fromkeys(names, arrow.float64()), null_values=[""], check_utf8=False
-            ),
-        )
-    except (arrow.ArrowException, ValueError, OverflowError, MemoryError):
-        return None
-    columns = [np.asarray(column, dtype=np.float64) for column in table.columns]
-    if all(column.null_count for column in table.columns):  # some lines may be empty
-        filled = ~np.logical_and.reduce([np.asarray(column.is_null()) for column in table.columns])
-        columns = [column[filled] for column in columns]
-    return columns if len(columns[0]) else None
-
-
-def _by_numpy(lines: TableText) -> list[Array] | None:
-    """Read the columns with NumPy, in blocks of lines to bound memory; None if a line is unusual."""
-    parts: list[list[Array]] = [[] for _ in range(lines.width)]
-    for stretch in _stretches(lines):
-        try:
-            values = load(stretch.decode(), lines.delimiter)
-        except UnicodeDecodeError:
-            return None
-        if values is None or values.shape[1] != lines.width:
-            return None
-        for part, column in zip(parts, values.T, strict=True):
-            part.append(column.copy())
-    columns: list[Array] = []
-    for part in filter(None, parts):
-        columns.append(np.concatenate(part))
-        part.clear()
-    return columns or None
-
-
-def _stretches(lines: TableText) -> Iterator[bytes]:
-    data, begin = lines.data, lines.start
-    while begin < len(data):
-        end = data.find(b"\n", begin + STRETCH) + 1 or len(data)
-        yield data[begin:end]
-        begin = end
