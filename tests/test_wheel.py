@@ -162,8 +162,27 @@ from helpers import robot_logs
 bz2.compress = lz4.frame.compress
 open("a.bag", "wb").write(robot_logs.bag([0.0, 1.0]).replace(b"compression=bz2", b"compression=lz4"))
 """
+ULG = """
+import struct
+def message(kind, data):
+    return struct.pack('<HB', len(data), ord(kind)) + data
+raw = b'ULog' + bytes([1, 0x12, 0x35, 1]) + bytes(8) + message('B', bytes(40))
+raw += message('F', b'p:uint64_t timestamp;double x;') + message('A', bytes(3) + b'p')
+for k in range(2):
+    raw += message('D', struct.pack('<HQd', 0, k * 10**6, 1.0))
+open('a.ulg', 'wb').write(raw)
+"""
+MF4 = """
+import numpy as np
+from asammdf import MDF, Signal
+with MDF(version='4.10') as file:
+    file.append([Signal(np.array([1., 2.]), np.array([0., 1.]), name='x')])
+    file.save('a.mf4')
+"""
 SPEC = "signal x\nrequire low: x < 5\n"
 QUICK = {
+    "ulg": (ULG, ["check", "low.stl", "a.ulg", "--map", "x=p.x"]),
+    "mf4": (MF4, ["check", "low.stl", "a.mf4"]),
     "parquet": (PARQUET, ["check", "low.stl", "a.parquet"]),
     "mat": (MAT, ["check", "low.stl", "a.mat"]),
     "mcap": (MCAP, ["check", "low.stl", "a.mcap", "--resample", "1s"]),
