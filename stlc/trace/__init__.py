@@ -11,6 +11,7 @@ from stlc.trace.trace import (
     read_recording,
     save_trace,
     trace_of,
+    traces_of,
 )
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "read_recording",
     "save_trace",
     "trace_of",
+    "traces_of",
 ]

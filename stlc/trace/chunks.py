@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.trace.enums import instants_of
-from stlc.trace.formats.registry import SUFFIXES, format_of, unreadable
-from stlc.trace.formats.table import several_traces
+from stlc.trace.clocks import SPELLINGS, ClockSetting, clocked
+from stlc.trace.formats.registry import SUFFIXES, format_of, suffix_of, unreadable
+from stlc.trace.formats.table import GROUPS
 from stlc.trace.recording import CLOCK, ClockGroup, Recording
 from stlc.trace.time_grid import TOLERANCE, resample_advice
 from stlc.trace.trace import Reading, Trace, trace_of
+from stlc.trace.tracks import OneTrace
 
 LARGE = 1_500_000_000
 """Files whose numbers take more bytes than this are read in chunks."""
@@ -31,7 +31,7 @@ def size_of(path: Path) -> int:
         StlcError: the file cannot be opened, or is damaged.
     """
     found = format_of(path)
-    size: int = found.function("size")(path) if found.chunked and path.suffix.lower() in SUFFIXES else 0
+    size: int = found.function("size")(path) if found.chunked and suffix_of(path) in SUFFIXES else 0
     return size
 
 
@@ -42,53 +42,35 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
         TraceError: the errors of `stlc.trace.trace.load_trace`; E605, the file holds several traces, or its
             format cannot be read in chunks.
     """
+    found = format_of(path)
+    if not found.chunked or suffix_of(path) not in SUFFIXES:
+        raise TraceError(Diagnostic("E605", f"`{path}` is of a format that cannot be read in pieces"))
     clock: _Clock | None = None
-    for recording in _recordings(path, samples):
+    only = OneTrace(str(path))
+    for recording in found.function("chunks")(path, samples, reading.wanted):
+        for name in GROUPS if recording.groups else ():
+            if name in recording.groups[0].arrays and name not in (reading.read or ()):
+                for key in np.unique(recording.groups[0].arrays[name]):
+                    only.require(name, key)
         if clock is None:
-            first = _single(trace_of(recording, reading))
-            clock = _Clock(first, _begin(recording, reading))
-            yield first
+            trace = trace_of(recording, reading)
+            clock = _Clock(trace)
         else:
-            yield _single(clock.next(recording, reading))
+            trace = clock.next(recording, reading)
+        if trace.traces > 1:
+            raise only.error(f"{trace.traces} traces")
+        yield trace
     if clock is None:
         raise unreadable(path, "it holds no samples")
 
 
-def _recordings(path: Path, samples: int) -> Iterator[Recording]:
-    found = format_of(path)
-    if not found.chunked or path.suffix.lower() not in SUFFIXES:
-        raise TraceError(Diagnostic("E605", f"`{path}` is of a format that cannot be read in pieces"))
-    return cast("Iterator[Recording]", found.function("chunks")(path, samples))
-
-
-def _single(trace: Trace) -> Trace:
-    if trace.traces > 1:
-        raise several_traces(trace.name, f"{trace.traces} traces")
-    return trace
-
-
-def _begin(recording: Recording, reading: Reading) -> np.datetime64 | None:
-    """Return the first date in the time column.
-
-    None is returned if the time column contains numbers, or if there is no time column.
-    """
-    clock = reading.names.get(CLOCK)
-    (group,) = (recording if clock is None else recording.clocked_by(clock)).groups
-    if group.clock is None or group.clock.dtype.kind != "U":
-        return None
-    first: np.datetime64 = instants_of(recording.name, group).flat[0]
-    return first
-
-
 class _Clock:
-    """Converter of consecutive chunks of a file to traces on one time grid.
+    """Converter of consecutive chunks of a file to traces on one time grid."""
 
-    The first chunk determines the grid.
-    """
-
-    def __init__(self, first: Trace, begin: np.datetime64 | None) -> None:
+    def __init__(self, first: Trace) -> None:
         self.name, self.dt, self.t0, self.samples = first.name, first.dt, first.t0, first.samples
-        self.begin = begin
+        self.origin = first.meta.origin
+        self.clock = next(iter(first.clocks), None)
 
     def next(self, recording: Recording, reading: Reading) -> Trace:
         """Convert the next chunk to a trace whose times continue those of the previous chunks.
@@ -96,30 +78,25 @@ class _Clock:
         Raises:
             TraceError: E602, a time is not on the time grid; also errors of `stlc.trace.trace.trace_of`.
         """
-        names = dict(reading.names)
-        renamed = names.pop(CLOCK, None)
-        recording = recording if renamed is None else recording.clocked_by(renamed)
-        (group,) = recording.groups
+        setting = reading.setting
+        if self.clock is not None and any(self.clock.name in group.arrays for group in recording.groups):
+            unit = self.clock.unit if self.clock.unit in SPELLINGS else setting.unit
+            setting = replace(setting, name=self.clock.name, unit=unit)
+        found = clocked(recording, setting, reading.read_in_file)
+        (group,) = found.groups
         if group.clock is not None:
-            self._check(self._seconds(group))
+            shift = 0 if found.meta.origin is None or self.origin is None else found.meta.origin - self.origin
+            self._check(group.clock.astype(np.float64) + shift * 1e-9)
         meta = replace(recording.meta, dt=self.dt)
-        unclocked = replace(recording, groups=(ClockGroup(group.arrays, None),), meta=meta)
-        trace = trace_of(unclocked, replace(reading, names=names))
+        arrays = {name: values for name, values in group.arrays.items() if name not in GROUPS}
+        unclocked = replace(found, groups=(ClockGroup(arrays, None),), meta=meta)
+        names = {signal: name for signal, name in reading.names.items() if signal != CLOCK}
+        trace = trace_of(unclocked, replace(reading, names=names, clock=ClockSetting(), group="none"))
         start = self.t0 + self.samples * self.dt
         self.samples += trace.samples
         return replace(trace, t0=start)
 
-    def _seconds(self, group: ClockGroup) -> NDArray[np.float64]:
-        """Times of a chunk in seconds; dates are converted to seconds since the first date of the file."""
-        assert group.clock is not None
-        if group.clock.dtype.kind not in "Uc":
-            return group.clock.astype(np.float64)
-        instants = instants_of(self.name, group)
-        begin = instants.flat[0] if self.begin is None else self.begin
-        return np.asarray((instants - begin) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
-
     def _check(self, times: NDArray[np.float64]) -> None:
-        """Check that every time is on the time grid, up to rounding. Raises TraceError (E602)."""
         wanted = self.t0 + self.dt * (self.samples + np.arange(len(times)))
         off = np.abs(times - wanted)
         bad = ~(off <= TOLERANCE * self.dt + 1e-9 * np.abs(wanted))

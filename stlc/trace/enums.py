@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.registry import closest
 from stlc.signature import Column
+from stlc.trace.formats.cells import value_of
 from stlc.trace.recording import ClockGroup, Recording
 
 Words = Mapping[str, float]
@@ -51,12 +52,12 @@ def in_numbers(recording: Recording, words: Mapping[str, Words]) -> Recording:
     for group in recording.groups:
         arrays = dict(group.arrays)
         for name in [name for name, values in arrays.items() if _is_odd(values)]:
-            if name in words:
-                arrays[name] = _numbers(recording.name, name, arrays[name], words[name])
+            key = name if name in words else name.partition("[")[0]  # of a vector, all components
+            if key in words:
+                arrays[name] = _numbers(recording.name, name, arrays[name], words[key])
             else:
                 extras[name] = arrays.pop(name)
-        clock = _seconds(recording.name, group) if _is_odd(group.clock) else group.clock
-        groups.append(replace(group, arrays=arrays, clock=clock))
+        groups.append(replace(group, arrays=arrays))
     return replace(recording, groups=tuple(groups), extras=extras)
 
 
@@ -72,40 +73,20 @@ def wordless(recording: Recording) -> Recording:
 
 
 def _is_odd(values: NDArray[Any] | None) -> bool:
-    """True if an array contains words or complex numbers, which are not signal values."""
-    return values is not None and values.dtype.kind in "Uc"
+    """True if an array contains words, dates or complex numbers, which are not signal values."""
+    return values is not None and values.dtype.kind in "UcMm"
 
 
-def _refuse_complex(trace: str, name: str, values: NDArray[Any]) -> None:
-    if values.dtype.kind == "c":
-        advice = (f"save the parts that are meant, e.g.  re = real({name});  im = imag({name});",)
-        raise TraceError(Diagnostic("E603", f"`{name}` in `{trace}` holds complex numbers", help=advice))
-
-
-def instants_of(trace: str, group: ClockGroup) -> NDArray[np.datetime64]:
-    """Return the dates and times (ISO 8601) in the time column of `group`.
-
-    Raises TraceError (E603) if the column contains other words.
-    """
-    assert group.clock is not None
-    _refuse_complex(trace, group.named, group.clock)
-    written = np.char.rstrip(group.clock, "Zz")
-    try:
-        return np.asarray(written.astype("datetime64[ns]"))
-    except ValueError:
-        shown = str(group.clock.flat[0])[:40]
-        message = f"the clock `{group.named}` in `{trace}` holds words (`{shown}`)"
-        advice = ("seconds, or dates and times such as 2026-01-31T12:00:00.5",)
-        raise TraceError(Diagnostic("E603", message, help=advice)) from None
-
-
-def instant_of_word(word: str) -> np.datetime64 | None:
-    """Return the date and time (ISO 8601) in a word; None if the word is not a date, or not a time (NaT)."""
-    try:
-        instant = np.datetime64(word.rstrip("Zz"), "ns")
-    except ValueError:
-        return None
-    return None if np.isnat(instant) else instant
+def _require_numbers(trace: str, name: str, values: NDArray[Any]) -> None:
+    if values.dtype.kind == "U":
+        return
+    held, advice = (
+        "complex numbers",
+        f"save the parts that are meant, e.g.  re = real({name});  im = imag({name});",
+    )
+    if values.dtype.kind in "Mm":
+        held, advice = "dates, not numbers", f"as the clock of the trace:  --clock {name}"
+    raise TraceError(Diagnostic("E603", f"`{name}` in `{trace}` holds {held}", help=(advice,)))
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
@@ -116,15 +97,8 @@ def number_of_word(trace: str, name: str, word: str, words: Words) -> float:
     return worth
 
 
-def _seconds(trace: str, group: ClockGroup) -> NDArray[np.float64]:
-    """Convert dates and times to seconds since the first one. Raises TraceError (E603) for other words."""
-    instants = instants_of(trace, group)
-    first = instants.flat[0] if instants.size else np.datetime64(0, "ns")
-    return np.asarray((instants - first) / np.timedelta64(1, "ns") * 1e-9, dtype=np.float64)
-
-
 def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArray[np.float64]:
-    _refuse_complex(trace, name, values)
+    _require_numbers(trace, name, values)
     found, places = np.unique(values, return_inverse=True)
     worth = [_worth(str(word), words) for word in found]
     if None in worth:
@@ -134,16 +108,13 @@ def _numbers(trace: str, name: str, values: NDArray[Any], words: Words) -> NDArr
 
 
 def _worth(word: str, words: Words) -> float | None:
-    """Return the number that a word stands for; NaN for an empty word, None for an unknown one.
-
-    If `words` does not contain the word, upper and lower case are ignored.
-    """
+    """Return the number that a word stands for; NaN for an empty word, None for an unknown one."""
     if word in words:
         return words[word]
-    if not word and words:
+    if not word:
         return math.nan
     alike = {value for name, value in words.items() if name.lower() == word.lower()}
-    return alike.pop() if len(alike) == 1 else None
+    return alike.pop() if len(alike) == 1 else value_of(word.strip())
 
 
 def _unknown(trace: str, name: str, word: str, words: Words) -> Diagnostic:

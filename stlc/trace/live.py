@@ -6,8 +6,10 @@ The samples are on one time grid. Names, units, words and times in a line are in
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain
 
@@ -16,12 +18,13 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.jsontext import loads
-from stlc.trace.enums import instant_of_word, number_of_word
+from stlc.trace.clocks import StreamClock
+from stlc.trace.enums import number_of_word
 from stlc.trace.formats.cells import bare, value_of
 from stlc.trace.formats.csv import delimiter_of, filled, head_cells, split_head
-from stlc.trace.formats.table import OneTrace, clock_scale, group_among
-from stlc.trace.recording import CLOCK, absent, clock_among
-from stlc.trace.resample import FIRST, MAX_SAMPLES, Spacing, usual_step, values_on
+from stlc.trace.formats.table import GROUPS
+from stlc.trace.recording import CLOCK, absent
+from stlc.trace.resample import FIRST, MAX_SAMPLES, ROUNDING, Between, longest_gap, track_of, usual_step
 from stlc.trace.time_grid import (
     NO_CLOCK,
     NO_STEP,
@@ -33,6 +36,7 @@ from stlc.trace.time_grid import (
     snapped,
 )
 from stlc.trace.trace import Reading
+from stlc.trace.tracks import OneTrace
 
 Floats = NDArray[np.float64]
 Sample = Mapping[str, float]
@@ -69,9 +73,7 @@ class SampleStream:
     units: dict[str, str] = field(default_factory=dict)
     _delimiter: str = ","
     _heads: tuple[str, ...] = ()
-    _clock: str | None = None
-    _scale: float = 1.0
-    _begin: np.datetime64 | None = None
+    _clock: StreamClock | None = None
     _signals: dict[str, str] = field(default_factory=dict)
     _only: OneTrace = field(init=False)
 
@@ -88,107 +90,111 @@ class SampleStream:
         """
         is_json: bool | None = None
         for number, raw in enumerate(lines, 1):
-            text = self._text(raw, number)
-            if not text:
-                continue
-            if is_json is None:
+            if len(raw) > MAX_LINE:
+                raise self._bad(number, f"is longer than {MAX_LINE:,} bytes")
+            try:
+                text = raw.decode("utf-8-sig").strip()
+            except UnicodeDecodeError:
+                raise self._bad(number, "is not UTF-8") from None
+            if text and is_json is None:
                 is_json = text.startswith("{")
-            if is_json:
+            if text and is_json:
                 yield self._object(text, number)
-            elif not self._heads:
+            elif text and not self._heads:
                 self._header(text, number)
             elif filled(text, self._delimiter):
                 yield self._row(text, number)
-
-    def _text(self, raw: bytes, number: int) -> str:
-        if len(raw) > MAX_LINE:
-            raise self._bad(number, f"is longer than {MAX_LINE:,} bytes")
-        try:
-            return raw.decode("utf-8-sig").strip()
-        except UnicodeDecodeError:
-            raise self._bad(number, "is not UTF-8") from None
 
     def _bad(self, number: int, what: str, code: str = "E603") -> TraceError:
         return TraceError(Diagnostic(code, f"line {number} of the {self.name} {what}"))
 
     # ------------------------------------------------------------------------ names
 
-    def _named(self, there: Iterable[str]) -> None:
-        """Assign the names in the stream, `there`, to the time and to the signals.
+    def _header(self, text: str, number: int) -> None:
+        self._delimiter = delimiter_of(text)
+        cells = head_cells(text.removeprefix("#").strip(), self._delimiter)
+        names, units = zip(*map(split_head, cells), strict=True)
+        read = [name for name in names if self.reading.wanted.reads(name)]
+        if len(set(read)) < len(read) or not all(read):
+            raise self._bad(number, "does not name every column, or names one twice", "E605")
+        if all(value_of(name) is not None for name in names):
+            raise self._bad(number, "has numbers where the columns are named", "E605")
+        self._heads = names
+        self.units = dict(zip(names, units, strict=True))
+        self._named(name for name in names if name and name != self._group(names))
+        self.units = {signal: self.units[name] for name, signal in self._signals.items()}
 
-        Raises:
-            TraceError: E601, a requested name is not in the stream.
-        """
-        known = list(there)
-        names = dict(self.reading.names)
-        self._clock = names.pop(CLOCK, None) or clock_among(known)
-        missing = [old for old in (*names.values(), self._clock) if old is not None and old not in known]
+    def _named(self, there: Iterable[str]) -> None:
+        known, read = list(there), self.reading.read_in_file
+        names = {signal: old for signal, old in self.reading.names.items() if signal != CLOCK}
+        units = {name: self.units.get(name, "") for name in known}
+        self._clock = StreamClock.of(self.name, units, self.reading.setting, read)
+        missing = [old for old in names.values() if old not in known and (read is None or old in read)]
         if missing:
             raise TraceError(*(absent(self.name, old, known) for old in missing))
         back = {old: new for new, old in names.items()}
         self._signals = {
             name: back.get(name, name)
             for name in known
-            if name != self._clock and (name in back or name not in names)
+            if (name in back or name not in names) and self._reads(name)
         }
 
-    def _header(self, text: str, number: int) -> None:
-        self._delimiter = delimiter_of(text)
-        cells = head_cells(text.removeprefix("#").strip(), self._delimiter)
-        names, units = zip(*map(split_head, cells), strict=True)
-        if len(set(names)) < len(names) or not all(names):
-            raise self._bad(number, "does not name every column, or names one twice", "E605")
-        if all(value_of(name) is not None for name in names):
-            raise self._bad(number, "has numbers where the columns are named", "E605")
-        self._heads = names
-        self._named(name for name in names if name != group_among(names))
-        unit_of = dict(zip(names, units, strict=True))
-        self.units = {signal: unit_of[name] for name, signal in self._signals.items()}
-        if self._clock is not None:
-            self._scale = clock_scale(f"the {self.name}", self._clock, unit_of[self._clock])
+    def _reads(self, name: str) -> bool:
+        is_clock = self._clock is not None and name == self._clock.name
+        return self.reading.wanted.reads(name) if self.reading.read is not None else not is_clock
+
+    def _group(self, names: Iterable[str]) -> str | None:
+        """Name of the column that gives the trace of each line; None if there is none."""
+        there = set(names)
+        return next((n for n in GROUPS if n in there and n not in (self.reading.read or ())), None)
 
     # ------------------------------------------------------------------------ values
 
     def _row(self, text: str, number: int) -> TimedSample:
-        cells = [bare(cell) for cell in text.split(self._delimiter)]
+        mark = self._delimiter
+        cells = text.split(mark)
+        if '"' in text:
+            cells = next(csv.reader([text], delimiter=mark, skipinitialspace=True))
         if len(cells) != len(self._heads):
             what = f"has {len(cells)} cells, the header names {len(self._heads)} columns"
             raise self._bad(number, what, "E605")
-        if self._delimiter != ",":
-            cells = [_with_point(cell) for cell in cells]
-        return self._moment(self._of_one_trace(dict(zip(self._heads, cells, strict=True))), number)
+        found: dict[str, object] = {}
+        for name, cell in zip(self._heads, map(bare, cells), strict=True):
+            pointed = cell if mark == "," else cell.replace(",", ".")  # if that makes a number
+            found[name] = pointed if value_of(cell) is None and value_of(pointed) is not None else cell
+        return self._moment(found, number)
 
     def _object(self, text: str, number: int) -> TimedSample:
         try:
             found = loads(text)
         except (ValueError, RecursionError):
-            raise self._bad(number, "is not a JSON object") from None
+            found = None
         if not isinstance(found, dict):
             raise self._bad(number, "is not a JSON object")
         flat: dict[str, object] = {}
         for name, value in found.items():
             many = isinstance(value, list)
             flat |= {f"{name}[{i}]": each for i, each in enumerate(value)} if many else {name: value}
-        flat = self._of_one_trace(flat)
         if not self._signals:
-            self._named(flat)
-        elif new := [name for name in flat if name not in self._signals and name != self._clock]:
-            self._signals |= {name: name for name in new if name not in self.reading.names}
+            self._named(name for name in flat if name != self._group(flat))
+        for name in flat:
+            if name not in self._signals and name not in self.reading.names and self._reads(name):
+                self._signals[name] = name
         return self._moment(flat, number)
 
-    def _of_one_trace(self, values: dict[str, object]) -> dict[str, object]:
-        """Remove the cell that names the trace of a line. Raises TraceError (E605) for a second trace."""
-        group = group_among(values)
-        if group is None:
-            return values
-        key = values.pop(group)
-        if key is not None:
-            number = _plain(key)
-            self._only.require(group, key if number is None else number)
-        return values
-
-    def _moment(self, values: Mapping[str, object], number: int) -> TimedSample:
-        time = None if self._clock is None else self._seconds(values.get(self._clock), number)
+    def _moment(self, values: dict[str, object], number: int) -> TimedSample:
+        group = self._group(values)
+        if group is not None and (key := values.pop(group)) is not None:
+            plain = _plain(key)
+            self._only.require(group, key if plain is None else plain)
+        time = None
+        if self._clock is not None:
+            value = values.get(self._clock.name)
+            with suppress(OverflowError):
+                time = self._clock.seconds(value)
+            if time is None or not math.isfinite(time):
+                shown = "no time" if value is None or value == "" else f"`{str(value)[:40]}` for a time"
+                raise self._bad(number, f"has {shown}")
         found = {
             signal: self._number(signal, values[name], number)
             for name, signal in self._signals.items()
@@ -196,50 +202,22 @@ class SampleStream:
         }
         return TimedSample(time, {signal: value for signal, value in found.items() if value is not None})
 
-    def _seconds(self, value: object, number: int) -> float:
-        found = _plain(value)
-        if found is not None and math.isfinite(seconds := found * self._scale):
-            return seconds
-        if isinstance(value, str) and found is None:
-            instant = instant_of_word(value)
-            if instant is not None:
-                self._begin = instant if self._begin is None else self._begin
-                return float((instant - self._begin) / np.timedelta64(1, "ns")) * 1e-9
-        shown = "no time" if value is None or value == "" else f"`{str(value)[:40]}` for a time"
-        raise self._bad(number, f"has {shown}")
-
     def _number(self, signal: str, value: object, number: int) -> float | None:
-        """Convert a value in line `number` to a number; None if it is a word that no requirement needs.
-
-        Raises:
-            TraceError: E603, a needed signal has an unknown word or another value that is not a number.
-        """
-        if value is None:
-            return math.nan
-        found = _plain(value)
-        if found is not None:
-            return found
+        """Return the number of a value; None if it is a word that no requirement needs."""
+        found = math.nan if value is None else _plain(value)
         worth = (self.reading.words or {}).get(signal)
-        if worth is None:
-            return None
+        if found is not None or worth is None:
+            return found
         if worth and isinstance(value, str):
             return number_of_word(f"line {number} of the {self.name}", signal, value, worth)
         raise self._bad(number, f"has `{str(value)[:40]}` where a number is expected")
 
 
-def _with_point(cell: str) -> str:
-    """Return a cell with a point in place of its decimal comma, if this makes it a number."""
-    changed = cell.replace(",", ".")
-    return changed if value_of(cell) is None and value_of(changed) is not None else cell
-
-
 def _plain(value: object) -> float | None:
     """Return the number in a JSON value or in the text of a cell; None if there is no number."""
-    if isinstance(value, str):
-        return value_of(value)
     if isinstance(value, int):
         return float(value) if abs(value) < _BEYOND_FLOATS else math.inf
-    return value if isinstance(value, float) else None
+    return value_of(value) if isinstance(value, str) else value if isinstance(value, float) else None
 
 
 # --------------------------------------------------------------------------------- time
@@ -253,11 +231,13 @@ class Uniform:
         t0: time of the first sample in seconds.
         dt: time step in seconds; None if unknown.
         samples: iterator over the samples; it raises TraceError for invalid input.
+        aside: function that counts the samples so far that lay between two instants of the grid.
     """
 
     t0: float
     dt: float | None
     samples: Iterator[Sample]
+    aside: Callable[[], int] = lambda: 0
 
 
 def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
@@ -281,7 +261,7 @@ def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Unif
     samples = gridded.samples(first, moments)
     head = next(samples, None)
     assert head is not None
-    return Uniform(gridded.t0, gridded.dt, chain([head], samples))
+    return Uniform(gridded.t0, gridded.dt, chain([head], samples), lambda: gridded.aside)
 
 
 def _steady(first: TimedSample, rest: Iterator[TimedSample], dt: float | None, name: str) -> Uniform:
@@ -315,9 +295,8 @@ def _checked(
         if now is None or not abs(now - wanted) <= TOLERANCE * step + _SLACK * abs(wanted):
             found = "no time" if now is None else f"{now:.6g} s"
             message = f"time in the {name} is not uniform: sample {number} has {found}, not {wanted:.6g} s"
-            raise TraceError(
-                Diagnostic("E602", message, help=_ways_out(now, wanted, step, measured=measured))
-            )
+            help_ = _ways_out(now, wanted, step, measured=measured)
+            raise TraceError(Diagnostic("E602", message, help=help_))
         yield moment.sample
 
 
@@ -332,38 +311,21 @@ def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) 
 
 
 @dataclass(slots=True)
-class _Track:
-    """Buffer of the samples of one signal that are still needed for interpolation."""
+class _Buffer:
+    """Samples of one signal that are still needed for values between them."""
 
-    held: bool
+    between: Between
     times: list[float] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
 
-    def take(self, time: float, value: float) -> None:
-        if not math.isnan(value):
-            self.times.append(time)
-            self.values.append(value)
-
     def forget(self, before: float) -> None:
-        """Drop samples that interpolation at time `before` or later does not need."""
+        """Drop samples that values at time `before` or later do not need."""
         there = int(np.searchsorted(self.times, before, side="right")) - 1
         if there > 0:
             del self.times[:there], self.values[:there]
 
-    def on(self, grid: Floats, spacing: Spacing, end: float) -> Floats:
-        """Return the values of the signal on a time grid, (points,).
-
-        No further sample of the signal comes before the time `end`, in seconds.
-        """
-        times, values = np.array(self.times, dtype=np.float64), np.array(self.values, dtype=np.float64)
-        return values_on(grid, times, values, spacing, held=self.held, end=end)
-
     def known_until(self, now: float, limit: float) -> float:
-        """Return the time in seconds up to which interpolated values can no longer change.
-
-        `now` is the time of the latest sample of the stream. `limit` is the longest gap between two samples,
-        in seconds, that is bridged by interpolation.
-        """
+        """Return the time in seconds up to which values can no longer change, once `now` is reached."""
         last = self.times[-1] if self.times else -math.inf
         return now if now - last > limit else last
 
@@ -377,37 +339,44 @@ class Gridded:
         reading: the requested grid, and the kinds of the signals.
         t0: time of the first sample in seconds.
         dt: time step of the time grid in seconds; known once the first sample on the grid was yielded.
+        aside: number of samples that lay between two instants of the grid.
     """
 
     name: str
     reading: Reading
     t0: float = 0.0
     dt: float = math.nan
-    _spacing: Spacing | None = None
-    _tracks: dict[str, _Track] = field(default_factory=dict)
+    aside: int = 0
+    _limit: float = math.nan
+    _buffers: dict[str, _Buffer] = field(default_factory=dict)
     _done: int = 0
     _came: int = 0
     _last: float = -math.inf
 
     def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
         """Yield the samples on the time grid one by one; none is yielded before the time step is known."""
+        given = self.reading.resample or self.reading.dt
+        waits = self.reading.max_gap is None or given is None  # the first samples tell the usual step
         waiting: list[float] = []
         for moment in chain([first], rest):
-            now = self._take(moment)
-            if self._spacing is None:
-                waiting.append(now)
-                if len(waiting) < FIRST and self._has_to_wait:
+            waiting.append(self._take(moment))
+            if math.isnan(self.dt):
+                if len(waiting) < FIRST and waits:
                     continue
-                self._begin(waiting)
-            yield from self._ready(now)
-        if self._spacing is None:
-            self._begin(waiting)
-        yield from self._rest()
+                self._begin(waiting, given)
+            self._count(waiting)
+            until = [each.known_until(self._last, self._limit) for each in self._buffers.values()]
+            yield from self._before(min(until, default=self._last), self._last)
+        if math.isnan(self.dt):
+            self._begin(waiting, given)
+        self._count(waiting)
+        yield from self._before(math.inf, self._last)
 
-    @property
-    def _has_to_wait(self) -> bool:
-        """True if the first samples must be collected, since the usual time step is estimated from them."""
-        return self.reading.max_gap is None or (self.reading.resample or self.reading.dt) is None
+    def _count(self, times: list[float]) -> None:
+        """Count the times that lie between two instants of the grid, and forget them."""
+        while times:
+            steps = (times.pop() - self.t0) / self.dt
+            self.aside += not math.isfinite(steps) or abs(steps - round(steps)) > ROUNDING
 
     def _take(self, moment: TimedSample) -> float:
         time = moment.time
@@ -418,77 +387,49 @@ class Gridded:
         if time < self._last:
             message = f"time in the {self.name} runs backwards: {self._last:g} s, {time:g} s"
             raise TraceError(Diagnostic("E602", message))
-        if not self._came:
-            self.t0 = time
+        self.t0 = self.t0 if self._came else time
         require_span(self.name, self.t0, time)
         self._came, self._last = self._came + 1, time
         for signal, value in moment.sample.items():
-            if signal not in self._tracks:
-                self._tracks[signal] = _Track(self._is_held(signal))
-            self._tracks[signal].take(time, value)
+            if signal not in self._buffers:
+                base, kinds, between = signal.partition("[")[0], self.reading.kinds, self.reading.between
+                held = (kinds.get(signal) or kinds.get(base) or "real") != "real"
+                usual = Between("hold" if held else "linear")
+                self._buffers[signal] = _Buffer(between.get(signal) or between.get(base) or usual)
+            if not math.isnan(value):
+                self._buffers[signal].times.append(time)
+                self._buffers[signal].values.append(value)
         return time
 
-    def _is_held(self, signal: str) -> bool:
-        kinds = self.reading.kinds
-        return (kinds.get(signal) or kinds.get(signal.partition("[")[0]) or "real") != "real"
-
-    def _begin(self, times: list[float]) -> None:
+    def _begin(self, times: list[float], given: float | None) -> None:
         first = np.array(times, dtype=np.float64)
-        self.dt = self.reading.resample or self.reading.dt or snapped(usual_step(first))
+        self.dt = given or snapped(usual_step(first[:FIRST]))
         require_step(self.name, self.dt)
-        self._spacing = Spacing.of(self.dt, first, self.reading.max_gap)
+        self._limit = longest_gap(self.dt, first, self.reading.max_gap)
 
-    def _ready(self, now: float) -> Iterator[Sample]:
-        """Yield the samples on the time grid that are known once a sample at time `now` has arrived."""
-        assert self._spacing is not None
-        until = [track.known_until(now, self._spacing.limit) for track in self._tracks.values()]
-        stop = min(until, default=now)
+    def _before(self, stop: float, end: float) -> Iterator[Sample]:
+        """Yield the next samples on the grid before the time `stop`, and up to the time `end`, in seconds."""
         if stop == -math.inf:
             return
-        yield from self._upto(lambda grid: grid + self._slack < stop, (stop - self.t0) / self.dt + 1, now)
-
-    def _rest(self) -> Iterator[Sample]:
-        """Yield the remaining samples on the time grid at the end of the stream."""
-        steps = (self._last - self.t0) / self.dt + self._slack / self.dt
-        count = math.floor(min(steps, MAX_SAMPLES)) + 1
-        yield from self._upto(lambda grid: np.ones(len(grid), dtype=np.bool_), count, self._last)
-
-    @property
-    def _slack(self) -> float:
-        return 0.0 if self._spacing is None else self._spacing.slack
-
-    def _upto(
-        self, known: Callable[[Floats], NDArray[np.bool_]], most: float, end: float
-    ) -> Iterator[Sample]:
-        """Yield the next samples on the time grid, as long as they are known.
-
-        Args:
-            known: function from times of the grid, in seconds, to booleans: True if the sample at this time
-                is known.
-            most: greatest number of samples to yield since the start of the stream.
-            end: no further sample of the stream comes before this time, in seconds.
-
-        Raises:
-            TraceError: E605, `most` is too large.
-        """
-        assert self._spacing is not None
+        slack = ROUNDING * self.dt
+        most = (min(stop, end) - self.t0 + slack) / self.dt + 1
         if most > MAX_SAMPLES:
             message = f"the {self.name} spans more than {MAX_SAMPLES:,} steps of {self.dt:g} s"
             raise TraceError(Diagnostic("E605", message, help=("a larger step",)))
         while True:
-            stop = min(math.ceil(most), self._done + _AT_ONCE)
-            grid = self.t0 + self.dt * np.arange(self._done, stop, dtype=np.float64)
-            grid = grid[known(grid)]
+            last = min(math.floor(most), self._done + _AT_ONCE)
+            grid = self.t0 + self.dt * np.arange(self._done, last, dtype=np.float64)
+            grid = grid[grid + slack < stop]
             if not len(grid):
                 return
-            columns = {
-                name: track.on(grid, self._spacing, max(end, float(grid[-1])))
-                for name, track in self._tracks.items()
-            }
+            columns = {}
+            for name, each in self._buffers.items():
+                times, values = np.array(each.times, np.float64), np.array(each.values, np.float64)
+                track = track_of(times, values, each.between, self._limit, max(end, float(grid[-1])))
+                columns[name] = track.around(grid, slack)[0]
             self._done += len(grid)
-            following = self.t0 + self.dt * self._done
-            for track in self._tracks.values():
-                track.forget(following)
+            for each in self._buffers.values():
+                each.forget(self.t0 + self.dt * self._done)
             rows = np.array(list(columns.values())).T.tolist() if columns else [[]] * len(grid)
             for row in rows:
                 yield dict(zip(columns, row, strict=True))

@@ -118,12 +118,10 @@ def read_meta(path: Path, array: NDArray[Any] | None) -> tuple[TraceMeta, dict[s
     A description gives the unit, kind and range of a signal. Both results are empty if `array` is None.
 
     Raises:
-        TraceError: E603, the array is not a JSON text of the expected form.
+        TraceError: E603, the array, a single text, is not JSON of the expected form.
     """
     if array is None:
         return TraceMeta(), {}
-    if array.dtype.kind != "U" or array.shape != ():
-        raise unreadable(path, "`meta` is not a JSON text")
     try:
         written = loads(str(array))
         return _meta_of(written), {n: _column(n, entry) for n, entry in written.get("signals", {}).items()}
@@ -150,6 +148,8 @@ def _meta_of(written: Mapping[str, Any]) -> TraceMeta:
             raise ValueError(f"`{name}` is {value!r:.40}")
         if isinstance(value, dict) and not all(isinstance(text, str) for text in value.values()):
             raise ValueError(f"`{name}` does not hold texts")
+        if isinstance(value, (int, float)) and not abs(value) < 2**63:
+            raise ValueError(f"`{name}` is out of range")
     return TraceMeta(**known)
 
 
@@ -157,10 +157,17 @@ def _column(name: str, entry: Mapping[str, Any]) -> Column:
     kind, role = entry.get("kind", "real"), entry.get("role", "state")
     if kind not in get_args(Kind) or role not in get_args(Role):
         raise ValueError(f"`{name}` is {kind!r:.20} {role!r:.20}")
-    labels = tuple((str(label), float(value)) for label, value in entry.get("labels", {}).items())
+    labels = tuple((label, _number(label, value)) for label, value in entry.get("labels", {}).items())
     unit = parse_unit(entry["unit"]) if entry.get("unit") else DIMENSIONLESS
-    low, high = (None if entry.get(end) is None else float(entry[end]) for end in ("low", "high"))
+    low, high = (None if entry.get(end) is None else _number(end, entry[end]) for end in ("low", "high"))
     return Column(name, unit, kind, role, low, high, labels)
+
+
+def _number(name: str, value: Any) -> float:
+    """Convert a JSON number. Raises ValueError for NaN and other values, OverflowError for a huge integer."""
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or value != value:
+        raise ValueError(f"`{name}` is {value!r:.40}")
+    return float(value)
 
 
 def _written(column: Column) -> dict[str, Any]:

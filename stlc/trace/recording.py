@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,107 @@ Floats = NDArray[np.float64]
 CLOCK = "t"
 ROSTOPIC = "%time"
 """Name of the clock in output of `rostopic echo -p`, in nanoseconds."""
-CLOCKS = (CLOCK, "time", "times", "timestamp", "__time", "tout", ROSTOPIC)
-"""Names of a clock, case-insensitive."""
 EXTRA = "extra."
-MAX_COMPONENTS = 1000
+_CLOCKED = re.compile(
+    r"(?:t|times?|timestamp|time_?stamp|tout|stamp|date|datetime|date_?time|clock|elapsed|epoch|secs?|nanosec|"
+    r"nsecs?|nanos|frame|cycle|step|tick)"
+    r"(?:[ _]?(?:s|secs?|seconds?|ms|msecs?|millis|us|usecs?|micros|ns|nsecs?|nanos|min|utc|boot|id|number))"
+    r"{0,2}",
+    re.IGNORECASE,
+)
+_COUNTS = re.compile(
+    r"(?:.*[._\s/])?(?:frame|cycle|step|tick)(?:[ _]?(?:id|number|nr|no|count|index))?", re.IGNORECASE
+)
+_GROUPED = re.compile(
+    r"(?i:(?:.*[._\s/])?(?:trace|agent|id|track|vehicle|unit|run|episode|engine|case|object|trial|subject|series))"
+    r"|.*(?:_id|_ID|[a-z]I[dD])"
+)
+
+
+def clock_rank(name: str) -> int:
+    """Return 2 if a column is called like a clock, 1 if its last words are, as in `motor_time`; else 0."""
+    if len(name) > _LONGEST:
+        return 0
+    leaf = re.split(r"[./]", name)[-1].strip("# _%")
+    if name.strip() == ROSTOPIC or _CLOCKED.fullmatch(leaf):
+        return 2
+    starts = (found.end() for found in re.finditer(r"[_\s](?!t\b)", leaf))
+    return int(any(_CLOCKED.fullmatch(leaf, start) for start in starts))
+
+
+def is_count_name(name: str) -> bool:
+    """True if a column of this name counts samples, such as `frame`."""
+    return len(name) <= _LONGEST and _COUNTS.fullmatch(name) is not None
+
+
+def is_group_name(name: str) -> bool:
+    """True if a column of this name may tell traces apart."""
+    return len(name) <= _LONGEST and _GROUPED.fullmatch(name.strip()) is not None
+
+
+_LONGEST = 80
+"""Letters of the name of a clock or of a group."""
+_SHOWN = 40
+"""Names that a message lists."""
+MAX_COMPONENTS = 4096
 """Most components of a vector."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is asked of a trace file; a reader may leave out everything else.
+
+    Attributes:
+        names: names in the file of the signals that are read, such as `v`, `q[0]`, `scan.ranges`,
+            `joint_states.position[elbow]` or `/cmd/linear.x`; None: all.
+        clock: name of the clock; "" if the file decides.
+        groups: names of the columns that tell the traces of a table apart; empty if the file decides.
+        columns: names of the columns of a table without a header.
+    """
+
+    names: frozenset[str] | None = None
+    clock: str = ""
+    groups: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
+
+    def reads(self, name: str) -> bool:
+        """True if the array `name`, a component (`q[0]` of `q`) or a part of it (`s.x` of `s`) is read."""
+        if self.names is None or name in self.names or name == self.clock:
+            return True
+        if name.partition("[")[0] in self.names:
+            return True
+        return any(each.startswith((f"{name}[", f"{name}.")) for each in (*self.names, self.clock))
+
+    def keeps(self, name: str) -> bool:
+        """True if the array `name` is read, or may be needed to tell its times or its traces."""
+        return self.reads(name) or name in self.groups or clock_rank(name) > 0 or is_group_name(name)
+
+
+ALL = Wanted()
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Clock of a group of signals, as it was found.
+
+    Attributes:
+        name: name of the array.
+        unit: unit of its numbers, or the kind of its words; "" if nothing says it (then it is seconds).
+        others: names of further candidates.
+    """
+
+    name: str
+    unit: str = ""
+    others: tuple[str, ...] = ()
+
+    @property
+    def plain(self) -> bool:
+        """True if nothing was decided: the only candidate, in seconds."""
+        return self.unit in ("", "s") and not self.others
+
+    def __str__(self) -> str:
+        told = f"`{self.name}`" + (f" ({self.unit})" if self.unit else "")
+        return told + "".join(f", not `{each}`" for each in self.others)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +132,10 @@ class ClockGroup:
     """Group of signals that share their sampling times.
 
     Attributes:
-        arrays: signal -> (samples,), (traces, samples) or (…, samples, components).
-        clock: times in seconds, (samples,); None if the file contains none.
+        arrays: signal -> (samples,), (traces, samples) or (…, samples, components); numbers or texts. If
+            `clock` is None, one of them may be the clock.
+        clock: times, (samples,), as the reader of the file knows them: seconds, or whole nanoseconds since
+            1970 (int64); None if they are among the arrays, or if there are none.
         named: name of the time column in the file.
     """
 
@@ -55,6 +154,15 @@ class Recording:
         columns: signal -> unit, kind and range, if the file gives them.
         meta: origin of the trace.
         extras: all other arrays in the file.
+        units: signal -> its unit as text, as the file writes it. It is parsed if the signal is read.
+        others: names in the file that were left out, for messages; not necessarily all.
+        clashes: name -> the sources that have this name (topics, columns) -> the name that is unambiguous. It
+            is an error to read such a name.
+        refused: name -> why it has no values (a reason that continues "`name` …"). It is an error to read it.
+        remarks: warnings about the file, such as a recording that was cut short.
+        line: function from the index of a row to its line in the file; None if rows are no lines.
+        clocks: the clocks of its groups, once they are chosen.
+        track: the object in a table that this is, such as `agent=2`; "" if the file holds one.
     """
 
     name: str
@@ -62,29 +170,32 @@ class Recording:
     columns: Mapping[str, Column] = field(default_factory=dict)
     meta: TraceMeta = field(default_factory=TraceMeta)
     extras: Mapping[str, Array] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    others: tuple[str, ...] = ()
+    clashes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    refused: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[Diagnostic, ...] = ()
+    line: Callable[[int], int] | None = None
+    clocks: tuple[Clock, ...] = ()
+    track: str = ""
+
+    def unit(self, name: str) -> str:
+        """Return the unit that the file states for an array, as text; "" if there is none."""
+        column = self.columns.get(name)
+        return self.units.get(name, "") or ("" if column is None else column.unit.text)
+
+    def column(self, name: str) -> Column:
+        """Return what the file says of a signal: its unit, kind and range.
+
+        Raises TraceError (E605) for an invalid unit.
+        """
+        known = self.columns.get(name)
+        return known or Column(name, unit_of(Path(self.name), name, self.units.get(name, "")))
 
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of all signals."""
         return tuple(name for group in self.groups for name in group.arrays)
-
-    def clocked_by(self, signal: str) -> Recording:
-        """Return a copy in which `signal` is the time of its group of signals.
-
-        Raises:
-            TraceError: E601, there is no such signal.
-        """
-        for index, group in enumerate(self.groups):
-            if group.clock is not None and group.named == signal:
-                return self
-            if signal in group.arrays:
-                rest = {name: values for name, values in group.arrays.items() if name != signal}
-                if group.clock is not None:
-                    rest[group.named] = group.clock
-                changed = ClockGroup(rest, group.arrays[signal].reshape(-1), signal)
-                groups = (*self.groups[:index], changed, *self.groups[index + 1 :])
-                return replace(self, groups=groups)
-        raise TraceError(absent(self.name, signal, self.signals))
 
 
 def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
@@ -95,30 +206,8 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
         "E601",
         f"trace `{trace}` has no signal `{signal}`",
         help=(f"did you mean `{near}`?",) if near else (),
-        note=(f"signals in {trace}: {', '.join(names)}",),
+        note=(f"signals in {trace}: {', '.join(names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''}",),
     )
-
-
-def clock_among(names: Iterable[str]) -> str | None:
-    """Return the name of the time column: `t`, else a usual name for time such as `time`.
-
-    A usual name is returned only if exactly one of them occurs; otherwise None.
-    """
-    known = list(names)
-    found = [name for name in known if name.strip().lower() in CLOCKS]
-    return CLOCK if CLOCK in known else found[0] if len(found) == 1 else None
-
-
-def of_arrays(path: Path, arrays: Mapping[str, Array], meta: TraceMeta | None = None) -> Recording:
-    """Return a recording of arrays that share one time column, if there is one.
-
-    Arrays called `extra.…` are not signals: they become the extras of the recording.
-    """
-    named = clock_among(arrays)
-    extras = {n.removeprefix(EXTRA): values for n, values in arrays.items() if n.startswith(EXTRA)}
-    signals = {n: values for n, values in arrays.items() if n != named and not n.startswith(EXTRA)}
-    group = ClockGroup(signals, None) if named is None else ClockGroup(signals, arrays[named], named)
-    return Recording(str(path), (group,), meta=meta or TraceMeta(), extras=extras)
 
 
 def unit_of(path: Path, name: str, text: str) -> Unit:
@@ -141,6 +230,8 @@ def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array
     for signal, values in arrays.items():
         if values.ndim in (1, 2) and values.shape[-1] == samples:
             data[signal] = np.atleast_2d(values)
+        elif not values.ndim:
+            data[signal] = np.broadcast_to(values, (1, samples))
         elif values.ndim in (2, 3) and values.shape[-2] == samples and values.shape[-1] <= MAX_COMPONENTS:
             stacked = values[None] if values.ndim == 2 else values
             data |= {f"{signal}[{i}]": stacked[..., i] for i in range(values.shape[-1])}

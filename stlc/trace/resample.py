@@ -1,14 +1,18 @@
-"""Resampling of signals to one time grid: discrete signals are held, real ones interpolated linearly.
+"""Resampling of signals to one time grid, in which every recorded sample counts.
 
-If the gap between two samples of a signal is too long, the signal is unknown (NaN) within it.
+A grid shows a signal at regular instants. Between two of them there may be several samples, or none. The
+samples are therefore kept as *moments*: all instants at which a signal was recorded, and the instants of the
+grid. At a moment between two samples of a signal, its value is that of the earlier sample (`hold`), a point
+on the line or arc between both (`linear`, `angle`), or either of them (`either`, the default for real
+signals): then a verdict rests on values that were recorded.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +24,19 @@ from stlc.trace.time_grid import NO_CLOCK, NO_STEP, check_finite, require_step, 
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+How: TypeAlias = Literal["hold", "linear", "angle", "either"]
 
 MAX_SAMPLES = 100_000_000
+FREE_SAMPLES = 1_000_000
+"""A grid may have this many samples, or `MAX_RATIO` for each recorded one."""
+MAX_RATIO = 50
 
-_ROUNDING = 1e-6
+ROUNDING = 1e-6
+"""Share of a step by which times may be off the grid."""
 
 _GAPS = 9
-"""Number of gaps between the first samples from which the usual step is computed."""
+"""Number of gaps between the first samples from which the usual step of a stream is computed."""
 
 BRIDGED = 3
 """Default longest gap that is bridged, in usual steps."""
@@ -34,85 +44,153 @@ BRIDGED = 3
 _SAME = 1 + 1e-9
 
 
-def usual_step(times: Floats) -> float:
-    """Usual time between samples in seconds; 0 if it is unknown.
+@dataclass(frozen=True, slots=True)
+class Between:
+    """Values of a signal between its samples.
 
-    It is the median of the first nine time differences, without those that are 0.
+    Attributes:
+        how: `hold`: that of the last sample; `linear`; `angle`: along the shorter arc; `either`: that of the
+            last or the next sample.
+        age: for `hold`, seconds after which a value is unknown; None: never.
+        period: for `angle`, a full turn in the unit of the signal.
     """
-    gaps = np.diff(times[: _GAPS + 1])
+
+    how: How
+    age: float | None = None
+    period: float = 2.0 * math.pi
+
+
+def usual_step(times: Floats) -> float:
+    """Usual time between samples in seconds: the median of the positive differences; 0 if there are none."""
+    gaps = np.diff(times)
     gaps = gaps[gaps > 0]
     return float(np.median(gaps)) if len(gaps) else 0.0
 
 
 FIRST = _GAPS + 1
-"""Number of samples that `usual_step` uses."""
+"""Number of first samples from which the usual step of a stream is computed."""
+
+
+def longest_gap(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> float:
+    """Return the longest gap between samples, in seconds, within which values are known.
+
+    It is `max_gap`, if that is given. Otherwise it is unlimited for `events`, whose values hold until the
+    next sample, and else three steps: of the grid (`dt`), or of the samples at `times`, whichever are longer.
+    """
+    if max_gap is not None:
+        return max_gap * _SAME
+    return math.inf if events else BRIDGED * max(dt, usual_step(times)) * _SAME
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Samples of a signal of one trace, without those that are unknown (NaN).
+
+    Attributes:
+        times: their times in seconds, increasing, (samples,).
+        values: their values, (samples,).
+        between: values between them.
+        limit: longest gap in seconds within which values are known.
+        end: time in seconds before which no further sample comes.
+    """
+
+    times: Floats
+    values: Floats
+    between: Between
+    limit: float
+    end: float
+
+    def around(self, moments: Floats, slack: float) -> tuple[Floats, Floats]:
+        """Return the two values that the signal may have at each moment, (moments,) each; NaN: unknown.
+
+        They are the same array where values are known exactly.
+        """
+        if not len(self.times):
+            unknown = np.full(len(moments), math.nan)
+            return unknown, unknown
+        there = np.searchsorted(self.times, moments + slack, side="right") - 1
+        index = np.clip(there, 0, None)
+        since = moments - self.times[index]
+        exact = since <= slack
+        found = self.values[index]
+        how, last = self.between.how, len(self.times) - 1
+        if how == "hold":
+            if self.between.age is not None:
+                unknown = since > self.between.age * _SAME + slack
+            else:
+                unknown = (np.append(np.diff(self.times), self.end - self.times[-1]) > self.limit)[
+                    index
+                ] & ~exact
+        else:
+            unknown = (np.append(np.diff(self.times), math.inf) > self.limit)[index] & ~exact
+        unknown |= there < 0
+        following = found
+        if how == "either":
+            following = np.where(exact, found, self.values[np.minimum(index + 1, last)])
+            following[unknown] = math.nan
+        elif how != "hold":
+            width = np.append(np.diff(self.times), 1.0)[index]
+            share = np.where(exact, 0.0, since / np.where(width > 0, width, 1.0))
+            change = self.values[np.minimum(index + 1, last)] - found
+            if how == "angle":
+                turn = self.between.period
+                change -= turn * np.round(change / turn)
+                low = -turn / 2 if (self.values < 0).any() else 0.0
+                moved = found + share * change
+                found = np.where(exact, found, (moved - low) % turn + low)
+            else:
+                found = found + share * change
+            following = found
+        found = np.where(unknown, math.nan, found)
+        return found, following if how == "either" else found
+
+
+def track_of(times: Floats, values: Array, between: Between, limit: float, end: float) -> Track:
+    """Return the samples of a signal, without NaN; those of one time are put a rounding error apart."""
+    numbers = values.astype(np.float64, copy=False)
+    there = ~np.isnan(numbers)
+    if not there.all():
+        times, numbers = times[there], numbers[there]
+    same = np.diff(times) <= 0
+    if same.any():
+        index = np.arange(len(times))
+        rank = index - np.maximum.accumulate(np.where(np.append(False, same), 0, index))
+        times = np.maximum.accumulate(times + rank * 2 * np.spacing(np.abs(times) + 1.0))
+    return Track(times, numbers, between, limit, end)
+
+
+# ----------------------------------------------------------------------------- moments
 
 
 @dataclass(frozen=True, slots=True)
-class Spacing:
-    """Time step of a grid, and the longest gap between samples that is bridged.
+class TimeRange:
+    """Times in seconds between which a signal, or a whole recording, was seen."""
+
+    first: float
+    last: float
+
+    def within(self, other: TimeRange) -> TimeRange:
+        """Return the time that both spans share."""
+        return TimeRange(max(self.first, other.first), min(self.last, other.last))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Instants at which signals were recorded, and those of the grid, in order.
 
     Attributes:
-        dt: time step of the grid in seconds.
-        limit: the longest gap between two samples, in seconds, within which values are held or interpolated.
+        times: times in seconds, (moments,).
+        starts: index of the first moment of each cell, which is the instant of the grid itself, (samples,).
+        before: signal -> value, or that of the sample before, (traces, moments).
+        after: signal -> value, or that of the sample after; the same array where it is the same.
+        clocks: signal -> number of its clock.
     """
 
-    dt: float
-    limit: float = math.inf
-
-    @staticmethod
-    def of(dt: float, times: Floats, max_gap: float | None, *, events: bool = False) -> Spacing:
-        """Return the spacing with step `dt` that bridges gaps of at most `max_gap` seconds.
-
-        Within a bridged gap, values are held or interpolated. If `max_gap` is None, there are two cases. If
-        `events` is True, all gaps are bridged: each value of a discrete signal holds until the next sample.
-        Otherwise gaps of up to three steps are bridged. The length of a step is then `dt` or the usual time
-        between the samples at `times`, whichever is longer.
-        """
-        if max_gap is not None:
-            return Spacing(dt, max_gap * _SAME)
-        return Spacing(dt, math.inf if events else BRIDGED * max(dt, usual_step(times)) * _SAME)
-
-    @property
-    def slack(self) -> float:
-        """Tolerance in seconds for rounding errors of times."""
-        return _ROUNDING * self.dt
-
-
-def values_on(
-    grid: Floats, times: Floats, values: Array, spacing: Spacing, *, held: bool, end: float
-) -> Floats:
-    """Return a signal on a grid, (points,), NaN where it is unknown.
-
-    A signal is unknown before its first sample and within gaps that are too long. If it is interpolated, it
-    is also unknown after its last sample. Samples that are NaN are ignored.
-
-    Args:
-        grid: increasing times of the grid in seconds, (points,).
-        times: times of the samples, non-decreasing, (samples,).
-        values: values of the samples, (samples,).
-        spacing: time step of the grid and longest allowed gap.
-        held: True for zero-order hold, False for linear interpolation.
-        end: no further sample comes before this time, in seconds. A held last value is known until `end`,
-            unless the gap from the last sample to `end` is too long.
-    """
-    there = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
-    if not there.all():
-        times, values = times[there], values[there]
-    if not len(times):
-        return np.full(len(grid), math.nan)
-    slack = spacing.slack
-    index = np.searchsorted(times, grid + slack, side="right") - 1
-    before = np.clip(index, 0, None)
-    if held:
-        found = values[before].astype(np.float64)
-    else:
-        found = np.asarray(np.interp(grid, times, values.astype(np.float64)), dtype=np.float64)
-    gaps = np.append(np.diff(times), end - times[-1] if held else math.inf)
-    unknown = (gaps[before] > spacing.limit) | (not held) & (before == len(times) - 1)
-    unknown &= grid - times[before] > slack
-    found[unknown | (index < 0)] = math.nan
-    return found
+    times: Floats
+    starts: Ints
+    before: Mapping[str, Floats]
+    after: Mapping[str, Floats]
+    clocks: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,35 +199,12 @@ class _Timed:
 
     times: Floats
     signals: Mapping[str, Array]
-    held: frozenset[str]
-
-    @property
-    def first(self) -> float:
-        return float(self.times[0])
+    between: Mapping[str, Between]
 
     @property
     def events(self) -> bool:
         """True if all signals keep their value until the next sample."""
-        return len(self.held) == len(self.signals)
-
-    @property
-    def last(self) -> float:
-        """The last time at which all signals are known; +inf if all keep their last value."""
-        return math.inf if self.events else float(self.times[-1])
-
-
-@dataclass(frozen=True, slots=True)
-class ResampleGrid:
-    """Grid requested for resampling.
-
-    Attributes:
-        dt: time step in seconds; None: the usual time between samples.
-        max_gap: the longest gap, in seconds, within which values are known. If None, the limit is three
-            steps, but discrete signals with a time column of their own have no limit.
-    """
-
-    dt: float | None = None
-    max_gap: float | None = None
+        return all(each.how == "hold" for each in self.between.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,96 +215,156 @@ class Resampled:
         t0: time of the first sample in seconds.
         dt: time step in seconds.
         data: signal -> (traces, samples); NaN where a signal is unknown.
+        moments: all instants at which signals were recorded.
+        spans: signal -> the time in which it was seen.
     """
 
     t0: float
     dt: float
     data: dict[str, Floats]
+    moments: Moments
+    spans: dict[str, TimeRange]
 
 
-def resampled(recording: Recording, grid: ResampleGrid, kinds: Mapping[str, Kind]) -> Resampled:
-    """Return the signals of a recording on one grid.
-
-    The grid spans the time in which every signal is known. bool, int and enum signals keep their last value
-    (zero-order hold), and real signals are interpolated. Within a gap that is too long, a signal is NaN.
+def resampled(
+    recording: Recording,
+    dt: float | None,
+    max_gap: float | None,
+    between: Mapping[str, Between],
+    kinds: Mapping[str, Kind],
+) -> Resampled:
+    """Return the signals of a recording on one grid, which begins at their first sample.
 
     Args:
         recording: content of a trace file, with one or more groups of common times.
-        grid: the requested grid.
+        dt: time step of the grid in seconds; None: the usual time between samples.
+        max_gap: the longest gap, in seconds, within which values are known; None: see `longest_gap`.
+        between: signal -> its values between samples; others follow from their kinds.
         kinds: signal -> kind of its numbers, which takes precedence over the kind in the file.
 
     Raises:
-        TraceError: E601, a group has no times; E602, times decrease, have no common interval, or `dt` is not
-            a valid time step; E604, a time is not finite; E605, arrays do not fit together, or there are too
-            many samples.
+        TraceError: E601, a group has no times; E602, times decrease, or `dt` is not a valid time step; E604,
+            a time is not finite; E605, arrays do not fit together, or the grid has too many samples.
     """
-    groups = [_timed(recording, group, kinds) for group in recording.groups if group.arrays]
+    groups = [_timed(recording, group, between, kinds) for group in recording.groups if group.arrays]
     if not groups:
         raise TraceError(Diagnostic("E601", f"trace `{recording.name}` has no signals"))
-    dt = grid.dt
     if dt is None:
         dt = snapped(min((step for s in groups if (step := usual_step(s.times))), default=0.0))
     require_step(recording.name, dt)
-    start = max(group.first for group in groups)
-    stop = min(group.last for group in groups)
-    if math.isinf(stop):
-        stop = max(float(group.times[-1]) for group in groups)
-    count = _count(recording.name, start, stop, dt)
-    instants = start + dt * np.arange(count, dtype=np.float64)
+    start = min(float(group.times[0]) for group in groups)
+    stop = max(float(group.times[-1]) for group in groups)
+    count = _count(recording, start, stop, dt, sum(len(group.times) for group in groups))
+    points = start + dt * np.arange(count, dtype=np.float64)
+    tracks = _tracks(groups, max_gap, between, start, dt, stop)
+    stamps = {id(track.times): track.times for rows in tracks.values() for track in rows}
+    times = np.unique(np.concatenate([points, *stamps.values()]))
+    starts = np.searchsorted(times, points)
     data: dict[str, Floats] = {}
+    before: dict[str, Floats] = {}
+    after: dict[str, Floats] = {}
+    for name, rows in tracks.items():
+        pairs = [track.around(times, 0.0) for track in rows]
+        before[name] = np.stack([pair[0] for pair in pairs])
+        if any(pair[0] is not pair[1] for pair in pairs):
+            after[name] = np.stack([pair[1] for pair in pairs])
+            lines = [replace(track, between=Between("linear")) for track in rows]
+            data[name] = np.stack([track.around(points, ROUNDING * dt)[0] for track in lines])
+        else:
+            data[name] = before[name][:, starts]
+    data, before = _same_traces(recording.name, data), _same_traces(recording.name, before)
+    other = _same_traces(recording.name, after) if after else after
+    clocks = {name: clock for clock, group in enumerate(groups) for name in group.signals}
+    moments = Moments(times, starts, before, {name: other.get(name, before[name]) for name in before}, clocks)
+    spans = {name: _seen(rows, stop) for name, rows in tracks.items()}
+    return Resampled(start, dt, data, moments, spans)
+
+
+def _tracks(
+    groups: Sequence[_Timed],
+    max_gap: float | None,
+    asked: Mapping[str, Between],
+    start: float,
+    dt: float,
+    stop: float,
+) -> dict[str, list[Track]]:
+    found = {}
     for group in groups:
-        spacing = Spacing.of(dt, group.times, grid.max_gap, events=group.events and len(groups) > 1)
-        end = max(float(group.times[-1]), float(instants[-1]))
+        points = start + dt * np.rint((group.times - start) / dt)
+        times = np.where(np.abs(group.times - points) <= ROUNDING * dt, points, group.times)  # up to rounding
+        events = group.events and len(groups) > 1
         for name, rows in group.signals.items():
-            held = name in group.held
-            data[name] = np.stack(
-                [values_on(instants, group.times, row, spacing, held=held, end=end) for row in rows]
-            )
-    return Resampled(start, dt, _same_traces(recording.name, data))
+            between = group.between[name]
+            holds = events or (between.how == "hold" and name in asked)
+            limit = longest_gap(dt, group.times, max_gap, events=holds)
+            found[name] = [track_of(times, row, between, limit, stop) for row in rows]
+    return found
 
 
-def _count(name: str, start: float, stop: float, dt: float) -> int:
-    if stop < start - _ROUNDING * dt:
-        ends = f"one starts at {start:g} s, one ends at {stop:g} s"
-        message = f"the signals of `{name}` have no time in common: {ends}"
-        raise TraceError(Diagnostic("E602", message))
-    steps = (stop - start) / dt + _ROUNDING
-    if steps >= MAX_SAMPLES:
+def _seen(tracks: Sequence[Track], stop: float) -> TimeRange:
+    """Time in which a signal was seen in all traces; empty if it never was."""
+    seen = [track.times for track in tracks]
+    if not all(map(len, seen)):
+        return TimeRange(math.inf, -math.inf)
+    last = stop if tracks[0].between.how == "hold" else min(float(times[-1]) for times in seen)
+    return TimeRange(max(float(times[0]) for times in seen), last)
+
+
+def _count(recording: Recording, start: float, stop: float, dt: float, recorded: int) -> int:
+    steps = (stop - start) / dt + ROUNDING
+    most = min(MAX_SAMPLES, max(FREE_SAMPLES, MAX_RATIO * recorded))
+    if steps >= most:
         message = (
-            f"`{name}` spans {stop - start:g} s: a step of {dt:g} s gives more than {MAX_SAMPLES:,} samples"
+            f"`{recording.name}` spans {stop - start:.6g} s: a step of {dt:g} s gives {steps + 1:,.0f} "
+            f"samples, and {recorded:,} were recorded"
         )
-        raise TraceError(Diagnostic("E605", message, help=("a larger step",)))
+        named = next((g.named for g in recording.groups if g.arrays), "t")
+        help_ = (
+            f"--resample {nearest_step((stop - start) / most)}  takes a longer step",
+            f"--clock {named}:us  says that the clock is in another unit than seconds",
+        )
+        raise TraceError(Diagnostic("E605", message, help=help_))
     return math.floor(steps) + 1
 
 
-def _timed(recording: Recording, group: ClockGroup, kinds: Mapping[str, Kind]) -> _Timed:
+def nearest_step(least: float) -> str:
+    """Text of a round time step of at least `least` seconds."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return f"{next(f * power for f in (1, 2, 5, 10, 20) if f * power >= least):.6g}s"
+
+
+def _timed(
+    recording: Recording, group: ClockGroup, asked: Mapping[str, Between], kinds: Mapping[str, Kind]
+) -> _Timed:
     name = recording.name
     if group.clock is None:
         help_ = (NO_CLOCK, NO_STEP)
         raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_))
     times: Floats = group.clock.astype(np.float64).reshape(-1)
-    _check_times(name, times)
-    signals = fit(name, group.arrays, len(times))
-    held = frozenset(n for n, values in signals.items() if _discrete(n, values, recording, kinds))
-    return _Timed(times, signals, held)
-
-
-def _check_times(name: str, times: Floats) -> None:
     check_finite(name, times)
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         i = int(back[0])
         message = f"time in `{name}` runs backwards: t[{i}] = {times[i]:g} s, t[{i + 1}] = {times[i + 1]:g} s"
         raise TraceError(Diagnostic("E602", message))
+    signals = fit(name, group.arrays, len(times))
+    between = {n: _between(n, values, recording, asked, kinds) for n, values in signals.items()}
+    return _Timed(times, signals, between)
 
 
-def _discrete(name: str, values: Array, recording: Recording, kinds: Mapping[str, Kind]) -> bool:
-    said = kinds.get(name) or kinds.get(name.partition("[")[0])
-    if said is not None:
-        return said != "real"
-    if name in recording.columns and recording.columns[name].kind != "real":
-        return True
-    return values.dtype.kind in "biu"
+def _between(
+    name: str, values: Array, recording: Recording, given: Mapping[str, Between], kinds: Mapping[str, Kind]
+) -> Between:
+    """Values of a signal between its samples: as asked for, else held if it is discrete or has one sample."""
+    base = name.partition("[")[0]
+    asked = given.get(name) or given.get(base)
+    if asked is not None:
+        return asked
+    said = kinds.get(name) or kinds.get(base)
+    if said is None:
+        said = recording.columns[name].kind if name in recording.columns else "real"
+        said = "int" if said == "real" and values.dtype.kind in "biu" else said
+    return Between("either" if said == "real" and values.shape[-1] > 1 else "hold")
 
 
 def _same_traces(name: str, data: dict[str, Floats]) -> dict[str, Floats]:

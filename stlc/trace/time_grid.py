@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
+from stlc.trace.recording import is_count_name
 
 Floats = NDArray[np.float64]
 
@@ -33,10 +34,10 @@ def resample_advice(step: float) -> str:
     proposed step is therefore at most half of `step`.
     """
     if not (np.isfinite(step) and 2 * SHORTEST <= step <= LONGEST):
-        return "--resample TIME  puts them on one grid (bool, int and enum held, real ones interpolated)"
+        return "--resample TIME  puts them on one grid, on which every sample counts"
     power = 10.0 ** np.floor(np.log10(step / 2))
     finer = max(factor * power for factor in (1, 2, 5) if factor * power <= step / 2 * (1 + 1e-9))
-    return f"--resample {finer:.6g}s  puts them on one grid (bool, int and enum held, real ones interpolated)"
+    return f"--resample {finer:.6g}s  puts them on one grid, on which every sample counts"
 
 
 def gap_advice(step: float) -> str:
@@ -69,8 +70,10 @@ def read_clock(
         require_step(name, dt)
     if clock is None:
         if dt is None:
-            help_ = (NO_CLOCK, NO_STEP)
-            known = ", ".join(others)
+            names = list(others)
+            frames = [f"--fps 25  if `{name}` counts frames" for name in names if is_count_name(name)]
+            help_ = (*frames[:1], NO_CLOCK, NO_STEP)
+            known = ", ".join(names)
             note = (f"arrays in {name}: {known}",) if known else ()
             raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_, note=note))
         return 0.0, dt, samples
@@ -95,14 +98,6 @@ def require_step(name: str, dt: float) -> None:
     if not SHORTEST <= dt <= LONGEST:
         help_ = (f"time is in seconds, and a step at least {SHORTEST:g} s and at most {LONGEST:g} s",)
         raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s", help=help_))
-
-
-def require_same_step(name: str, found: float, said: float) -> None:
-    """Raise TraceError (E602) if the measured time step `found` differs from the given time step `said`."""
-    if abs(found - said) > 1e-3 * said:
-        message = f"`{name}` has a sample every {found:.6g} s, not every {said:.6g} s"
-        help_ = ("leave out --dt: the file says what its step is",)
-        raise TraceError(Diagnostic("E602", message, help=help_))
 
 
 def require_span(name: str, first: float, last: float) -> None:
@@ -140,11 +135,10 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
             f"time in `{name}` is not uniform: t[{i}] = {times[i]:.6g} s is {drift[i]:.3g} s beside the grid"
         )
         raise TraceError(Diagnostic("E602", message, help=(resample_advice(mean),)))
-    return _snap(mean, dt)
+    return snapped(mean, dt)
 
 
 def _require_even(name: str, times: Floats) -> None:
-    """Check that times increase by about the usual step. Raises TraceError (E602)."""
     gaps = np.diff(times)
     usual = float(np.median(gaps))
     backwards = np.flatnonzero(gaps <= 0)
@@ -153,7 +147,10 @@ def _require_even(name: str, times: Floats) -> None:
         message = (
             f"time in `{name}` does not increase: t[{i}] = {times[i]:g} s, t[{i + 1}] = {times[i + 1]:g} s"
         )
-        raise TraceError(Diagnostic("E602", message))
+        help_ = (
+            () if (gaps < 0).any() else (resample_advice(float(np.median(gaps[gaps > 0])) if usual else 0.0),)
+        )
+        raise TraceError(Diagnostic("E602", message, help=help_))
     odd = gaps - usual
     np.abs(odd, out=odd)
     if odd.max() > TOLERANCE * usual:
@@ -161,7 +158,6 @@ def _require_even(name: str, times: Floats) -> None:
 
 
 def _uneven(name: str, times: Floats, gaps: Floats, usual: float) -> Diagnostic:
-    """Finding E602: samples are missing, or the times are not on a grid."""
     i = int(np.argmax(np.abs(gaps - usual) > TOLERANCE * usual))
     steps = np.rint(gaps / usual)
     if (np.abs(gaps - steps * usual) <= TOLERANCE * usual).all() and (steps >= 1).all():
@@ -179,17 +175,11 @@ def _uneven(name: str, times: Floats, gaps: Floats, usual: float) -> Diagnostic:
     return Diagnostic("E602", message, help=(resample_advice(usual),))
 
 
-def snapped(step: float) -> float:
-    """Return a measured time step, rounded to a nearby simple fraction if there is one."""
-    return _snap(step, None) if np.isfinite(step) and step > 0 else step
-
-
-def _snap(mean: float, dt: float | None) -> float:
-    """Return `dt` if it agrees with the measured time step `mean`, else `mean`.
-
-    If there is a simple fraction near `mean`, it is returned instead of `mean`.
-    """
-    if dt is not None and abs(dt - mean) <= 1e-3 * mean:
+def snapped(step: float, dt: float | None = None) -> float:
+    """Return a measured step as `dt` if that agrees with it, or as a nearby simple fraction."""
+    if not (np.isfinite(step) and step > 0):
+        return step
+    if dt is not None and abs(dt - step) <= 1e-3 * step:
         return dt
-    near = float(Fraction(mean).limit_denominator(100_000))
-    return near if abs(near - mean) <= _SNAP * mean else mean
+    near = float(Fraction(step).limit_denominator(100_000))
+    return near if abs(near - step) <= _SNAP * step else step

@@ -17,13 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
-from stlc.signature import Column, Kind, Signature
+from stlc.signature import Kind, Signature
+from stlc.trace.clocks import ClockSetting, clocked
 from stlc.trace.enums import Words, in_numbers, wordless
-from stlc.trace.formats.registry import SUFFIXES, WRITTEN, format_of, needed, unreadable
+from stlc.trace.formats.registry import FORMATS, SUFFIXES, WRITTEN, format_of, needed, suffix_of, unreadable
+from stlc.trace.formats.table import GROUPS
 from stlc.trace.meta import TraceMeta
-from stlc.trace.recording import CLOCK, EXTRA, ClockGroup, Recording, absent, fit
-from stlc.trace.resample import ResampleGrid, resampled, usual_step
-from stlc.trace.time_grid import read_clock, require_same_step, resample_advice
+from stlc.trace.recording import ALL, CLOCK, EXTRA, Clock, ClockGroup, Recording, Wanted, absent, fit
+from stlc.trace.resample import Between, Moments, TimeRange, resampled, usual_step
+from stlc.trace.time_grid import read_clock, resample_advice
+from stlc.trace.tracks import separated
 
 __all__ = [
     "Reading",
@@ -34,6 +37,7 @@ __all__ = [
     "read_recording",
     "save_trace",
     "trace_of",
+    "traces_of",
 ]
 
 Floats = NDArray[np.float64]
@@ -53,6 +57,12 @@ class Trace:
         extras: all other arrays in the file, of any shape; never evaluated.
         meta: origin of the trace.
         name: the path as the user gave it, for messages.
+        moments: all instants at which signals were recorded, if they were resampled.
+        spans: signal -> time in which it was seen, if signals were resampled.
+        clocks: clocks of the file from which the times are.
+        remarks: warnings about the file.
+        track: the object in a table that this is, such as `agent=2`; "" if the file holds one.
+        others: names of arrays of the file that were not read.
     """
 
     signature: Signature
@@ -62,6 +72,17 @@ class Trace:
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     meta: TraceMeta = field(default_factory=TraceMeta)
     name: str = "trace"
+    moments: Moments | None = None
+    spans: Mapping[str, TimeRange] = field(default_factory=dict)
+    clocks: tuple[Clock, ...] = ()
+    remarks: tuple[Diagnostic, ...] = ()
+    track: str = ""
+    others: tuple[str, ...] = ()
+
+    @property
+    def file(self) -> str:
+        """Path of the file as the user gave it."""
+        return self.name.removesuffix(f" ({self.track})")
 
     @property
     def traces(self) -> int:
@@ -92,8 +113,22 @@ class Trace:
         back = {old: new for new, old in names.items()}
         kept = [c for c in self.signature.columns if c.name in back or c.name not in names]
         columns = tuple(replace(c, name=back.get(c.name, c.name)) for c in kept)
-        data = {back.get(c.name, c.name): self.data[c.name] for c in kept}
-        return replace(self, signature=Signature(columns), data=data)
+        kept_names = {c.name: back.get(c.name, c.name) for c in kept}
+
+        def moved(values: Mapping[str, Any]) -> dict[str, Any]:
+            return {new: values[old] for old, new in kept_names.items() if old in values}
+
+        moments = self.moments
+        if moments is not None:
+            before, after, clocks = map(moved, (moments.before, moments.after, moments.clocks))
+            moments = replace(moments, before=before, after=after, clocks=clocks)
+        return replace(
+            self,
+            signature=Signature(columns),
+            data=moved(self.data),
+            moments=moments,
+            spans=moved(self.spans),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +136,8 @@ class Reading:
     """Options for reading a trace file.
 
     Attributes:
-        names: signal -> its name in the file; the key `t` gives the name of the time column.
+        names: signal -> its name in the file; the key `t` gives the name of the time column, and `trace` or
+            `agent` that of the column that tells objects apart.
         resample: time step in seconds of a new grid; None keeps the grid of the file, which must be uniform.
         dt: time step in seconds, if the file does not give it; must not contradict the file.
         max_gap: longest gap in seconds within which values are known. If it is given, the file is resampled.
@@ -110,6 +146,13 @@ class Reading:
         words: numbers that stand for words, such as `{"sign": {"stop": 0, "light": 1}}`. The keys are the
             names of all needed signals. Other signals of words become extras (arrays that are never
             evaluated). If None, all signals of words become extras.
+        read: signal that is read -> whether it may be the time itself; all others are left out of the file.
+            If None, all signals are read.
+        clock: the clock, if the user names it.
+        group: name of the column that tells the objects in a table apart, or one of them, such as
+            `agent=2`; "" if the file decides.
+        columns: names of the columns of a table without a header.
+        between: signal -> its values between samples, for resampling.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
@@ -118,6 +161,38 @@ class Reading:
     max_gap: float | None = None
     kinds: Mapping[str, Kind] = field(default_factory=dict)
     words: Mapping[str, Words] | None = None
+    read: Mapping[str, bool] | None = None
+    clock: ClockSetting = ClockSetting()  # noqa: RUF009 - frozen
+    group: str = ""
+    columns: tuple[str, ...] = ()
+    between: Mapping[str, Between] = field(default_factory=dict)
+
+    @property
+    def read_in_file(self) -> dict[str, bool] | None:
+        """Names in the file of the signals that are read, as `read`; None for all."""
+        if self.read is None:
+            return None
+        return {self.names.get(name, name): timelike for name, timelike in self.read.items()}
+
+    @property
+    def setting(self) -> ClockSetting:
+        """The clock that is asked for, by any option."""
+        given = self.clock if self.clock.name else replace(self.clock, name=self.names.get(CLOCK, ""))
+        return given if given.step is not None else replace(given, step=self.dt)
+
+    @property
+    def grouping(self) -> str:
+        """The column that tells objects apart, as asked for by any option; "" if the file decides."""
+        keys = (name for name in GROUPS if name in self.names and name not in (self.read or ()))
+        return self.group or next((self.names[name] for name in keys), "")
+
+    @property
+    def wanted(self) -> Wanted:
+        """The arrays that a reader has to give."""
+        read = self.read_in_file
+        names = None if read is None else frozenset(read)
+        groups = tuple(each.partition("=")[0] for each in self.grouping.split(",") if each)
+        return Wanted(names, self.setting.name, groups, self.columns)
 
 
 AS_IT_IS = Reading()
@@ -126,74 +201,110 @@ AS_IT_IS = Reading()
 # ----------------------------------------------------------------------- reading
 
 
-def read_recording(path: Path) -> Recording:
-    """Read a trace file of any format.
+def read_recording(path: Path, wanted: Wanted = ALL) -> Recording:
+    """Read what is wanted of a trace file of any format.
 
     Raises:
         UsageError: U102, there is no such file.
         MissingError: R301, the format needs a package that is not installed.
         TraceError: E603, the file cannot be read; E605, its arrays do not fit together.
     """
-    if path.suffix.lower() not in SUFFIXES and path.is_file() and not is_zipfile(path):
+    guessed = format_of(path) is FORMATS[0] and suffix_of(path) not in FORMATS[0].suffixes
+    if guessed and path.is_file() and not is_zipfile(path):
         why = f"its suffix is none of {' '.join(SUFFIXES)}"
         raise unreadable(path, why, advice="give it the suffix of its format")
-    found: Recording = format_of(path).function("read")(path)
+    found: Recording = format_of(path).function("read")(path, wanted)
     return found
 
 
 def load_trace(path: Path | str, reading: Reading = AS_IT_IS) -> Trace:
     """Read a trace; the suffix of the file determines the format.
 
-    Suffixes are `.csv`, `.tsv`, `.parquet`, `.mat`, `.mcap`, `.bag` and `.db3`; a folder is a ROS 2 bag, and
-    any other file is read as `.npz`. Values may be NaN or infinite. The monitor, however, refuses infinite
-    values that a requirement needs.
+    Suffixes are `.csv`, `.tsv`, `.jsonl`, `.parquet`, `.mat`, `.mcap`, `.bag`, `.db3`, `.ulg` and `.mf4`; a
+    folder is a ROS 2 bag, and any other file is read as `.npz`. Values may be NaN (unknown) or infinite.
 
     Raises:
         UsageError: U102, there is no such file.
         MissingError: R301, the format needs a package that is not installed.
         TraceError: E601, no times, or no such signal; E602, times are not uniform; E603, the file cannot be
-            read safely; E605, its arrays do not fit together.
+            read safely; E605, its arrays do not fit together, or it holds objects of different times.
     """
-    return trace_of(read_recording(Path(path)), reading)
+    return trace_of(read_recording(Path(path), reading.wanted), reading)
 
 
 def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
-    """Convert the content of a trace file to a trace, with renamed signals, on one uniform grid.
+    """Convert the content of a trace file to one trace, with renamed signals, on one uniform grid.
 
     Raises:
         TraceError: the errors of `load_trace`.
     """
-    names = dict(reading.names)
-    clock = names.pop(CLOCK, None)
-    if clock is not None:
-        recording = recording.clocked_by(clock)
+    traces = traces_of(recording, reading)
+    if len(traces) > 1:
+        message = f"`{recording.name}` holds {len(traces)} objects of different times"
+        help_ = ("stlc check  judges each of them; in Python:  stlc.trace.traces_of",)
+        raise TraceError(Diagnostic("E605", message, help=help_))
+    return traces[0]
+
+
+def traces_of(recording: Recording, reading: Reading = AS_IT_IS) -> tuple[Trace, ...]:
+    """Convert the content of a trace file to traces, one for each object with times of its own.
+
+    Raises:
+        TraceError: the errors of `load_trace`.
+    """
+    read = reading.read_in_file
+    _require_readable(recording, read)
+    parts = separated(recording, reading.grouping, reading.setting, read)
+    short = {i for i, p in enumerate(parts) if p.track and len(next(iter(p.groups[0].arrays.values()))) < 2}
+    several = {i: _one_trace(part, reading, read) for i, part in enumerate(parts) if i not in short}
+    step = next((trace.dt for trace in several.values()), None)  # which one sample does not tell
+    for i in range(len(parts)):
+        part = replace(parts[i], meta=replace(parts[i].meta, dt=parts[i].meta.dt or step))
+        several.setdefault(i, several[i] if i in several else _one_trace(part, reading, read))
+    return tuple(several[i] for i in range(len(parts)))
+
+
+def _require_readable(recording: Recording, read: Mapping[str, bool] | None) -> None:
+    findings = []
+    for name in recording.signals if read is None else read:
+        if name in recording.refused:
+            findings.append(Diagnostic("E603", f"`{name}` in `{recording.name}` {recording.refused[name]}"))
+        elif name in recording.clashes:
+            sources = recording.clashes[name]
+            message = f"`{name}` in `{recording.name}` is ambiguous: {' and '.join(map(str, sources))}"
+            help_ = tuple(f"--map SIGNAL={one}  reads {source}" for source, one in sources.items())
+            findings.append(Diagnostic("E605", message, help=help_))
+    if findings:
+        raise TraceError(*findings)
+
+
+def _one_trace(recording: Recording, reading: Reading, read: Mapping[str, bool] | None) -> Trace:
+    names = {signal: name for signal, name in reading.names.items() if signal not in (CLOCK, *GROUPS)}
+    names |= {s: n for s, n in reading.names.items() if reading.read is not None and s in reading.read}
+    recording = clocked(recording, reading.setting, read)
     if reading.words is None:
         recording = wordless(recording)
     else:
         recording = in_numbers(recording, {names.get(n, n): worth for n, worth in reading.words.items()})
-    if reading.resample is None and reading.max_gap is None:
-        trace = _uniform(recording, reading.dt)
+    gridded = reading.resample is not None or reading.max_gap is not None
+    if read and not recording.signals and (gridded or not recording.groups):
+        raise TraceError(*(absent(recording.name, name, recording.others) for name in read))
+    if not gridded:
+        trace = _uniform(recording, reading.dt, read)
     else:
         kinds = {names.get(name, name): kind for name, kind in reading.kinds.items()}
-        grid = ResampleGrid(reading.resample or reading.dt, reading.max_gap)
-        on_grid = resampled(_clocked(recording, reading.dt), grid, kinds)
+        between = {names.get(name, name): each for name, each in reading.between.items()}
+        if (step := reading.dt or recording.meta.dt) is not None:  # of signals without times
+            groups = (
+                group if group.clock is not None else replace(group, clock=step * np.arange(_longest(group)))
+                for group in recording.groups
+            )
+            recording = replace(recording, groups=tuple(groups))
+        on_grid = resampled(recording, reading.resample or reading.dt, reading.max_gap, between, kinds)
         trace = _trace(recording, on_grid.t0, on_grid.dt, on_grid.data)
-    return trace.renamed(names)
-
-
-def _clocked(recording: Recording, dt: float | None) -> Recording:
-    """Return the recording with times added to the signals that have none.
-
-    The time step is `dt` or, if that is None, the one in the metadata. Without either, nothing is added.
-    """
-    step = dt or recording.meta.dt
-    if step is None:
-        return recording
-    groups = tuple(
-        group if group.clock is not None else replace(group, clock=step * np.arange(_longest(group)))
-        for group in recording.groups
-    )
-    return replace(recording, groups=groups)
+        trace = replace(trace, moments=on_grid.moments, spans=on_grid.spans)
+    present = {s: n for s, n in names.items() if n in trace.data or read is None}
+    return trace.renamed(present)
 
 
 def _longest(group: ClockGroup) -> int:
@@ -202,13 +313,11 @@ def _longest(group: ClockGroup) -> int:
     return max((shape[-1] if len(shape) < 3 else shape[-2] for shape in shapes), default=0)
 
 
-def _uniform(recording: Recording, step: float | None) -> Trace:
-    """Return the trace of a recording whose signals share one uniform time column.
-
-    `step` is the time step in seconds that the user gives, or None. A given step must agree with the times.
-    """
+def _uniform(recording: Recording, step: float | None, read: Mapping[str, bool] | None) -> Trace:
+    """Return the trace of a recording whose signals share one uniform time column."""
     name = recording.name
-    groups = [group for group in recording.groups if group.arrays] or list(recording.groups)
+    groups = [group for group in recording.groups if group.arrays]
+    groups = groups or [*recording.groups, ClockGroup({}, None)][:1]
     if len(groups) > 1:
         message = f"the signals of `{name}` follow {len(groups)} clocks"
         usual = [usual_step(s.clock.astype(np.float64).reshape(-1)) for s in groups if s.clock is not None]
@@ -216,17 +325,28 @@ def _uniform(recording: Recording, step: float | None) -> Trace:
         raise TraceError(Diagnostic("E602", message, help=help_))
     (group,) = groups
     known_step = recording.meta.dt if step is None else step
-    t0, dt, samples = read_clock(name, group.clock, known_step, _longest(group), others=group.arrays)
-    if step is not None:
-        require_same_step(name, dt, step)
+    others = (*group.arrays, *recording.others)
+    t0, dt, samples = read_clock(name, group.clock, known_step, _longest(group), others=others)
+    if step is not None and abs(dt - step) > 1e-3 * step:
+        message = f"`{name}` has a sample every {dt:.6g} s, not every {step:.6g} s"
+        help_ = ("leave out --dt: the file says what its step is",)
+        raise TraceError(Diagnostic("E602", message, help=help_))
+    if not group.arrays and read:  # the monitor tells what is missing
+        return _trace(recording, t0, dt, {})
     data = fit(name, group.arrays, samples)
     whole = {n: np.ascontiguousarray(values, dtype=np.float64) for n, values in data.items()}
     return _trace(recording, t0, dt, whole)
 
 
 def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) -> Trace:
-    signature = Signature(tuple(recording.columns.get(name, Column(name)) for name in data))
-    return Trace(signature, dt, data, t0, recording.extras, recording.meta, recording.name)
+    columns = [recording.column(name) for name in data]
+    return Trace(
+        *(Signature(tuple(columns)), dt, data, t0, recording.extras, recording.meta, recording.name),
+        clocks=recording.clocks,
+        remarks=recording.remarks,
+        track=recording.track,
+        others=recording.others,
+    )
 
 
 # ----------------------------------------------------------------------- writing

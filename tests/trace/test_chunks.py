@@ -127,8 +127,8 @@ def test_a_piece_that_unpacks_to_much(tmp_path: Path, name: str, monkeypatch: py
 
 
 def test_a_vector_of_too_many_components(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", t=np.arange(4.0), x=np.ones(4), wide=np.zeros((4, 1001)))
-    with pytest.raises(TraceError, match="4 x 1001"):
+    np.savez(tmp_path / "a.npz", t=np.arange(4.0), x=np.ones(4), wide=np.zeros((4, 5000)))
+    with pytest.raises(TraceError, match="4 x 5000"):
         load_trace(tmp_path / "a.npz")
 
 
@@ -142,10 +142,14 @@ def test_a_column_holds_words_or_numbers_in_all_pieces(tmp_path: Path, late: str
         lambda reading: [load_trace(tmp_path / "a.csv", reading)],
         lambda reading: list(pieces(tmp_path / "a.csv", 10, reading)),
     ):
+        if late == "1":  # among words, numbers are words for themselves
+            parts = read(Reading(words={"mode": {"go": 1.0}}))
+            assert {float(x) for part in parts for x in part.data["mode"][0]} == {1.0}
+            continue
         with pytest.raises(TraceError) as caught:
             read(Reading(words={"mode": {"go": 1.0}}))
         found.append(caught.value.diagnostics[0].code)
-    assert found == ["E603"] * 2
+    assert found == ["E603"] * (0 if late == "1" else 2)
 
 
 @pytest.mark.parametrize("before", ["", "\n\n"])

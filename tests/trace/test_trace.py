@@ -21,6 +21,7 @@ from stlc.signature import Column, Signature
 from stlc.trace import Reading, Trace, TraceMeta, as_fraction, load_trace, save_trace
 from stlc.trace.enums import TRUTH
 from stlc.trace.formats import csv as trace_csv
+from stlc.trace.formats.npz import read as read_npz
 from stlc.units import parse_unit
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -169,9 +170,11 @@ class Exploit:
 
 def test_an_array_of_objects_is_not_unpickled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    path = npz(tmp_path / "a.npz", t=np.arange(3) * 0.1, x=np.array([Exploit()] * 3, dtype=object))
-    assert code_of(path) == "E603"
-    assert "Python objects" in message_of(path)
+    objects = np.array([Exploit()] * 3, dtype=object)
+    path = npz(tmp_path / "a.npz", t=np.arange(3) * 0.1, v=np.zeros(3), x=objects)
+    assert "Python objects" in read_npz(path).refused["x"]
+    with pytest.raises(TraceError):
+        load_trace(path, Reading({"y": "x"}, words={"y": {}}))
     assert not Path("owned").exists()
 
 
@@ -232,13 +235,6 @@ def test_too_many_arrays_and_arrays_given_twice(tmp_path: Path, monkeypatch: pyt
         with pytest.warns(UserWarning, match="Duplicate"):
             archive.writestr("x.npy", header((0,)))
     assert "twice" in message_of(tmp_path / "b.npz")
-
-
-@pytest.mark.parametrize(
-    "values", [np.array(["a", "b"]), np.zeros(2, complex), np.zeros(2, "M8[s]"), np.zeros(2, [("a", "f8")])]
-)
-def test_arrays_of_the_wrong_kind(tmp_path: Path, values: np.ndarray) -> None:
-    assert code_of(npz(tmp_path / "a.npz", t=[0.0, 0.1], x=values)) == "E603"
 
 
 @pytest.mark.parametrize("order", "<>")
@@ -308,8 +304,6 @@ def test_a_truncated_file(tmp_path: Path, cut: int) -> None:
         np.array('{"spec_set": {"D": 1.5}}'),
         np.array('{"signals": {"x": {"kind": "tensor"}}}'),
         np.array('{"signals": {"x": {"unit": "[["}}}'),
-        np.array(3.0),
-        np.array(["{}"]),
     ],
 )
 def test_damaged_meta(tmp_path: Path, meta: np.ndarray) -> None:
@@ -343,7 +337,6 @@ def test_a_packed_array_that_is_damaged(tmp_path: Path) -> None:
         ({"x": [1.0, 2.0]}, "E601", "has no `t`"),
         ({"t": [0.0, 0.1]}, "E601", "no signals"),
         ({"t": [0.0, 0.1], "x": [1.0, 2.0, 3.0]}, "E605", "`x` in .* is 3, and `t` has 2 samples"),
-        ({"t": [0.0, 0.1], "x": 3.0}, "E605", "a single number"),
         (
             {"t": [0.0, 0.1], "x": np.zeros((2, 2)), "y": np.zeros((3, 2))},
             "E605",
@@ -351,7 +344,6 @@ def test_a_packed_array_that_is_damaged(tmp_path: Path) -> None:
         ),
         ({"t": [0.0, 0.1], "x": np.zeros((0, 2))}, "E605", "no traces"),
         ({"t": [], "x": []}, "E605", "no samples"),
-        ({"t": [[0.0, 0.1]], "x": [1.0, 2.0]}, "E605", "`t` in .* is 1 x 2"),
         ({"t": [0.0], "x": [1.0]}, "E602", "one sample"),
         ({"t": [0.0, np.nan, 0.2], "x": [1.0, 2.0, 3.0]}, "E604", r"nan at t\[1\]"),
         ({"t": [0.0, 0.1, 0.1], "x": [1.0, 2.0, 3.0]}, "E602", "does not increase"),
@@ -388,7 +380,7 @@ def test_the_step_is_the_fraction_that_was_meant(tmp_path: Path, dt: float) -> N
     assert as_fraction(trace.dt).denominator <= 1_000_000
 
 
-@pytest.mark.parametrize("dt", [1e-300, 5e-324, 1e-16, 1e13, 1e308])
+@pytest.mark.parametrize("dt", [1e-300, 5e-324, 1e-16, 1e13, 1e15])
 def test_a_step_that_nothing_is_sampled_with(tmp_path: Path, dt: float) -> None:
     path = npz(tmp_path / "a.npz", x=np.zeros(5), meta=np.array(f'{{"dt": {dt!r}}}'))
     assert (code_of(path), message_of(path)[:17]) == ("E602", "the time step of ")
@@ -435,15 +427,13 @@ def test_csv_lines_of_agents_may_alternate(tmp_path: Path) -> None:
         ("t,x\n0,go\n0.1,stop\n", "E603", None, "`x` in .* holds words (`go`)"),
         ("t,x\nnow,1\nthen,2\n", "E603", None, "the clock `t` in .* holds words (`now`)"),
         ("t [m],x\n0,1\n1,2\n", "E605", None, "the clock `t` of .* is in [m], which is not a time"),
-        ("time,Time,x\n0,1,1\n1,2,1\n", "E601", None, "no `t`"),
+        ("time,Time,x\n0,1,1\n1,3,1\n", "E601", None, "which of `time`, `Time` is the clock"),
         ("t,x\n0,1\n,2\n", "E604", None, "time in .* is nan at t[1]"),
         ("t,x\n0,1\n0.1,1_0\n", "E603", (3, 5), "`1_0` is not a number"),
         ("t,x\n0,1\n0.1,0x10\n", "E603", (3, 5), "`0x10` is not a number"),
         ("t,x\n0,1\n0.1,__import__('os')\n", "E603", (3, 5), "is not a number"),
         ("t,x\n0,1\n0.1,2,3\n", "E605", (3, 1), "this line has 3 cells"),
         ("t,x\n0,1\n0.1\n", "E605", (3, 1), "this line has 1 cells"),
-        ("t,x,x\n0,1,2\n", "E605", (1, 5), "two columns are called `x`"),
-        ("t,,x\n0,1,2\n", "E605", (1, 3), "a column without a name"),
         ("0,1\n0.1,2\n", "E605", (1, 1), "must name the columns"),
         ("t,x\n", "E603", None, "no line of numbers"),
         (" \n ", "E603", None, "empty"),
@@ -454,9 +444,9 @@ def test_csv_lines_of_agents_may_alternate(tmp_path: Path) -> None:
             "t,trace,x\n0,0,1\n1,0,1\n0,1,1\n",
             "E605",
             None,
-            "differ in length: trace 0 has 2 samples, 1 has 1",
+            "2 objects of different times",
         ),
-        ("t,trace,x\n0,0,1\n1,0,1\n5,1,1\n6,1,1\n", "E605", None, "same times"),
+        ("t,trace,x\n0,0,1\n1,0,1\n5,1,1\n6,1,1\n", "E605", None, "2 objects of different times"),
     ],
 )
 def test_csv_that_is_wrong(
@@ -470,10 +460,12 @@ def test_csv_that_is_wrong(
     assert (finding.span and (finding.span.line, finding.span.column)) == place
 
 
-def test_csv_reports_all_bad_cells_at_once(tmp_path: Path) -> None:
+def test_csv_reports_the_first_bad_cell_of_each_column(tmp_path: Path) -> None:
     with pytest.raises(TraceError) as caught:
         load_trace(csv(tmp_path / "a.csv", "t,x,y\n0,1,2\n1,a,b\n1,2,c\n"))
-    assert [d.message.split("`")[1] for d in caught.value.diagnostics] == ["a", "b", "c"]
+    first, second = caught.value.diagnostics
+    assert [d.message.split("`")[1] for d in (first, second)] == ["a", "b"]
+    assert second.note == ("1 more cell of `y` not a number",)
 
 
 @pytest.mark.parametrize(
@@ -561,10 +553,10 @@ def test_traces_whose_names_may_have_been_cut_are_refused(tmp_path: Path) -> Non
 
 def test_without_a_clock_the_arrays_are_named(tmp_path: Path) -> None:
     with pytest.raises(TraceError) as caught:
-        load_trace(csv(tmp_path / "a.csv", "stamp,x\n0,1\n1,2\n"))
+        load_trace(csv(tmp_path / "a.csv", "when,x\n0,1\n1,2\n"))
     (finding,) = caught.value.diagnostics
     assert finding.message.endswith("has no `t`")
-    assert finding.note == (f"arrays in {tmp_path / 'a.csv'}: stamp, x",)
+    assert finding.note == (f"arrays in {tmp_path / 'a.csv'}: when, x",)
 
 
 @pytest.mark.parametrize("quote", ["", '"'])
@@ -598,20 +590,20 @@ def test_words_that_a_signal_does_not_have(tmp_path: Path, text: str, message: s
 
 
 def test_other_suffixes_are_listed(tmp_path: Path) -> None:
-    with pytest.raises(TraceError, match=r"none of \.npz \.csv \.tsv \.parquet \.pq \.mat \.mcap"):
-        load_trace(csv(tmp_path / "a.txt", "t,x\n0,1\n"))
+    with pytest.raises(TraceError, match=r"none of \.npz \.csv \.tsv \.txt \.jsonl \.ndjson \.parquet"):
+        load_trace(csv(tmp_path / "a.doc", "t,x\n0,1\n"))
     save_trace(tmp_path / "a.npz", a_trace())
     (tmp_path / "a.npz").rename(tmp_path / "a.bin")
     assert load_trace(tmp_path / "a.bin").samples == a_trace().samples
     assert load_trace(csv(tmp_path / "a.tsv", "t\tx\n0\t1\n1\t2\n")).samples == 2
-    for path in ("a.txt", "a"):
+    for path in ("a.doc", "a"):
         with pytest.raises(UsageError, match=r"written as \.npz, \.csv or \.mcap"):
             save_trace(tmp_path / path, a_trace())
 
 
 def test_csv_that_is_not_text(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_bytes(b"t,x\n0,\xff\xfe\n")
-    assert "not UTF-8" in message_of(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_bytes(b"t,x\n0,1\n1,\xff\xfe\n")
+    assert "`ÿþ` is not a number" in message_of(tmp_path / "a.csv")
 
 
 @given(st.text(alphabet='t,x\n0123.e-"; ', max_size=60))
@@ -624,11 +616,12 @@ def test_any_csv_is_read_or_refused(tmp_path: Path, text: str) -> None:
 @settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_both_csv_readers_agree(tmp_path: Path, rows: list[list[float]]) -> None:
     body = "".join(f"{a!r},{b!r}\n" for a, b in rows)
-    fast = trace_csv.read_csv(csv(tmp_path / "a.csv", "a,b\n" + body))
-    strict = trace_csv.read_csv(
+    fast = trace_csv.read(csv(tmp_path / "a.csv", "a,b\n" + body))
+    strict = trace_csv.read(
         csv(tmp_path / "b.csv", "a,b\n\n" + body.replace(",", ',"', 1).replace("\n", '"\n', 1))
     )
-    assert all(np.array_equal(fast.columns[name], strict.columns[name]) for name in ("a", "b"))
+    columns, others = fast.groups[0].arrays, strict.groups[0].arrays
+    assert all(np.array_equal(columns[name], others[name]) for name in ("a", "b"))
 
 
 def test_a_clock_of_words_without_samples_is_a_diagnostic(tmp_path: Path) -> None:

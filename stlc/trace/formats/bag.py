@@ -12,93 +12,117 @@ import sqlite3
 import struct
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing
-from dataclasses import dataclass
-from functools import cache
-from mmap import mmap
+from contextlib import closing, suppress
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.files import is_stored
-from stlc.trace.formats.messages import MAX_BYTES, DamageError, Decode, Log, Room, mapped
+from stlc.trace.formats.messages import Bytes, Channel, DamageError, Decode, Log, Room, mapped
+from stlc.trace.formats.paths import Selection
 from stlc.trace.formats.registry import damage, needed, unreadable
-from stlc.trace.formats.ros import Form, decoder
-from stlc.trace.recording import Recording
+from stlc.trace.formats.ros import decoder
+from stlc.trace.recording import ALL, Recording, Wanted
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
 _PACKED = ".zstd"
-_ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
-"""Database operations that a query may use: no functions, pragmas or recursion."""
 _LONGEST = 256_000_000
 """Greatest number of bytes of a message."""
 
 
-def read(path: Path) -> Recording:
-    """Read all numbers in the messages of a bag: a `.bag` file, a `.db3` file, or a folder.
+def read(path: Path, wanted: Wanted = ALL) -> Recording:
+    """Read what is wanted of the messages of a bag: a `.bag` file, a `.db3` file, or a folder.
 
     Raises:
         UsageError: U102, there is no such file, or no bag in the folder.
         MissingError: R301, a package is not installed.
-        TraceError: E603, the file is of another format, damaged, or without numbers.
+        TraceError: E603, the file is of another format, damaged, or without messages.
     """
-    return _read_ros1(path) if path.suffix.lower() == ".bag" and not path.is_dir() else _read_ros2(path)
+    log, stored = Log(path, wanted), [path]
+    if path.is_dir():
+        stored = sorted((each for each in path.iterdir() if is_stored(each)), key=_order)
+    if not stored:
+        help_ = ("the folder of a bag holds .db3 or .mcap files",)
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: is a directory", help=help_))
+    for each in stored:
+        with damage(path):
+            _add_stored(log, each)
+    return log.recording()
 
 
-@dataclass(frozen=True, slots=True)
-class _Topic:
-    """A ROS topic and the decoder of its messages; None if the messages cannot be decoded."""
+def _order(path: Path) -> list[object]:
+    """Sort key of a file: digits are compared as numbers, so that `bag_9.db3` precedes `bag_10.db3`."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d{1,18})", path.name))]
 
-    name: str
-    decode: Decode | None
 
-    @staticmethod
-    def of(log: Log, name: str, definition: str, form: Form) -> _Topic:
-        """Return the topic with the decoder of its messages.
+def _add_stored(log: Log, path: Path) -> None:
+    if path.name.lower().endswith(_PACKED):
+        with mapped(path) as data:
+            content = Room(path, len(data)).unpacked("zstd", data[:])
+        with tempfile.TemporaryDirectory(prefix="stlc-bag-") as folder:
+            inner = Path(folder) / f"bag{Path(path.stem).suffix.lower()}"
+            inner.write_bytes(content)
+            del content
+            _add_stored(log, inner)
+    elif path.suffix.lower() == ".mcap":
+        from stlc.trace.formats.mcap import add_mcap
 
-        `definition` is the text of the message definition, `form` the encoding: "ros1" or "cdr" (ROS 2). If
-        the definition is invalid, the decoder is None, and the reason is stored in `log.unread`.
-        """
-        try:
-            return _Topic(name, decoder(definition, form))
-        except DamageError as error:
-            log.unread[name] = str(error)
-            return _Topic(name, None)
+        add_mcap(log, path)
+    elif log.published:
+        raise unreadable(log.path, "it does not hold the times at which messages were published")
+    elif path.suffix.lower() == ".bag":
+        _add_bag(log, path)
+    else:
+        _add_database(log, path)
 
 
 # --------------------------------------------------------------------------------- ROS 1
 
 
-def _read_ros1(path: Path) -> Recording:
-    """Read all numbers in the messages of a ROS 1 bag."""
-    log = Log(path)
-    with mapped(path) as data, damage(path):
+def _add_bag(log: Log, path: Path) -> None:
+    """Add the messages of a ROS 1 bag; of a bag that is cut off, those before its end."""
+    channels: dict[bytes, Channel] = {}
+    with mapped(path) as data:
         if data[: len(_MAGIC)] != _MAGIC:
             raise DamageError("it does not begin like a bag of version 2.0")
-        topics: dict[int, _Topic] = {}
         room = Room(path, len(data))
-        for kind, fields, content in _records(data, len(_MAGIC)):
-            if kind == _CHUNK:
-                how, size = fields[b"compression"].decode(), _word(fields[b"size"])
-                inner = room.unpacked(how, content, size)
-                for record in _records(inner, 0):
-                    _take(log, topics, *record)
-            else:
-                _take(log, topics, kind, fields, content)
-        return log.recording()
+        with log.partly(path, "rosbag reindex FILE  repairs its index"):
+            closed = True
+            for fields, content in _records(data, len(_MAGIC), room):
+                kind = fields[b"op"][0]
+                if kind == _HEADER:
+                    closed = any(fields[b"index_pos"])
+                elif kind == _CONNECTION and fields[b"conn"] not in channels:
+                    facts = dict(_fields(content))
+                    text = facts[b"message_definition"].decode("utf-8", "replace")
+                    name = facts.get(b"type", b"").decode("utf-8", "replace")
+                    make = partial(decoder, text, "ros1")
+                    channels[fields[b"conn"]] = log.channel(fields[b"topic"].decode(), name, make)
+                elif kind == _MESSAGE:
+                    if fields[b"conn"] not in channels:
+                        raise DamageError("a message of an unknown connection")
+                    seconds, rest = struct.unpack("<II", fields[b"time"])
+                    log.add(channels[fields[b"conn"]], seconds * 10**9 + rest, content, room)
+            if not closed:
+                raise DamageError("it was not closed")
 
 
-Bytes: TypeAlias = bytes | mmap
-
-
-def _records(data: Bytes, at: int) -> Iterator[tuple[int, dict[bytes, bytes], bytes]]:
-    """Yield (record type, header fields, data) of each record in `data`, from byte `at` on."""
+def _records(data: Bytes, at: int, room: Room) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
+    """Yield the header and the content of each record from byte `at` on, and of those in chunks."""
     while at < len(data):
         head, at = _sized(data, at)
-        content, at = _sized(data, at)
         fields = dict(_fields(head))
-        yield fields[b"op"][0], fields, content
+        (size,) = struct.unpack_from("<I", data, at)
+        content, at = data[at + 4 : at + 4 + size], at + 4 + size
+        if fields[b"op"][0] == _CHUNK:
+            how, (unpacked,) = fields[b"compression"].decode(), struct.unpack("<I", fields[b"size"])
+            inner = room.unpacked(how, content, unpacked, whole=at <= len(data))
+            yield from _records(inner, 0, room)
+        if at > len(data):
+            raise DamageError(f"{size} bytes are declared, {len(content)} follow")
+        yield fields, content
 
 
 def _sized(data: Bytes, at: int) -> tuple[bytes, int]:
@@ -116,73 +140,7 @@ def _fields(head: bytes) -> Iterator[tuple[bytes, bytes]]:
         yield name, value
 
 
-def _word(field: bytes) -> int:
-    value: int = struct.unpack("<I", field)[0]
-    return value
-
-
-def _take(log: Log, topics: dict[int, _Topic], kind: int, fields: dict[bytes, bytes], content: bytes) -> None:
-    """Process one record of a file.
-
-    The topic of a connection is added to `topics`, and the numbers in a message are added to `log`. `topics`
-    maps the number of a connection to its topic. Other kinds of records are ignored.
-    """
-    if kind == _CONNECTION:
-        number = _word(fields[b"conn"])
-        if number not in topics:
-            definition = dict(_fields(content))[b"message_definition"].decode("utf-8", "replace")
-            topics[number] = _Topic.of(log, fields[b"topic"].decode(), definition, "ros1")
-    elif kind == _MESSAGE:
-        topic = topics.get(_word(fields[b"conn"]))
-        if topic is None:
-            raise DamageError("a message of an unknown connection")
-        if topic.decode is not None:
-            seconds, rest = struct.unpack("<II", fields[b"time"])
-            log.add(topic.name, seconds * 10**9 + rest, topic.decode(content))
-
-
 # --------------------------------------------------------------------------------- ROS 2
-
-
-def _read_ros2(path: Path) -> Recording:
-    """Read all numbers in the messages of a ROS 2 bag: a folder, or a single `.db3` file."""
-    log = Log(path)
-    if path.is_dir():
-        stored = sorted((each for each in path.iterdir() if is_stored(each)), key=_order)
-        if not stored:
-            help_ = ("the folder of a bag holds .db3 or .mcap files",)
-            raise UsageError(Diagnostic("U102", f"cannot read `{path}`: is a directory", help=help_))
-    else:
-        stored = [path]
-    for each in stored:
-        with damage(path):
-            _add_stored(log, each)
-    return log.recording()
-
-
-def _order(path: Path) -> tuple[object, ...]:
-    """Sort key of a file: digits are compared as numbers, so that `bag_9.db3` precedes `bag_10.db3`."""
-    return tuple(
-        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d{1,18})", path.name)
-    )
-
-
-def _add_stored(log: Log, path: Path) -> None:
-    """Add the messages of one file; a compressed file is first unpacked to a temporary file."""
-    if path.name.lower().endswith(_PACKED):
-        with mapped(path) as data:
-            content = Room(path, len(data)).of_unknown_size(data[:])
-        with tempfile.TemporaryDirectory(prefix="stlc-bag-") as folder:
-            inner = Path(folder) / f"bag{Path(path.stem).suffix.lower()}"
-            inner.write_bytes(content)
-            del content
-            _add_stored(log, inner)
-    elif path.suffix.lower() == ".mcap":
-        from stlc.trace.formats.mcap import add_mcap
-
-        add_mcap(log, path)
-    else:
-        _add_database(log, path)
 
 
 def _add_database(log: Log, path: Path) -> None:
@@ -190,76 +148,67 @@ def _add_database(log: Log, path: Path) -> None:
         room = Room(path, len(data))
         if data[:16] != b"SQLite format 3\0":
             raise DamageError("it is not a database of SQLite")
-    with closing(_opened(path)) as database:
-        topics = _topics(log, database)
-        query = "SELECT topic_id, timestamp, data FROM messages"
-        for number, time, content in database.execute(query):
-            topic = topics.get(number)
-            if topic is None or topic.decode is None:
-                continue
-            if not isinstance(time, int) or not isinstance(content, bytes):
-                raise DamageError("a message without a time, or without content")
-            room.left -= len(content) + 16
-            if room.left < 0:
-                raise unreadable(path, "its messages are larger than its file")
-            log.add(topic.name, time, topic.decode(room.whole(content)))
+    ahead = path.with_name(f"{path.name}-wal")
+    help_ = "sqlite3 FILE .recover  writes what is readable"
+    with log.partly(path, help_), closing(_opened(path)) as database:
+        _add_messages(log, room, database)
+        if ahead.exists() and ahead.stat().st_size:
+            raise DamageError(f"it was not closed, and `{ahead.name}` is not read")
+
+
+def _add_messages(log: Log, room: Room, database: sqlite3.Connection) -> None:
+    texts: dict[str, str] = {}
+    with suppress(sqlite3.OperationalError):  # before Iron, there is no such table
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        texts = {str(n): str(text) for n, how, text in database.execute(query) if how == "ros2msg"}
+    topics = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+    channels = {
+        number: log.channel(str(name), str(kind), partial(_decoder, str(kind), str(form), texts.get(kind)))
+        for number, name, kind, form in topics
+        if isinstance(number, int)
+    }
+    read = ", ".join(str(n) for n, each in channels.items() if each.source.selection is not None)
+    query = "SELECT topic_id, timestamp, data FROM messages"
+    for number, time, content in database.execute(f"{query} WHERE topic_id IN ({read})"):
+        if not isinstance(time, int) or not isinstance(content, bytes):
+            raise DamageError("a message without a time, or without content")
+        room.left -= len(content) + 16
+        if room.left < 0:
+            raise unreadable(log.path, "its messages are larger than its file")
+        log.add(channels[number], time, content, room)
+    for number, channel in channels.items() if log.missing else ():
+        for _, time, content in database.execute(f"{query} WHERE topic_id = {number} LIMIT 1"):
+            if channel.source.selection is None and isinstance(content, bytes):
+                log.add(channel, time, content, room)
 
 
 def _opened(path: Path) -> sqlite3.Connection:
-    """Open a database read-only, and forbid every operation in it other than reading tables."""
-    where = path.resolve().as_uri()
-    database = sqlite3.connect(f"{where}?mode=ro&immutable=1", uri=True)
-    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(_LONGEST, MAX_BYTES))
+    database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST)
     tables = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name in ("topics", "messages"):
         if not re.match(r"CREATE TABLE\b", str(tables.get(name)), re.IGNORECASE):
             database.close()
             raise DamageError(f"the database has no table `{name}`")
-
-    def allow(action: int, *_: object) -> int:
-        return sqlite3.SQLITE_OK if action in _ALLOWED else sqlite3.SQLITE_DENY
-
-    database.set_authorizer(allow)
+    allowed = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)  # no functions, pragmas or recursion
+    database.set_authorizer(lambda a, *_: sqlite3.SQLITE_OK if a in allowed else sqlite3.SQLITE_DENY)
     return database
 
 
-def _topics(log: Log, database: sqlite3.Connection) -> dict[int, _Topic]:
-    """Read the topics of a database: topic number -> topic."""
-    texts = _definitions(database)
-    topics: dict[int, _Topic] = {}
-    query = "SELECT id, name, type, serialization_format FROM topics"
-    for number, name, kind, form in database.execute(query):
-        if form != "cdr":
-            log.unread[str(name)] = f"its messages are written as `{str(form)[:40]}`"
-            continue
-        text = texts.get(kind) or _usual(str(kind))
-        if text is None:
-            log.unread[str(name)] = f"`{str(kind)[:60]}` is defined neither in the bag nor by ROS itself"
-        else:
-            topics[number] = _Topic.of(log, str(name), text, "cdr")
-    return topics
-
-
-def _definitions(database: sqlite3.Connection) -> dict[str, str]:
-    """Message definitions in the database: message type -> definition; {} if the database has none."""
-    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-    try:
-        rows = database.execute(query).fetchall()
-    except sqlite3.OperationalError:  # before Iron
-        return {}
-    return {str(kind): str(text) for kind, encoding, text in rows if encoding == "ros2msg"}
-
-
-def _usual(kind: str) -> str | None:
-    """Definition of the ROS 2 message type `kind`; None if this is not a standard type."""
-    store = _usual_ones()
-    try:
-        return str(store.generate_msgdef(kind, ros_version=2)[0])
-    except Exception:  # the library's error for an unknown name
-        return None
+def _decoder(kind: str, form: str, text: str | None, selection: Selection) -> Decode:
+    if form != "cdr":
+        raise DamageError(f"its messages are written as `{form[:40]}`")
+    if not text:
+        try:
+            text = str(_usual().generate_msgdef(kind, ros_version=2)[0])
+        except StlcError:
+            raise
+        except Exception:  # the library's error for an unknown name
+            raise DamageError(f"`{kind[:60]}` is defined neither in the bag nor by ROS itself") from None
+    return decoder(text, "cdr", selection)
 
 
 @cache
-def _usual_ones() -> Any:
+def _usual() -> Any:
     types = needed("rosbags.typesys")
     return types.get_typestore(types.Stores.LATEST)

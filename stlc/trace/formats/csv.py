@@ -1,9 +1,9 @@
-"""Traces as `.csv` files.
+"""Traces as tables of text: `.csv`, `.tsv`, `.txt`, also packed as `.csv.gz`.
 
-A cell contains a number or a word, or is empty; any other content is an error. The first line names the
-columns, with optional units in brackets: `t, x [m], v (km/h)`. If the file holds several traces, a column
-`trace` or `agent` identifies the trace of each line. If the first cell of a column is a word, the column
-contains words. In other columns an empty cell is NaN, an unknown value.
+The first lines tell the dialect: the delimiter, comments, lines of text before the header, the header with
+optional units in brackets (`t, x [m], v (km/h)`), a row of units. Rows are those of RFC 4180. A cell is a
+number, a word, or missing. If the first cell of a column that is not missing is a word, the column contains
+words. In other columns every cell is a number, or missing: NaN, an unknown value.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import islice, pairwise
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,340 +21,303 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.escape import from_spreadsheet, spreadsheet
+from stlc.escape import spreadsheet
 from stlc.files import write_atomic
-from stlc.source import Source, Span
-from stlc.trace.formats.cells import NUMBER, STRETCH, TableText, bare, load, read_lines, value_of
-from stlc.trace.formats.registry import MAX_LETTERS, opened, unreadable
-from stlc.trace.formats.table import GROUPS, OneTrace, Table, is_unit, of_table
-from stlc.trace.recording import Recording
+from stlc.source import Span
+from stlc.trace.formats.cells import Array, bare, is_missing, load, number_of, numbers, read_lines
+from stlc.trace.formats.layout import (
+    BLANKS,
+    COMMENT,
+    MAX_CELL,
+    Layout,
+    Rows,
+    delimiter_of,
+    filled,
+    head_cells,
+    layout_of,
+    lines_of,
+    split_head,
+)
+from stlc.trace.formats.registry import MAX_LETTERS, unreadable
+from stlc.trace.formats.table import GROUPS, MAX_LINE, endless, place, size, text_lines, unpacked, utf8
+from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
 
 if TYPE_CHECKING:
     from stlc.trace.trace import Trace
 
-Array = NDArray[Any]
+__all__ = ["chunks", "delimiter_of", "filled", "head_cells", "read", "size", "split_head", "write"]
 
-MAX_BYTES = 1_000_000_000
 LARGE = 4_000_000
 """Size in bytes from which on a file is parsed without decoding it to text."""
 
 _HEAD_BYTES = 1 << 16
-_END = re.compile(rb"\r\n|\r|\n")
-_HEAD = re.compile(r"(?P<name>[^\[\]]*[^\[\]\s](?:\[\d+\])?)\s*(?:\[(?P<unit>[^\]]*)\])?")
-_ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]+)\)")
-_FILLED = re.compile(r"[^\n]*\S[^\n]*")
-_COMMA = re.compile(r"(?<!\d),|,(?!\d)")
-"""A comma that is not within a number."""
+STRETCH = 1 << 18
+"""Characters of a block of lines."""
+_FIRST = 4096
+"""Characters of the first block, which tells which columns hold words."""
+_RAGGED = -1
+"""Index of a column, for rows with another number of cells than the header."""
 _MAX_FINDINGS = 20
-_QUOTED = re.compile(r'"(?:[^"]|"")*"')
+_END = re.compile(rb"\r\n|\r|\n")
 
 
-@dataclass(frozen=True, slots=True)
-class _Sheet:
-    """The text of a file, divided into its header and the lines that follow."""
+def read(path: Path, wanted: Wanted = ALL) -> Recording:
+    """Return the wanted columns of a table as numbers, or as texts for columns of words.
 
-    source: Source
-    delimiter: str
-    header: str
-    header_at: int
-    body_at: int
-
-
-def read(path: Path) -> Recording:
-    """Return the content of a `.csv` file. Raises the errors of `read_csv` and of `of_table`."""
-    return of_table(path, read_csv(path))
-
-
-def size(path: Path) -> int:
-    """Size of the file in bytes, as an estimate of the memory that its numbers need."""
-    return path.stat().st_size
-
-
-def chunks(path: Path, samples: int) -> Iterator[Recording]:
-    """Yield the trace of a file in chunks of `samples` lines.
-
-    Raises the errors of `read`, and E605 if the file contains several traces.
-    """
-    only = OneTrace(str(path))
-    with path.open(encoding="latin-1") as file:  # every byte a letter, and every line ending `\n`
-        known, header = next(((at, line) for at, line in enumerate(file, 1) if line.strip()), (0, ""))
-        blank, kinds = "\n" * (known - 1), dict[int, bool]()
-        while lines := list(islice(file, samples)):
-            if any(map(str.strip, lines)):
-                body = "".join(lines).encode("latin-1")
-                yield of_table(path, _table_of_chunk(path, header, body, blank, known, kinds), only=only)
-            known += len(lines)
-
-
-def _table_of_chunk(
-    path: Path, header: str, body: bytes, blank: str, known: int, kinds: dict[int, bool]
-) -> Table:
-    """Columns of the lines `body`; `known` lines come before them, those of `blank` above the header."""
-    head = header.encode("latin-1")
-    try:
-        return table_of_text(path, head + body, kinds)
-    except TraceError:  # again, so that the finding has the number of the line in the file
-        table_of_text(path, blank.encode() + head + b"\n" * (known - len(blank) - 1) + body, kinds)
-        raise
-
-
-def read_csv(path: Path) -> Table:
-    """Return the columns of a `.csv` file as numbers, or as texts for columns of words.
-
-    The file is in UTF-8. Commas, semicolons or tabs separate the columns. With semicolons or tabs, numbers
-    may have decimal commas.
+    The text is in UTF-8, UTF-16 or Windows-1252, and may be packed (gzip). Commas, semicolons, tabs, `|` or
+    blanks separate the columns. If they are no commas, numbers may have decimal commas.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
-        TraceError: E603, the file is not text, or a cell is not a number; E605, the header is invalid, or a
-            line has another number of cells.
+        TraceError: E603, the file is not text, or a cell is not a number; E605, there is no header, or a line
+            has another number of cells.
     """
-    return table_of_text(path, _read(path))
+    data = utf8(path, unpacked(path))
+    start, head = 0, _after_line(data, _HEAD_BYTES)
+    if head > _HEAD_BYTES + MAX_LINE:
+        raise endless(path)
+    layout = layout_of(path, data[:head], wanted)
+    for _ in range(layout.lines):
+        start = _after_line(data, start)
+    found = _Body(path, layout, wanted).read(data, start)
+    if found is None:
+        raise unreadable(path, "no line of numbers follows the header")
+    return found
 
 
-def table_of_text(path: Path, data: bytes, kinds: dict[int, bool] | None = None) -> Table:
-    """Return the columns of a `.csv` file whose content is `data`; `path` is used in messages.
-
-    Raises TraceError in the same cases as `read_csv`.
-
-    Args:
-        path: path of the file.
-        data: its content, or the header and some lines of it.
-        kinds: whether a column contains words: index -> True or False, as far as earlier lines tell. It is
-            completed. None: there are no earlier lines.
-    """
-    kinds = {} if kinds is None else kinds
-    if len(data) >= LARGE and (table := _read_large(path, data, kinds)) is not None:
-        return table
-    sheet = _sheet(path, data)
-    names, units = _read_header(sheet)
-    texts = _text_columns(sheet, len(names), kinds)
-    return Table(dict(zip(names, _read_body(sheet, len(names), texts), strict=True)), units)
+def _after_line(data: bytes, at: int) -> int:
+    """Number of the byte after the end of the line that contains the byte `at`."""
+    end = _END.search(data, at)
+    return end.end() if end else len(data)
 
 
-def _read(path: Path) -> bytes:
-    with opened(path), path.open("rb") as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="save it as `.npz`")
-    return data
+def chunks(path: Path, samples: int, wanted: Wanted = ALL) -> Iterator[Recording]:
+    """Yield the wanted columns of a table in chunks of `samples` lines. Raises the errors of `read`."""
+    lines, head = text_lines(path), bytearray()
+    while len(head) < _HEAD_BYTES and (line := next(lines, b"")):
+        head += line
+    if not head.strip():
+        return
+    layout = layout_of(path, utf8(path, bytes(head)), wanted)
+    body = _Body(path, layout, wanted)
+    rest = chain(bytes(head).splitlines(keepends=True)[layout.lines :], lines)
+    while data := b"".join(_whole_rows(rest, samples, layout.delimiter)):
+        if (found := body.read(utf8(path, data))) is not None:
+            yield found
 
 
-def _read_large(path: Path, data: bytes, kinds: dict[int, bool]) -> Table | None:
-    """Read the columns of a large file of numbers in one step; `kinds` as of `table_of_text`.
-
-    None is returned if the file contains something that only the slower reader can read.
-    """
-    try:
-        sheet = _sheet(path, data[: data.rfind(b"\n", 0, _HEAD_BYTES) + 1])
-        names, units = _read_header(sheet)
-    except TraceError:
-        return None
-    if _text_columns(sheet, len(names), kinds):
-        return None
-    start = 0
-    for _ in range(sheet.source.text.count("\n", 0, sheet.body_at)):
-        end = _END.search(data, start)
-        start = len(data) if end is None else end.end()
-    columns = read_lines(TableText(data, start, len(names), sheet.delimiter))
-    return None if columns is None else Table(dict(zip(names, columns, strict=True)), units)
-
-
-def _sheet(path: Path, data: bytes) -> _Sheet:
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise unreadable(path, f"it is not UTF-8 (byte {error.start})") from None
-    if "\0" in text:
-        raise unreadable(path, "it is a binary file, not a table")
-    body = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
-    stripped = body.lstrip()
-    if not stripped:
-        raise unreadable(path, "it is empty")
-    start = len(body) - len(stripped)
-    end = body.find("\n", start)
-    end = len(body) if end < 0 else end
-    header = body[start:end]
-    delimiter = delimiter_of(header)
-    if delimiter != "," and "," in body[end:] and not _COMMA.search(body, end):
-        body = body[:end] + body[end:].replace(",", ".")  # decimal commas, as many spreadsheets write them
-    return _Sheet(Source(str(path), body), delimiter, header, start, min(end + 1, len(body)))
-
-
-def _read_header(sheet: _Sheet) -> tuple[list[str], dict[str, str]]:
-    findings: list[Diagnostic] = []
-    units: dict[str, str] = {}
-    names: list[str] = []
-    for raw, span in _placed(sheet.source, sheet.header_at, _raw_heads(sheet.header, sheet.delimiter)):
-        text = _head(raw)
-        plain = text.removeprefix("#").strip() if not names else text  # np.savetxt begins a header with it
-        name, unit = split_head(plain)
-        if not _HEAD.fullmatch(plain):
-            shown = f"`{text}` is not the name of a column" if text else "a column without a name"
-            findings.append(Diagnostic("E605", shown, span, label="expected a signal's name"))
-        elif name in units:
-            findings.append(Diagnostic("E605", f"two columns are called `{name}`", span))
-        elif NUMBER.fullmatch(name):
-            message, advice = "the first line must name the columns", ("e.g. `t,x,v`",)
-            findings.append(Diagnostic("E605", message, span, help=advice))
-        names.append(name)
-        units[name] = unit
-    if findings:
-        raise TraceError(*findings[:_MAX_FINDINGS])
-    return names, units
-
-
-def delimiter_of(header: str) -> str:
-    """The delimiter of a header: comma, semicolon or tab."""
-    return max(",;\t", key=_QUOTED.sub("", header).count)
-
-
-def head_cells(header: str, delimiter: str) -> list[str]:
-    """Split a header into its cells, without quotes.
-
-    `write_csv` puts an apostrophe before a name such as `=1+1`, which a spreadsheet program would run as a
-    formula. The apostrophe is removed here.
-    """
-    return [_head(raw) for raw in _raw_heads(header, delimiter)]
-
-
-def _raw_heads(header: str, delimiter: str) -> list[str]:
-    """Split a header into its unprocessed cells; a delimiter within quotes is part of a cell."""
-    hidden = _QUOTED.sub(lambda match: "\0" * len(match[0]), header)
-    edges = [-1, *(at for at, char in enumerate(hidden) if char == delimiter), len(header)]
-    return [header[left + 1 : right] for left, right in pairwise(edges)]
-
-
-def _head(raw: str) -> str:
-    text = bare(raw)
-    return from_spreadsheet(text.replace('""', '"') if _QUOTED.fullmatch(raw.strip()) else text)
-
-
-def split_head(text: str) -> tuple[str, str]:
-    """Split a header cell, `v [km/h]` or `v (km/h)`, into name and unit; any other text is just a name."""
-    match = _HEAD.fullmatch(text.strip())
-    if match is None:
-        return text.strip(), ""
-    round_ = _ROUND.fullmatch(match["name"])
-    if match["unit"] is None and round_ is not None and is_unit(round_["unit"].strip()):
-        return round_["name"], round_["unit"].strip()
-    return match["name"], (match["unit"] or "").strip()
-
-
-def _placed(source: Source, start: int, cells: Iterable[str]) -> Iterator[tuple[str, Span]]:
-    """Yield the cells of a line with their source locations.
-
-    `start` is the position in the file at which the line begins.
-    """
-    for raw in cells:
-        at = start + (len(raw) - len(raw.lstrip()))
-        yield raw, source.span(at, max(at + len(raw.strip()), at + 1))
-        start += len(raw) + 1
-
-
-def _text_columns(sheet: _Sheet, width: int, kinds: dict[int, bool]) -> frozenset[int]:
-    """Indices of the columns whose first non-empty cell is a word; `kinds` as of `table_of_text`."""
-    open_ = set(range(width)) - kinds.keys()
-    for line in _FILLED.finditer(sheet.source.text, sheet.body_at):
-        cells = line[0].split(sheet.delimiter)[:width]
-        texts = {i: cell.strip().strip('"').strip() for i, cell in enumerate(cells) if i in open_}
-        filled = {i for i, text in texts.items() if text}
-        kinds |= {i: value_of(texts[i]) is None for i in filled}
-        open_ -= filled
-        if not open_:
-            break
-    return frozenset(i for i, word in kinds.items() if word)
-
-
-def _read_body(sheet: _Sheet, width: int, texts: frozenset[int]) -> list[Array]:
-    """Read the columns in blocks of lines; a block with unusual cells is read cell by cell.
-
-    `width` is the number of columns, and `texts` are the indices of the columns of words.
-    """
-    findings: list[Diagnostic] = []
-    parts: list[list[Array]] = [[] for _ in range(width)]
-    text, begin = sheet.source.text, sheet.body_at
-    while begin < len(text) and len(findings) < _MAX_FINDINGS:
-        end = text.find("\n", begin + STRETCH) + 1 or len(text)
-        columns = _read_fast(sheet, text[begin:end], width, texts)
-        if columns is None:
-            columns = _read_strict(sheet, begin, end, width, texts, findings)
-        for part, column in zip(parts, columns, strict=True):
-            part.append(column)
-        begin = end
-    if findings:
-        raise TraceError(*findings)
-    if not any(map(len, parts[0])):
-        raise unreadable(sheet.source.name, "no line of numbers follows the header")
-    return [np.concatenate(part) for part in parts]
-
-
-def _read_fast(sheet: _Sheet, body: str, width: int, texts: frozenset[int]) -> list[Array] | None:
-    """Read all lines of `body` at once with NumPy's reader; None if a cell is unusual."""
-    if len(texts) == width or (texts and '"' in body):
-        return None
-    numbers = [i for i in range(width) if i not in texts]
-    values = load(body, sheet.delimiter, numbers if texts else None)
-    lines = [line for line in body.split("\n") if texts and filled(line, sheet.delimiter)]
-    words = [line.split(sheet.delimiter) for line in lines]
-    if values is None or values.shape[1] != len(numbers) or any(len(cells) != width for cells in words):
-        return None
-    columns: dict[int, Array] = {i: np.ascontiguousarray(values[:, k]) for k, i in enumerate(numbers)}
-    columns |= {i: np.array([cells[i].strip()[:MAX_LETTERS] for cells in words]) for i in texts}
-    return [columns[i] for i in range(width)]
-
-
-def filled(line: str, delimiter: str) -> bool:
-    """True if any cell of a line is not empty."""
-    return bool(line.strip(f" \t{delimiter}"))
-
-
-def _read_strict(
-    sheet: _Sheet, start: int, end: int, width: int, texts: frozenset[int], findings: list[Diagnostic]
-) -> list[Array]:
-    """Read the lines of a block cell by cell, and append the location of every error to `findings`."""
-    rows: list[list[float | str]] = []
-    for line in sheet.source.text[start:end].removesuffix("\n").split("\n"):
-        if filled(line, sheet.delimiter):
-            placed = _placed(sheet.source, start, line.split(sheet.delimiter))
-            cells = [(bare(raw), span) for raw, span in placed]
-            rows.append(_read_row(sheet, cells, width, texts, findings))
-        start += len(line) + 1
-        if len(findings) >= _MAX_FINDINGS:
-            break
-    whole = [] if findings else rows
-    return [
-        np.array([row[i] for row in whole], dtype=str if i in texts else np.float64) for i in range(width)
-    ]
-
-
-def _read_row(
-    sheet: _Sheet,
-    cells: Sequence[tuple[str, Span]],
-    width: int,
-    texts: frozenset[int],
-    findings: list[Diagnostic],
-) -> list[float | str]:
-    if len(cells) != width:
-        span = cells[0][1].to(cells[-1][1])
-        message = f"this line has {len(cells)} cells, the header names {width} columns"
-        findings.append(Diagnostic("E605", message, span, help=_decimal_comma(sheet, cells, width)))
-        return []
-    row: list[float | str] = []
-    for i, (text, span) in enumerate(cells):
-        if i in texts:
-            row.append(text[:MAX_LETTERS])
-        elif (value := value_of(text)) is not None:
-            row.append(value)
+def _whole_rows(lines: Iterator[bytes], samples: int, delimiter: str) -> Iterator[bytes]:
+    """Yield the next `samples` lines, and those that end a row whose quoted cells contain line breaks."""
+    for line in islice(lines, samples):
+        if b'"' in line and not COMMENT.match(line.decode("latin-1")):
+            rows = Rows((each.decode("latin-1") for each in chain([line], lines)), delimiter)
+            with suppress(csv.Error):  # it is told once the row is read
+                next(iter(rows), None)
+            yield rows.raw.encode("latin-1")
         else:
-            findings.append(Diagnostic("E603", f"`{text}` is not a number", span))
-    return row
+            yield line
 
 
-def _decimal_comma(sheet: _Sheet, cells: Sequence[object], width: int) -> tuple[str, ...]:
-    if sheet.delimiter == "," and len(cells) == 2 * width:
-        return ("decimal commas? write a point, or separate the columns with `;`",)
-    return ()
+def _is_plain(text: str) -> bool:
+    """True if there are no quotes and no comments in some lines, so that each line is a row."""
+    return not any(mark in text for mark in ('"', "#", "%", "//"))
+
+
+class _Body:
+    """Reader of the rows of a table below its header, all at once or in pieces.
+
+    Attributes:
+        kept: index -> name of the columns that are read.
+        kinds: index of a column -> whether it contains words, as far as the rows so far tell.
+        above: number of lines of the file before the rows that are read next.
+        text: the rows that are being read.
+        parts: index of a column -> its values in each block of the text.
+        wrong: index of a column -> rows whose cell is not a number: for each block with such rows its
+            position, the number of the first of them in it, and how many they are.
+    """
+
+    def __init__(self, path: Path, layout: Layout, wanted: Wanted) -> None:
+        self.path, self.layout, self.wanted = path, layout, wanted
+        self.mark, self.width = layout.delimiter, len(layout.names)
+        self.kept = {i: name for i, name in enumerate(layout.names) if name and wanted.keeps(name)}
+        self.kinds: dict[int, bool] = {}
+        self.above, self.text = layout.lines, ""
+        self.parts: dict[int, list[Array]] = {}
+        self.wrong: dict[int, list[tuple[int, int, int]]] = {}
+
+    def read(self, data: bytes, start: int = 0) -> Recording | None:
+        """Return the kept columns of the rows in `data`, UTF-8, from byte `start` on; None without rows.
+
+        Raises TraceError (E603, E605).
+        """
+        columns = (self._by_kernel(data, start) or self._by_blocks(data, start)) if self.kept else []
+        first, rows, ends = self.above + 1, len(columns[0]) if columns else 0, data.count(b"\n", start)
+        self.above += ends
+        if self.kept and not columns:
+            return None
+        names, units = self.layout.names, self.layout.units
+        return Recording(
+            str(self.path),
+            (ClockGroup(dict(zip(self.kept.values(), columns, strict=True)), None),),
+            units={name: units[name] for name in self.kept.values() if units[name]},
+            others=tuple(name for i, name in enumerate(names) if name and i not in self.kept),
+            clashes=self.layout.clashes,
+            line=(lambda row: first + row) if 0 <= rows - ends <= 1 else None,
+        )
+
+    def _by_kernel(self, data: bytes, start: int) -> list[Array] | None:
+        """Return the columns of a large table of plain numbers; None for others."""
+        if any(map(self.kinds.get, self.kept)) or len(data) < LARGE or self.mark == BLANKS:
+            return None
+        columns = read_lines(data, start, self.width, self.mark, list(self.kept))
+        for i, values in zip(self.kept, columns or (), strict=False):
+            if not np.isnan(values).all():
+                self.kinds[i] = False
+        return columns
+
+    def _by_blocks(self, data: bytes, start: int) -> list[Array]:
+        """Return the columns of any table, read in blocks of lines."""
+        text = str(memoryview(data)[start:], "utf-8")
+        self.text = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+        self.parts, self.wrong, at = {i: [] for i in self.kept}, {}, 0
+        while at < len(self.text):
+            size = STRETCH if at else _FIRST
+            at = self._block(at, self.text.find("\n", at + size) + 1 or len(self.text))
+        if _RAGGED in self.wrong:
+            raise TraceError(self._finding(_RAGGED))
+        if wrong := [i for i in self.wrong if self.wanted.reads(self.kept[i])]:
+            raise TraceError(*map(self._finding, wrong[:_MAX_FINDINGS]))
+        if self.wrong:  # columns that might have been a clock: words and numbers are words
+            self.kinds |= dict.fromkeys(self.wrong, True)
+            return self._by_blocks(data, start)
+        self.text = ""
+        return [self._joined(i) for i in self.kept] if any(map(len, next(iter(self.parts.values())))) else []
+
+    def _joined(self, i: int) -> Array:
+        parts, word = self.parts.pop(i), self.kinds.get(i)
+        if word or (word is None and any((part != "").any() for part in parts)):
+            return np.concatenate(parts)
+        return np.concatenate([p if p.dtype.kind == "f" else np.full(len(p), np.nan) for p in parts])
+
+    def _block(self, begin: int, end: int) -> int:
+        block = self.text[begin:end]
+        if self.mark != BLANKS and self._load(block):
+            return end
+        if _is_plain(block):
+            rows = [line.split(None if self.mark == BLANKS else self.mark) for line in block.split("\n")]
+        else:
+            rows, end = self._rows(begin, end)
+        aligned = {k: self._aligned(row) for k, row in enumerate(rows) if self._is_filled(row)}
+        if ragged := [k for k, row in aligned.items() if row is None]:
+            self.wrong.setdefault(_RAGGED, []).append((begin, ragged[0], len(ragged)))
+        full = {k: row for k, row in aligned.items() if row is not None}
+        for i in self.kept:
+            self._take(i, [row[i] for row in full.values()], begin, list(full))
+        return end
+
+    def _load(self, block: str) -> bool:
+        words = [i for i in self.kept if self.kinds.get(i)]
+        numbers = places = [i for i in self.kept if i not in words]
+        rows: list[list[str]] = []
+        values = None if words else load(block, self.mark)
+        if values is None or values.shape[1] != self.width:
+            if not numbers or len(self.kinds) < len(self.kept) or not _is_plain(block):
+                return False
+            lines = [line for line in block.split("\n") if line.strip()]
+            aligned = all(line.count(self.mark) == self.width - 1 for line in lines)
+            values = load(block, self.mark, numbers) if aligned else None
+            if values is None or len(values) != len(lines):
+                return False
+            rows = [line.split(self.mark) for line in lines] if words else []
+            places = list(range(len(numbers)))
+        for i, k in zip(numbers, places, strict=True):
+            self.kinds[i] = False
+            self.parts[i].append(values[:, k].copy())
+        for i in words:
+            self.parts[i].append(np.array([row[i].strip()[:MAX_LETTERS] for row in rows]))
+        return True
+
+    def _rows(self, begin: int, end: int) -> tuple[list[list[str]], int]:
+        found, rows = list[list[str]](), Rows(lines_of(self.text, begin), self.mark, begin)
+        try:
+            for cells in rows:
+                found.append(cells)
+                if rows.at >= end:
+                    break
+        except csv.Error as error:
+            raise TraceError(self._misquoted(rows, str(error))) from None
+        return found, rows.at
+
+    def _is_filled(self, cells: list[str]) -> bool:
+        return bool("".join(cells).strip(" " if self.mark == "\t" else " \t"))
+
+    def _aligned(self, row: list[str]) -> list[str] | None:
+        """The row with a cell for each column; None if a column lacks its cell, or a cell its column."""
+        if len(row) == self.width:
+            return row
+        wrong = self._is_filled(row[self.width :]) or any(self.layout.names[len(row) :])
+        return None if wrong else (row + [""] * self.width)[: self.width]
+
+    def _take(self, i: int, cells: list[str], begin: int, places: list[int]) -> None:
+        """Append the cells of a block to the column `i`; `places` are the numbers of their rows in it."""
+        comma = self.mark != ","
+        if i not in self.kinds:
+            first = next((text for cell in cells if not is_missing(text := bare(cell))), None)
+            if first is not None:
+                self.kinds[i] = number_of(first, comma=comma) is None
+        if self.kinds.get(i) is False:
+            values, bad = numbers(cells, comma=comma)
+            if bad:
+                self.wrong.setdefault(i, []).append((begin, places[bad[0]], len(bad)))
+        else:
+            values = np.array([bare(cell)[:MAX_LETTERS] for cell in cells], dtype=str)
+        self.parts[i].append(values)
+
+    def _finding(self, i: int) -> Diagnostic:
+        """Return what is wrong with the first row of `wrong[i]`, and how many more there are."""
+        begin, number, _ = self.wrong[i][0]
+        rows = Rows(lines_of(self.text, begin), self.mark, begin)
+        next(islice(rows, number, None))
+        cells = _spans(rows.raw, rows.at - len(rows.raw), self.mark)
+        more = sum(count for _, _, count in self.wrong[i]) - 1
+        help_: tuple[str, ...] = ()
+        if i == _RAGGED:
+            code, span = "E605", self._span(cells[0][0], cells[-1][1])
+            message = f"this line has {len(cells)} cells, the header names {self.width} columns"
+            note = f"{more} more line{'s' * (more > 1)} with another number of cells"
+            if self.mark == "," and len(cells) == 2 * self.width:
+                help_ = ("decimal commas? write a point, or separate the columns with `;`",)
+        else:
+            code, span = "E603", self._span(*cells[i])
+            message = f"`{bare(span.text)[:80]}` is not a number"
+            note = f"{more} more cell{'s' * (more > 1)} of `{self.kept[i]}` not a number"
+        return Diagnostic(code, message, span, help=help_, note=(note,) if more else ())
+
+    def _misquoted(self, rows: Rows, error: str) -> Diagnostic:
+        begin, line = rows.at - len(rows.raw), rows.raw.partition("\n")[0].rstrip()
+        span = self._span(begin, begin + len(line))
+        if "limit" in error:
+            return Diagnostic("E603", f"a cell of this row has more than {MAX_CELL:,} letters", span)
+        help_ = ('a quote within a quoted cell is written twice: "say ""go"""',)
+        ended = "end of data" in error
+        what = "opens a quote that nothing closes" if ended else "has text behind closing quotes"
+        return Diagnostic("E603", f"this row {what}", span, help=help_)
+
+    def _span(self, start: int, end: int) -> Span:
+        return place(self.path, self.above, self.text, start, end)
+
+
+def _spans(row: str, at: int, delimiter: str) -> list[tuple[int, int]]:
+    """Places of the cells of a row at position `at`: first character and end."""
+    mark, spans = re.escape(delimiter), list[tuple[int, int]]()
+    cell = r'("(?:[^"]|"")*"\S*|\S+)'
+    if delimiter != BLANKS:
+        cell = rf'(?:\A|{mark})((?: *"(?:[^"]|"")*")?[^{mark}]*)'
+    for found in re.finditer(cell, row.rstrip("\n")):
+        first = found.end(1) - len(found[1].lstrip())
+        end = found.start(1) + len(found[1].rstrip())
+        spans.append((at + first, at + max(end, first + 1)))
+    return spans
 
 
 def write(path: Path | str, trace: Trace) -> None:
@@ -387,35 +350,25 @@ def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapp
         TraceError: E605, a name would be read back differently, such as a name with a unit in brackets.
         MissingError: R201, no space left or no permission; an existing file is not changed.
     """
-    head = _row(f"{name} [{units[name]}]" if units.get(name) else name for name in columns)
-    _require_names(Path(path), head, list(columns))
-    text = io.StringIO(head)
-    text.seek(0, io.SEEK_END)
-    writer = csv.writer(text, lineterminator="\n")
-    for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-        writer.writerow([repr(value) for value in row])
-    write_atomic(path, text.getvalue())
+    names = list(columns)
+    heads = [f"{name} [{units[name]}]" if units.get(name) else name for name in names]
+    if _names_in(heads) != names:
+        odd = next((name for name in names if _names_in([name]) != [name]), names[0])
+        message = f"no column of a `.csv` can be called `{odd}`"
+        raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which holds any name",)))
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    write_atomic(path, _line(heads) + "".join(f"{','.join(map(repr, row))}\n" for row in rows))
 
 
-def _require_names(path: Path, header: str, names: Sequence[str]) -> None:
-    """Check that the reader finds the names `names` in `header`. Raises TraceError (E605) if not."""
-    if _names_in(path, header) == list(names):
-        return
-    odd = next((name for name in names if _names_in(path, _row((name,))) != [name]), names[0])
-    message = f"no column of a `.csv` can be called `{odd}`"
-    raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which holds any name",)))
+def _names_in(heads: Sequence[str]) -> list[str]:
+    """Names that the reader finds in a header with the cells `heads` above numbers; [] if it finds none."""
+    text = f"{_line(heads)}{','.join('0' * len(heads))}\n"
+    with suppress(TraceError):
+        return list(layout_of(Path(), text.encode("utf-8", "replace"), ALL).names)
+    return []
 
 
-def _names_in(path: Path, header: str) -> list[str]:
-    """Names that the reader finds in a header; [] if the header is invalid."""
-    try:
-        return _read_header(_sheet(path, header.encode("utf-8", "replace")))[0]
-    except TraceError:
-        return []
-
-
-def _row(heads: Iterable[str]) -> str:
-    """Text of a header line with the given cells."""
+def _line(cells: Sequence[str]) -> str:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(map(spreadsheet, heads))
+    csv.writer(text, lineterminator="\n").writerow(map(spreadsheet, cells))
     return text.getvalue()

@@ -9,157 +9,136 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import lru_cache, partial
+from io import BytesIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stlc.escape import topic as topic_of
 from stlc.files import atomic_path
 from stlc.jsontext import loads
-from stlc.trace.formats.messages import (
-    DEEPEST,
-    HEADER,
-    LONGEST,
-    STAMPS,
-    DamageError,
-    Decode,
-    Log,
-    MessageNumber,
-    Room,
-    mapped,
-    numbers_of,
-    seconds_of,
-)
+from stlc.trace.formats.messages import LONGEST, Bytes, Channel, DamageError, Decode, Log, Room, mapped
+from stlc.trace.formats.paths import Selection
 from stlc.trace.formats.registry import damage, needed, unreadable
-from stlc.trace.formats.ros import decoder
+from stlc.trace.formats.ros import Form, decoder
 from stlc.trace.meta import meta_array, read_meta
-from stlc.trace.recording import ClockGroup, Recording
+from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
 
 if TYPE_CHECKING:
     from stlc.trace.trace import Trace
 
 OURS = "stlc"
 """The metadata record that describes the signals."""
-_READ = "read are JSON, Protocol Buffers, and ROS 1 and 2"
+_ROS: dict[tuple[str, str], Form] = {("cdr", "ros2msg"): "cdr", ("ros1", "ros1msg"): "ros1"}
+"""Encodings of messages and of their definitions -> form of ROS."""
+_DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_UNUSUAL = {"nan": "null", "inf": "1e999", "-inf": "-1e999"}
+"""Numbers that JSON lacks -> what is written: infinity is a number beyond all floats."""
+_MAGIC = b"\x89MCAP0\r\n"
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 3, 4, 5, 6, 12, 15
+_FRAME, _SENT = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 
 
-def read(path: Path) -> Recording:
-    """Read the numbers in all messages.
-
-    A number becomes a signal only if every message of its topic contains it.
+def read(path: Path, wanted: Wanted = ALL) -> Recording:
+    """Read what is wanted of the messages.
 
     Raises:
         UsageError: U102, the file does not exist or cannot be opened.
         MissingError: R301, `mcap`, or a package for an encoding, is not installed.
-        TraceError: E603, the file is of another format, damaged, or without numbers.
+        TraceError: E603, the file is of another format, damaged, or without messages.
     """
-    log = Log(path)
+    log = Log(path, wanted)
     with damage(path):
         ours = add_mcap(log, path)
-        found = None if ours is None else _as_written(log, ours)
-    return log.recording() if found is None else found
-
-
-@dataclass(slots=True)
-class _File:
-    """Reader of the records of one file: its schemas, its channels and their decoders."""
-
-    log: Log
-    room: Room
-    schemas: dict[int, Any] = field(default_factory=dict)
-    channels: dict[int, Any] = field(default_factory=dict)
-    decoders: dict[int, Decode | None] = field(default_factory=dict)
-
-    def take(self, record: Any) -> None:
-        """Process one record: store a schema or channel, or add the numbers of a message to the log."""
-        match type(record).__name__:
-            case "Schema":
-                self.schemas.setdefault(record.id, record)
-            case "Channel":
-                self.channels.setdefault(record.id, record)
-            case "Message":
-                self.message(record)
-
-    def message(self, message: Any) -> None:
-        channel = self.channels.get(message.channel_id)
-        if channel is None:
-            raise DamageError("a message of an unknown channel")
-        if channel.id not in self.decoders:
-            self.decoders[channel.id] = self.decoder(channel)
-        decode = self.decoders[channel.id]
-        if decode is not None:
-            self.log.add(channel.topic, message.log_time, decode(self.room.whole(message.data)))
-
-    def decoder(self, channel: Any) -> Decode | None:
-        """Return the decoder of a channel's messages; None if they cannot be decoded.
-
-        In this case the reason is stored in `log.unread`.
-        """
-        schema, encoding = self.schemas.get(channel.schema_id), channel.message_encoding
-        described = "" if schema is None else schema.encoding
-        try:
-            if encoding == "json":
-                return _of_json
-            if encoding == "protobuf" and described == "protobuf":
-                return _protobuf(schema)
-            if schema and (encoding, described) in (("cdr", "ros2msg"), ("ros1", "ros1msg")):
-                return decoder(schema.data.decode("utf-8", "replace"), encoding)
-        except DamageError as error:
-            self.log.unread[channel.topic] = str(error)
-            return None
-        shown = f"`{encoding[:40]}`" + (f" by `{described[:40]}`" if described else "")
-        self.log.unread[channel.topic] = f"its messages are written as {shown} ({_READ})"
-        return None
+        if ours is not None and wanted.names is not None:
+            log = Log(path)
+            add_mcap(log, path)
+        found = log.recording()
+        return found if ours is None else _as_written(found, ours) or found
 
 
 def add_mcap(log: Log, path: Path) -> Mapping[str, str] | None:
-    """Add the messages of a file to a log.
+    """Add the messages of a file to a log; of a file that is cut off, those before its end.
 
     Returns the metadata if stlc wrote the file, None for other files.
     """
-    reader = needed("mcap.stream_reader").StreamReader
+    needed("mcap")  # before the packages for compressed chunks, which come with it
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Channel] = {}
     ours: Mapping[str, str] | None = None
-    with mapped(path) as data:
-        size, room = len(data), Room(path, len(data))
-        file = _File(log, room)
-        stream = cast("IO[bytes]", data)
-        for record in reader(stream, emit_chunks=True, record_size_limit=size).records:
-            if type(record).__name__ == "Chunk":
-                inner = room.unpacked(record.compression, record.data, record.uncompressed_size)
-                if record.uncompressed_crc and zlib.crc32(inner) != record.uncompressed_crc:
-                    raise DamageError("the content of a chunk is not what was written")
-                parts = needed("mcap.records").Chunk(
-                    compression="",
-                    data=inner,
-                    message_end_time=0,
-                    message_start_time=0,
-                    uncompressed_crc=0,
-                    uncompressed_size=len(inner),
-                )
-                for part in needed("mcap.stream_reader").breakup_chunk(parts):
-                    file.take(part)
-            elif type(record).__name__ == "Metadata" and record.name == OURS:
-                ours = record.metadata
-            elif type(record).__name__ == "DataEnd":  # followed by an index
-                break
+    with mapped(path) as whole:
+        if whole[: len(_MAGIC)] != _MAGIC:
+            raise DamageError("it does not begin like an MCAP file")
+        room = Room(path, len(whole))
+        with log.partly(path, "mcap recover FILE -o FIXED  rewrites what is readable"):
+            for kind, data, start, end in _records(whole, len(_MAGIC), room):
+                if kind == _MESSAGE:
+                    number, _, logged, published = _SENT.unpack_from(data, start)
+                    if number not in channels:
+                        raise DamageError("a message of an unknown channel")
+                    time = published if log.published else logged
+                    log.add(channels[number], time, data[start + _SENT.size : end], room)
+                elif kind == _SCHEMA:
+                    schema = _record("Schema", data[start:end])
+                    schemas.setdefault(schema.id, schema)
+                elif kind == _CHANNEL:
+                    channel = _record("Channel", data[start:end])
+                    schema = schemas.get(channel.schema_id)
+                    make = partial(_decoder, channel.message_encoding, schema)
+                    found = log.channel(channel.topic, "" if schema is None else schema.name, make)
+                    channels.setdefault(channel.id, found)
+                elif kind == _METADATA and (record := _record("Metadata", data[start:end])).name == OURS:
+                    ours = record.metadata
+                elif kind == _DATA_END:  # an index follows
+                    break
             else:
-                file.take(record)
+                raise DamageError("it was not closed")
     return ours
 
 
-# ------------------------------------------------------------------------------ encodings
+def _records(data: Bytes, at: int, room: Room) -> Iterator[tuple[int, Bytes, int, int]]:
+    """Yield (kind, data, start, end) of each record in `data`, from byte `at` on, and of those in chunks."""
+    while at < len(data):
+        kind, size = _FRAME.unpack_from(data, at)
+        start, at = at + _FRAME.size, at + _FRAME.size + size
+        whole = at <= len(data)
+        if kind == _CHUNK:
+            unpacked, crc, letters = struct.unpack_from("<QII", data, start + 16)
+            first = start + 40 + letters
+            how = data[start + 32 : first - 8].decode()
+            inner = room.unpacked(how, data[first:at], unpacked, whole=whole)
+            if whole and crc and zlib.crc32(inner) != crc:
+                raise DamageError("the content of a chunk is not what was written")
+            yield from _records(inner, 0, room)
+        if not whole or not kind:
+            raise DamageError("it ends inside a record")
+        yield kind, data, start, at
 
 
-def _of_json(data: bytes) -> Iterable[MessageNumber]:
-    return numbers_of(loads(data.decode(json.detect_encoding(data))))
+def _record(name: str, content: bytes) -> Any:
+    stream = needed("mcap.data_stream").ReadDataStream(BytesIO(content))
+    return getattr(needed("mcap.records"), name).read(stream)
 
 
-def _protobuf(schema: Any) -> Decode:
-    """Return the decoder of Protocol Buffers messages, made from the descriptors in the file."""
+def _decoder(encoding: str, schema: Any, selection: Selection) -> Decode:
+    described = "" if schema is None else schema.encoding
+    if encoding == "json":
+        return lambda data: loads(data.decode(json.detect_encoding(data)))
+    if encoding == described == "protobuf":
+        return _protobuf(schema, selection)
+    if (form := _ROS.get((encoding, described))) is not None:
+        return decoder(schema.data.decode("utf-8", "replace"), form, selection)
+    shown = f"`{encoding[:40]}`" + (f" by `{described[:40]}`" if described else "")
+    raise DamageError(f"its messages are written as {shown} (read are JSON, Protocol Buffers, and ROS)")
+
+
+def _protobuf(schema: Any, selection: Selection) -> Decode:
     pool = needed("google.protobuf.descriptor_pool").DescriptorPool()
     files = needed("google.protobuf.descriptor_pb2").FileDescriptorSet.FromString(schema.data)
     left = {each.name: each for each in files.file}
@@ -170,44 +149,31 @@ def _protobuf(schema: Any) -> Decode:
         for each in ready:
             pool.Add(left.pop(each.name))
     kind = needed("google.protobuf.message_factory").GetMessageClass(pool.FindMessageTypeByName(schema.name))
-
-    def decode(data: bytes) -> Iterator[MessageNumber]:
-        message = kind.FromString(data)
-        fields = message.DESCRIPTOR.fields
-        if [each.name for each in fields] == ["data"]:
-            return _proto_field("", message, fields[0], 0)
-        return _proto_fields("", message, 0)
-
-    return decode
+    return lambda data: _tree(kind.FromString(data), selection)
 
 
-def _proto_fields(name: str, message: Any, depth: int) -> Iterator[MessageNumber]:
-    fields = message.DESCRIPTOR.fields
-    if {each.name for each in fields} in STAMPS:
-        yield MessageNumber(name, seconds_of({each.name: getattr(message, each.name) for each in fields}))
-        return
-    for each in fields:
-        if each.name != HEADER:
-            yield from _proto_field(f"{name}.{each.name}" if name else each.name, message, each, depth)
+def _tree(message: Any, selection: Selection) -> dict[str, object]:
+    """Return the selected fields of a Protocol Buffers message; one that is absent is left out."""
+    tree: dict[str, object] = {}
+    for each, part in _selected(message.DESCRIPTOR, selection):
+        inner = each.message_type
+        if each.has_presence and not message.HasField(each.name):
+            continue
+        value = getattr(message, each.name)
+        if each.is_repeated:
+            if (inner is None or not inner.GetOptions().map_entry) and (part.long or len(value) <= LONGEST):
+                tree[each.name] = list(value) if inner is None else [_tree(item, part) for item in value]
+        elif not isinstance(value, bytes):
+            tree[each.name] = value if inner is None else _tree(value, part)
+    return tree
 
 
-def _proto_field(name: str, message: Any, each: Any, depth: int) -> Iterator[MessageNumber]:
-    value = getattr(message, each.name)
-    if each.is_repeated:
-        is_map = each.message_type is not None and each.message_type.GetOptions().map_entry
-        if not is_map and len(value) <= LONGEST:
-            for i, item in enumerate(value):
-                yield from _proto_value(f"{name}[{i}]", item, each, depth)
-    elif not each.has_presence or message.HasField(each.name):
-        yield from _proto_value(name, value, each, depth)
-
-
-def _proto_value(name: str, value: Any, each: Any, depth: int) -> Iterator[MessageNumber]:
-    if each.message_type is not None:
-        if depth <= DEEPEST:
-            yield from _proto_fields(name, value, depth + 1)
-    elif isinstance(value, (int, float)):
-        yield MessageNumber(name, float(value), isinstance(value, int))
+@lru_cache(maxsize=1000)
+def _selected(kind: Any, selection: Selection) -> list[tuple[Any, Selection]]:
+    """The selected fields of a type of messages, and what is selected in them."""
+    names = frozenset(kind.fields_by_name)
+    parts = [selection.part(each.name, names, nested=each.message_type is not None) for each in kind.fields]
+    return [(each, part) for each, part in zip(kind.fields, parts, strict=True) if part is not None]
 
 
 # ---------------------------------------------------------------------------- stlc's own
@@ -225,64 +191,46 @@ def write(path: Path | str, trace: Trace) -> None:
     writers = needed("mcap.writer")
     base = "/" + topic_of(Path(path).stem, empty="trace")
     topics = [base] if trace.traces == 1 else [f"{base}/{k}" for k in range(trace.traces)]
-    first = math.floor(float(trace.times[0]) * 1e9)
-    origin = max(trace.meta.origin or 0, -first)
+    origin = max(trace.meta.origin or 0, -math.floor(float(trace.times[0]) * 1e9))
     meta = meta_array(replace(trace.meta, dt=trace.dt), trace.signature)
+    properties = {
+        each.name: {"type": "number"} | ({"description": each.unit.text} if each.unit.text else {})
+        for each in trace.signature.columns
+    }
     stamps = [origin + round(float(t) * 1e9) for t in trace.times]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         writer = writers.Writer(file)
         writer.start(profile="", library="stlc")
-        schema = writer.register_schema(base[1:], "jsonschema", json.dumps(_schema(trace)).encode())
+        described = {"$schema": _DIALECT, "type": "object", "properties": properties}
+        schema = writer.register_schema(base[1:], "jsonschema", json.dumps(described).encode())
         channels = [writer.register_channel(topic, "json", schema) for topic in topics]
-        rows = {name: values.T.tolist() for name, values in trace.data.items()}
+        rows = {json.dumps(name): values.T.tolist() for name, values in trace.data.items()}
         for k, stamp in enumerate(stamps):
             for i, channel in enumerate(channels):
-                cells = ", ".join(
-                    f"{json.dumps(name)}: {_cell(values[k][i])}" for name, values in rows.items()
-                )
+                texts = {name: repr(values[k][i]) for name, values in rows.items()}
+                cells = ", ".join(f"{name}: {_UNUSUAL.get(text, text)}" for name, text in texts.items())
                 writer.add_message(channel, stamp, f"{{{cells}}}".encode(), stamp, sequence=k)
         writer.add_metadata(OURS, {"topics": json.dumps(topics), "origin": str(origin), "meta": str(meta)})
         writer.finish()
 
 
-def _cell(value: float) -> str:
-    """JSON text of a number: `null` for NaN, and a number beyond all floats such as 1e999 for infinity."""
-    if math.isnan(value):
-        return "null"
-    return repr(value) if math.isfinite(value) else "1e999" if value > 0 else "-1e999"
-
-
-def _schema(trace: Trace) -> dict[str, object]:
-    units = {column.name: column.unit.text for column in trace.signature.columns}
-    properties = {
-        name: {"type": "number"} | ({"description": units[name]} if units.get(name) else {})
-        for name in trace.data
-    }
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "type": "object",
-        "properties": properties,
-    }
-
-
-def _as_written(log: Log, ours: Mapping[str, str]) -> Recording | None:
-    """Return the trace that stlc wrote to a file, given its messages (`log`) and its metadata (`ours`).
-
-    None is returned if the messages no longer fit together, because the file was changed afterwards.
-    """
-    topics, origin = json.loads(ours.get("topics", "[]")), int(ours.get("origin", "0"))
-    if not isinstance(topics, list) or not topics or not all(isinstance(topic, str) for topic in topics):
+def _as_written(found: Recording, ours: Mapping[str, str]) -> Recording | None:
+    """Return the trace that stlc wrote to a file, given its messages and its metadata (`ours`)."""
+    starts = [f"{str(topic).strip('/').replace('/', '.')}." for topic in json.loads(ours.get("topics", "[]"))]
+    if not found.groups or len(found.groups) != len(starts):
         return None
-    found = [log.topic(topic) for topic in topics]
-    times, first = found[0]
-    alike = all(
-        np.array_equal(times, others) and arrays.keys() == first.keys() for others, arrays in found[1:]
-    )
-    if not alike or not first:
+    times = np.asarray(found.groups[0].clock)
+    parts = [
+        {name.removeprefix(start): values for name, values in group.arrays.items() if name.startswith(start)}
+        for group, start in zip(found.groups, starts, strict=True)
+        if np.array_equal(np.asarray(group.clock), times)
+    ]
+    if len(parts) < len(starts) or not parts[0] or any(each.keys() != parts[0].keys() for each in parts):
         return None
+    origin = int(ours.get("origin", "0"))
     if not -(2**63) < origin < 2**63:
-        raise unreadable(log.path, f"its time 0 is {origin} ns, which is no time")
+        raise unreadable(found.name, f"its time 0 is {origin} ns, which is no time")
     clock = np.array([(t - origin) * 1e-9 for t in times.tolist()], dtype=np.float64)
-    data = {name: np.stack([arrays[name] for _, arrays in found]) for name in first}
-    meta, columns = read_meta(log.path, np.array(ours.get("meta", "{}")))
-    return Recording(str(log.path), (ClockGroup(data, clock),), columns, meta)
+    data = {name: np.stack([each[name] for each in parts]) for name in parts[0]}
+    meta, columns = read_meta(Path(found.name), np.array(ours.get("meta", "{}")))
+    return Recording(found.name, (ClockGroup(data, clock),), columns, meta)

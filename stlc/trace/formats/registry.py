@@ -58,16 +58,25 @@ class Format:
 
 FORMATS = (
     Format("npz", (".npz",), writes=True, chunked=True),
-    Format("csv", (".csv", ".tsv"), writes=True, chunked=True),
+    Format("csv", (".csv", ".tsv", ".txt"), writes=True, chunked=True),
+    Format("jsonl", (".jsonl", ".ndjson"), chunked=True),
     Format("parquet", (".parquet", ".pq"), "parquet", ("pyarrow",), chunked=True),
     Format("mat", (".mat",), "mat", ("h5py",)),
     Format("mcap", (".mcap",), "mcap", ("mcap", "google"), writes=True),
+    Format("ulg", (".ulg",), "ulg", ("pyulog",)),
+    Format("mf4", (".mf4", ".mdf"), "mf4", ("asammdf",)),
     Format("bag", (".bag", ".db3"), "bag", ("rosbags", "lz4", "zstandard"), folder=True),
 )
 SUFFIXES = tuple(suffix for each in FORMATS for suffix in each.suffixes)
 WRITTEN = tuple(each.suffixes[0] for each in FORMATS if each.writes)
 _PACKAGES = {"google": "protobuf"}
 """Names of packages that differ from those of their modules."""
+
+
+def suffix_of(path: Path) -> str:
+    """Suffix of a trace file in lower case, without a `.gz` behind it."""
+    suffix = path.suffix.lower()
+    return Path(path.stem).suffix.lower() if suffix == ".gz" else suffix
 
 
 def format_of(path: Path) -> Format:
@@ -77,10 +86,7 @@ def format_of(path: Path) -> Format:
     """
     if path.is_dir():
         return next(each for each in FORMATS if each.folder)
-    return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
-
-
-# ------------------------------------------------------------------------ shared by readers
+    return next((each for each in FORMATS if suffix_of(path) in each.suffixes), FORMATS[0])
 
 
 def needed(module: str) -> Any:
@@ -99,13 +105,8 @@ def needed(module: str) -> Any:
 
 
 def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
-    """Return the error E603: the file cannot be read, or is not safe to read.
-
-    `why` is the reason. `advice` is a help text, or "".
-    """
-    return TraceError(
-        Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()),
-    )
+    """Return the error E603: the file cannot be read, or is not safe to read; `advice` is a help."""
+    return TraceError(Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()))
 
 
 @contextmanager
@@ -114,8 +115,8 @@ def opened(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {reason}")) from None
+        why = (error.strerror or type(error).__name__).lower()
+        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {why}")) from None
 
 
 @contextmanager
@@ -126,9 +127,8 @@ def damage(path: Path) -> Iterator[None]:
     except StlcError:
         raise
     except Exception as error:
-        lines = str(error).strip().splitlines()
-        why = lines[0][:100] if lines else type(error).__name__
-        raise unreadable(path, f"it is damaged or of another format ({why})") from None
+        why = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise unreadable(path, f"it is damaged or of another format ({why[:100]})") from None
 
 
 def room_for(path: Path) -> int:
@@ -137,14 +137,10 @@ def room_for(path: Path) -> int:
 
 
 def require_room(path: Path, size: int, *, chunk: bool = False) -> None:
-    """Check that a file, or a chunk of it, that unpacks to `size` bytes may be read.
-
-    Raises TraceError (E603) if not.
-    """
+    """Raise TraceError (E603) if a file, or a chunk of it, that unpacks to `size` bytes is too large."""
     most = room_for(path)
     if not 0 <= size <= most:
-        what, advice = "it", "split it, or do not compress it"
-        if chunk:
-            what, advice = "a chunk", "--chunk SAMPLES  reads fewer samples at a time"
+        fewer = "--chunk SAMPLES  reads fewer samples at a time"
+        what, advice = ("a chunk", fewer) if chunk else ("it", "split it, or do not compress it")
         why = f"{what} unpacks to {size / 1e9:.1f} GB, more than {most / 1e9:.1f} GB"
         raise unreadable(path, why, advice=advice)
