@@ -27,6 +27,9 @@ TAGS: Mapping[str, str] = MappingProxyType(
         "product": "`x in [lo, hi]` has the robustness `(x - lo) * (hi - x)` of the paper.",
         "id": '`@id("R1")`: what it is called elsewhere.',
         "group": "`@group(name)`: requirements that belong together.",
+        "hold": "`@hold signal x`: the last value holds; `@hold(0.5 s)`: unknown when it is older.",
+        "linear": "`@linear signal x`: between its samples on the line.",
+        "angle": "`@angle signal x`: between its samples on the shorter arc.",
     }
 )
 

@@ -57,7 +57,8 @@ def test_the_unit_of_the_file(write):
 
 
 def test_tags(write):
-    assert offers(write, "@│") == ["@group", "@id", "@liveness", "@product", "@safety", "@scale", "@weight"]
+    of_requirements = ["@group", "@id", "@liveness", "@product", "@safety", "@scale", "@weight"]
+    assert offers(write, "@│") == sorted(["@angle", "@hold", "@linear", *of_requirements])
     assert "@safety" in offers(write, "@sa│")
 
 

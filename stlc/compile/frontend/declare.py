@@ -20,9 +20,10 @@ from stlc.compile.frontend.scope import (
     Scope,
     Sort,
     column_entries,
+    column_value,
     member_entries,
 )
-from stlc.compile.frontend.tags import refuse_tags
+from stlc.compile.frontend.tags import refuse_tags, require_between
 from stlc.compile.frontend.values import Number, TimeExpr, Value, VectorValue
 from stlc.compile.ir.functions import FUNCTIONS, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Label
@@ -136,7 +137,7 @@ def _absent_function(item: ast.Extern, interface: Interface) -> Diagnostic:
 
 Labels = tuple[tuple[str, float], ...]
 
-MAX_COMPONENTS = 1000
+MAX_COMPONENTS = 4096
 _KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 
@@ -395,7 +396,10 @@ def declare(
     for item in spec.items:
         if isinstance(item, ast.Enum | ast.Require | ast.Assume):
             continue
-        refuse_tags(item.tags, f"a `{_keyword(item)}`", scope)
+        if isinstance(item, ast.Signal):
+            require_between(item.tags, scope)
+        else:
+            refuse_tags(item.tags, f"a `{_keyword(item)}`", scope)
         if item.name in found.entries:
             continue
         try:
@@ -481,7 +485,10 @@ class _EntryBuilder:
         about = role + _about(item)
         if self.interface is not None and columns[0].name in self.interface.signature:
             about += f"; also a state of {self.interface.where}"
-        (entry,) = column_entries(columns, about=about, span=item.name_span).values()
+        if item.type is None or item.type.size is None:  # a number, also where its column is called `q[0]`
+            entry = Known(column_value(columns[0]), about, item.name_span)
+        else:
+            (entry,) = column_entries(columns, about=about, span=item.name_span).values()
         return replace(entry, value=_read_in(entry.value, unit)) if unit.text else entry
 
     def parameter(self, item: ast.Param) -> Entry:

@@ -21,6 +21,7 @@ from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column
 from stlc.source import Span
+from stlc.units import SYMBOLS, same_dims, written_unit
 
 
 def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
@@ -125,6 +126,40 @@ def read_tags(tags: Sequence[ast.Tag], scope: Scope) -> Tags:
         except Failed:
             continue
     return found
+
+
+BETWEEN = ("hold", "linear", "angle")
+"""Tags of signals: their values between recorded samples."""
+
+
+def age_of(tag: ast.Tag) -> float | None:
+    """Return the age in seconds after which a held value is unknown, as in `@hold(0.5 s)`; None: never.
+
+    Raises:
+        ValueError: the argument is no time above 0, or the tag takes none.
+    """
+    if not tag.args:
+        return None
+    age = tag.args[0].value
+    if tag.name == "hold" and len(tag.args) == 1 and isinstance(age, ast.Quantity) and age.unit:
+        unit = written_unit(age.unit)
+        if same_dims(unit, SYMBOLS["s"]) and age.value > 0:
+            return float(age.value) * unit.scale
+    raise ValueError(f"`@{tag.name}` does not take this argument")
+
+
+def require_between(tags: Sequence[ast.Tag], scope: Scope) -> None:
+    """Report the error E501 for tags of a signal other than `BETWEEN`, and for wrong arguments of these."""
+    refuse_tags([tag for tag in tags if tag.name not in BETWEEN], "a `signal`", scope)
+    found = [tag for tag in tags if tag.name in BETWEEN]
+    for tag in found[1:]:
+        scope.report(Diagnostic("E501", "a signal has one value between its samples", tag.span))
+    for tag in found:
+        try:
+            age_of(tag)
+        except ValueError as error:
+            help_ = ("@hold(0.5 s)  says after which time a value is unknown",)
+            scope.report(Diagnostic("E501", str(error), tag.span, help=help_))
 
 
 def refuse_tags(tags: Sequence[ast.Tag], what: str, scope: Scope) -> None:

@@ -483,7 +483,7 @@ def _values(column: Column, arrays: Mapping[str, np.ndarray], recording: Recordi
         values = whole[..., component] if component < whole.shape[-1] else None
     if values is None or values.dtype.kind not in "biuf":
         return None
-    stored = recording.columns.get(name) or recording.columns.get(base)
-    change = None if stored is None else conversion(recording.name, column, stored.unit)
+    stored = recording.column(base if name not in arrays else name)
+    change = conversion(recording.name, column, stored.unit)
     numbers = values.astype(np.float64).ravel()
     return numbers if change is None else change(numbers)
