@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stlc.compile.frontend.interface import Interface
+from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.traverse import nodes
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import find_system
 from stlc.grammar import ast
@@ -38,11 +41,6 @@ class Times:
         step = self if self.dt is not None else other
         return Times(step.dt, self.horizon if self.horizon is not None else other.horizon, step.trace)
 
-    @property
-    def complete(self) -> bool:
-        """True if time step and horizon are known."""
-        return self.dt is not None and self.horizon is not None
-
     def grid(self) -> Grid:
         """Return the time grid, with the horizon in steps.
 
@@ -57,29 +55,20 @@ class Times:
         if abs(steps - whole) > _SLACK * max(whole, 1):
             horizon, dt = float(self.horizon), float(self.dt)
             if self.trace:
+                least = math.ceil(horizon / dt)
+                counts = range(least, least + 1000)  # the step in the help has four digits, if one fits
+                fits = (n for n in counts if math.isclose(float(f"{horizon / n:.4g}") * n, horizon))
+                finer = f"--resample {horizon / next(fits, least):.6g}s"
+                help_ = (f"{finer}  puts the signals on a grid of which T is a whole number of steps",)
                 message = f"`{self.trace}` has dt {dt:g} s, and T = {horizon:g} s is no whole number of steps"
-                raise TraceError(Diagnostic("E602", message, help=(_dividing(horizon, dt),)))
+                raise TraceError(Diagnostic("E602", message, help=help_))
             message = f"the horizon {horizon:g} s is not a whole number of steps of {dt:g} s"
             raise UsageError(Diagnostic("U101", message))
         return Grid(self.dt, whole)
 
 
-def _dividing(horizon: float, dt: float) -> str:
-    """Help text that proposes a time step that fits into the horizon a whole number of times.
-
-    `horizon` and `dt` are in seconds. The proposed step has four digits and is at most `dt`.
-    """
-    least = math.ceil(horizon / dt)
-    short = (n for n in range(least, least + 1000) if math.isclose(float(f"{horizon / n:.4g}") * n, horizon))
-    step = horizon / next(short, least)
-    return f"--resample {step:.6g}s  puts the signals on a grid of which T is a whole number of steps"
-
-
 def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -> Times:
-    """Convert `dt` and `horizon`, in seconds, to exact times.
-
-    Raises UsageError (U101) if either of them is not positive.
-    """
+    """Exact times of `dt` and `horizon` in seconds. Raises UsageError (U101) if one is not positive."""
     for name, value in (("dt", dt), ("horizon", horizon)):
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(Diagnostic("U101", f"{name} is a time in seconds above 0, not {value}"))
@@ -96,8 +85,7 @@ def _declared(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
     """Return what the system file `name` declares: time step and horizon, and signals and functions.
 
-    `spec` is the specification; its location is used to find the file. `overrides` maps the names of
-    constants to their new values, as text.
+    The file is searched for beside the specification. `overrides`: name of a constant -> its value, as text.
 
     Raises:
         UsageError: U102, there is no such file.
@@ -110,10 +98,9 @@ def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 
 
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
-    """Return time step and horizon of the system that the specification `spec` names.
+    """Time step and horizon of the system that a specification names; None without one or without its file.
 
-    None if it names no system, or if the system file is not found. `overrides` maps the names of constants to
-    their new values, as text.
+    `overrides`: name of a constant -> its value, as text.
     """
     if spec.system is None:
         return None
@@ -124,14 +111,37 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
     return _declared(spec.system, spec, overrides)[0]
 
 
-def recorded_times(trace: Trace, given: Times) -> Times:
-    """Return the time step and the horizon of a trace.
+def require_windows(trace: Trace, rules: Sequence[CompiledRequirement]) -> None:
+    """Raise TraceError (E602) if a window is shorter than a step of the trace, and so checks nothing."""
+    for rule in rules:
+        for node in nodes(rule.typed.formula):
+            if not isinstance(node, (typed.Temporal, typed.Until)) or node.interval.hi is None:
+                continue
+            last, length = node.interval.hi, float(node.interval.hi.seconds)
+            if last.steps or last.horizons or not 0.0 < length < trace.dt * (1.0 - _SLACK):
+                continue
+            name = next((clock.name for clock in trace.clocks), "t")
+            scales = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+            unit = next((unit for unit, scale in scales.items() if trace.dt * scale <= length), "ms")
+            message = (
+                f"`{trace.name}` has a sample every {trace.dt:.6g} s by its clock `{name}`, "
+                f"and a window of {length:.6g} s has none but its first"
+            )
+            help_ = (
+                f"--clock {name}:{unit}  if the clock is in {unit}, not in seconds",
+                f"--resample {length / 10:.3g}s  judges on a finer grid",
+            )
+            span = node.interval.span or last.span or rule.span
+            raise TraceError(Diagnostic("E602", message, span, help=help_))
 
-    Raises TraceError (E602) if the time step of the trace differs from the time step in `given`.
+
+def agreed_times(name: str, step: float, horizon: int | None, given: Times) -> Times:
+    """Times of recorded signals, from their time step in seconds and their horizon in steps.
+
+    Raises TraceError (E602) if the time step differs from that in `given`.
     """
-    dt = as_fraction(trace.dt)
+    dt = as_fraction(step)
     if given.dt is not None and abs(given.dt - dt) > Fraction(1, 1000) * dt:
-        message = f"`{trace.name}` has dt {float(dt):g} s, the monitor was told {float(given.dt):g} s"
+        message = f"`{name}` has dt {float(dt):g} s, the monitor was told {float(given.dt):g} s"
         raise TraceError(Diagnostic("E602", message))
-    horizon = trace.meta.horizon
-    return Times(dt, None if horizon is None else horizon * dt, trace.name)
+    return Times(dt, None if horizon is None else horizon * dt, name)

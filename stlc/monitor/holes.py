@@ -36,10 +36,9 @@ def holes_in(env: Mapping[str, Floats]) -> Names:
 
 
 def without_holes(env: Mapping[str, Floats], holes: Iterable[str]) -> dict[str, Floats]:
-    """Return the signals without NaN, and one additional signal per name in `holes`.
+    """Return the signals with some number for NaN, and for each of `holes` a signal that marks them.
 
-    Every NaN is replaced by some number. The additional signal marks where this was done: it is 1 at known
-    samples and -1 at unknown samples. All arrays are (samples, batch).
+    It is 1 at known and -1 at unknown samples. All arrays are (samples, batch).
     """
     filled = dict(env)
     for name in holes:
@@ -62,8 +61,7 @@ def unsure(formula: ir.Formula, holes: Names, *, least: bool, computed: bool = T
 
     Args:
         formula: in negation normal form (negations occur only in predicates).
-        holes: names of the signals with unknown values. A `freeze` may store such a signal under a name; this
-            name then also counts as a signal with unknown values.
+        holes: names of the signals with unknown values; names under which a `freeze` stores them are added.
         least: True for the lower bound, False for the upper bound.
         computed: whether NaN that a function gives outside of its domain is unknown too.
     """
@@ -71,36 +69,32 @@ def unsure(formula: ir.Formula, holes: Names, *, least: bool, computed: bool = T
 
 
 def _unsure(formula: ir.Formula, holes: Names, nans: Names | None, *, least: bool) -> ir.Formula:
-    """Return the bound that `unsure` returns.
-
-    `nans` are the names under which an enclosing `freeze` stores a number that may be NaN; None if computed
-    NaN does not count as unknown.
-    """
+    """`nans` are the frozen values that may be NaN; None if computed NaN does not count as unknown."""
     match formula:
         case ir.Predicate(num=num):
-            return _guarded(_decided(formula, nans, least=least), _known(num, holes), least=least)
+            atom, known = _decided(formula, nans, least=least), _known(num, holes)
+            if known is None:
+                return atom
+            # outside of the trace the guard equals the predicate: false before a negation if windows are cut
+            guard = known if least is (atom.sign > 0) else ir.Op("neg", (known,))
+            test = ir.Predicate(guard, sign=atom.sign, guard=True)
+            return ir.BoolOp("and" if least else "or", (atom, test))
         case ir.Freeze(bindings=bindings, body=body):
-            known = {name: found for name, num in bindings if (found := _known(num, holes)) is not None}
+            tests = {name: found for name, num in bindings if (found := _known(num, holes)) is not None}
             bound = frozenset(name for name, _ in bindings)
             if nans is not None:
                 lost = frozenset(name for name, num in bindings if _is_partial(num, nans))
                 bindings = tuple((name, _with_nan(num, nans)) for name, num in bindings)
                 nans = (nans - bound) | lost
-            inner = _unsure(body, (holes - bound) | frozenset(known), nans, least=least)
-            more = tuple((KNOWN + name, num) for name, num in known.items())
+            inner = _unsure(body, (holes - bound) | frozenset(tests), nans, least=least)
+            more = tuple((KNOWN + name, num) for name, num in tests.items())
             return replace(formula, bindings=(*bindings, *more), body=inner)
         case _:
             return map_children(formula, formulas=lambda part: _unsure(part, holes, nans, least=least))
 
 
-# ------------------------------------------------------------------------- unknown samples
-
-
 def _known(num: ir.Num, holes: Names) -> ir.Num | None:
-    """Return an expression that is 1 where all signals in `num` are known, else -1.
-
-    None is returned if `num` reads no signal in `holes`, because `num` is then known everywhere.
-    """
+    """An expression that is 1 where all signals in `num` are known, else -1; None if they all are."""
     found = dict.fromkeys(
         replace(leaf, name=KNOWN + leaf.name)
         for leaf in leaves(num)
@@ -111,24 +105,8 @@ def _known(num: ir.Num, holes: Names) -> ir.Num | None:
     return next(iter(found)) if len(found) == 1 else ir.Op("min", tuple(found))
 
 
-def _guarded(atom: ir.Predicate, known: ir.Num | None, *, least: bool) -> ir.Formula:
-    if known is None:
-        return atom
-    # outside of the trace the guard equals the predicate: false before a negation where windows are cut
-    test = ir.Predicate(
-        known if least is (atom.sign > 0) else ir.Op("neg", (known,)), sign=atom.sign, guard=True
-    )
-    return ir.BoolOp("and" if least else "or", (atom, test))
-
-
-# ------------------------------------------------------------------------- computed NaN
-
-
 def _is_partial(num: ir.Num, nans: Names) -> bool:
-    """True if a number may be NaN, or depend on NaN, although the signals that it reads are known.
-
-    `nans` are the names of frozen values that may be NaN.
-    """
+    """True if a number may depend on NaN although its signals are known; `nans` are such frozen values."""
     return any(
         (isinstance(part, ir.Op) and not has_value(part))
         or (isinstance(part, ir.FrozenVar) and part.name in nans)
@@ -138,7 +116,7 @@ def _is_partial(num: ir.Num, nans: Names) -> bool:
 
 
 def _returns_nan(call: ir.Extern) -> bool:
-    """True if a function of the system may return NaN; that of a Python function is not known."""
+    """True if a function of the system may return NaN, as any Python function may."""
     body = call.function
     if not isinstance(body, ir.Body):
         return True
@@ -162,8 +140,7 @@ def _is_number(num: ir.Num) -> ir.Formula:
 def _with_nan(num: ir.Num, nans: Names) -> ir.Num:
     """Return the number with NaN wherever it depends on NaN.
 
-    A condition on NaN is false, and so a number with conditions (`if`, `ind`) may have a value where it has
-    none. Arguments of functions of the system are treated alike.
+    Conditions (`if`, `ind`), false on NaN, and functions of the system would give a value there.
     """
     if not _is_partial(num, nans):
         return num
@@ -172,17 +149,14 @@ def _with_nan(num: ir.Num, nans: Names) -> ir.Num:
         case ir.Where(cond, yes, no):
             return _chosen(cond, yes, no, nans)
         case ir.Indicator(cond):
-            return _chosen(cond, ir.Const(1.0), ir.Const(0.0), nans) if _tests_nan(cond, nans) else num
+            lost = any(_is_partial(part, nans) for part in numbers(cond))
+            return _chosen(cond, ir.Const(1.0), ir.Const(0.0), nans) if lost else num
         case ir.Extern(args=args):
             for arg in args:
                 num = ir.Where(_is_number(arg), num, _NAN) if _is_partial(arg, nans) else num
             return num
         case _:
             return num
-
-
-def _tests_nan(cond: ir.Formula, nans: Names) -> bool:
-    return any(_is_partial(num, nans) for num in numbers(cond))
 
 
 def _chosen(cond: ir.Formula, yes: ir.Num, no: ir.Num, nans: Names) -> ir.Num:

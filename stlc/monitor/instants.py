@@ -26,37 +26,28 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 At: TypeAlias = int | Literal["all"] | None
-"""A sample; every start at which the requirement has a value; or the instants of the requirement itself."""
+"""A sample; every sample with a complete window; or the instants that the requirement prescribes."""
 
 
 def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: At) -> range:
     """Return the instants at which a requirement is evaluated on a trace of `samples` samples.
 
-    `at` is the number of one sample, or "all" for every sample with a complete window, or None for the
-    instants that the requirement prescribes. `horizon` is the length of a planning window in steps.
-
-    Raises:
-        UsageError: U101, `at` is not a sample of the trace.
+    `horizon` is the planning window in steps. Raises UsageError (U101) if `at` is no sample of the trace.
     """
     if isinstance(at, int):
         if not 0 <= at < samples:
             message = f"there is no sample {at}: the trace has {samples}, counted from 0"
             raise UsageError(Diagnostic("U101", message))
         return range(at, at + 1)
-    if rule.absolute:
-        return range(1)
-    if rule.windowed and horizon is not None:
+    if rule.windowed and horizon is not None and not rule.absolute:
         return range(max(samples - horizon, 1))
-    if at == "all":
-        return range(max(samples - rule.reach, 1))
-    return range(1)
+    return range(max(samples - rule.reach, 1) if at == "all" and not rule.absolute else 1)
 
 
 def window_of(rule: CompiledRequirement, horizon: int | None) -> int | None:
     """Number of samples from an instant to `end`, the end of the planning window that begins there.
 
-    None if the formula does not mention `end`, or if the requirement is not evaluated for every planning
-    window.
+    None if the formula does not mention `end`, or if not every planning window is evaluated.
     """
     return horizon if rule.windowed and rule.uses_end and not rule.absolute else None
 
@@ -66,22 +57,21 @@ def rule_bounds(
 ) -> tuple[Array, Array]:
     """Lower and upper bounds on the robustness at the instants `starts`, each `(count, batch)`.
 
-    The bounds hold for all values that unknown samples may have. If nothing is unknown, the same array is
-    returned twice. `horizon` is the length of a planning window in steps. `ends` is the treatment of windows
-    that extend beyond the trace: "open" leaves the missing samples unknown, "truncate" clips the windows.
+    The bounds hold for all values of unknown samples; if nothing is unknown, they are the same array.
+    `horizon` is the length of a planning window in steps. In windows that extend beyond the trace, samples
+    are unknown (`ends` is "open"), or the windows are clipped ("truncate").
     """
-    window = window_of(rule, horizon)
+    formula, window = rule.under(record.semantics), window_of(rule, horizon)
     if window is None:
-        return bounds(rule.under(record.semantics), record, starts, ends)
-    return window_bounds(rule.under(record.semantics), record, starts, window, ends)
+        return bounds(formula, record, starts, ends)
+    return window_bounds(formula, record, starts, window, ends)
 
 
 def rule_known(
     rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
 ) -> NDArray[np.bool_]:
-    """Return for each instant in `starts` whether its value is exact: booleans, (count,).
+    """Whether the value at each instant depends on no sample after the `samples` ones of the trace, (count,).
 
-    The trace has `samples` samples. A value is exact if it depends on no samples after the end of the trace.
     `horizon` is the length of a planning window in steps.
     """
     window = window_of(rule, horizon)
@@ -95,12 +85,11 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
     """Return the robustness at every sample, `(samples, batch)`.
 
     `end` is the treatment of windows that extend beyond the trace: "strict" gives NaN, "truncate" clips them,
-    "lower" and "upper" give a bound. Unknown samples inside the trace have the same effect: NaN, or the bound
-    if `end` is "lower" or "upper". A requirement with absolute operators (`always@[a, b]`) has the same value
-    at all samples.
+    "lower" and "upper" give a bound. Unknown samples inside the trace have the same effect: NaN or the bound.
+    A requirement with absolute operators (`always@[a, b]`) has the same value at all samples.
     """
     sides = _sides(rule, record)
-    if sides is not None:
+    if sides:
         least, most = (rule_signal(each, record.sure, horizon, end) for each in sides)
         return _agreed(least, most, record, end)
     if rule.absolute:
@@ -113,11 +102,7 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
 
 
 def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: Boundary) -> Array:
-    """Compute `rule_signal` for a requirement that mentions `end`, the last sample of a planning window.
-
-    The planning window of an instant ends `window` samples after it. If the argument `end` is "strict",
-    values are NaN where the planning window extends beyond the trace.
-    """
+    """`rule_signal` of a requirement that mentions `end`, which is `window` samples after each instant."""
     whole = max(record.samples - window, 0)
     starts = range(whole if end == "strict" else record.samples)
     ends: Ends = "truncate" if end == "truncate" else "open"
@@ -126,9 +111,13 @@ def _window_signal(rule: CompiledRequirement, record: Record, window: int, end: 
         low, high = window_bounds(rule.under(record.semantics), record, starts, window, ends)
         parts.append(high if end == "upper" else low)
     if len(starts) < record.samples:
-        like = next(iter(record.env.values()))
-        parts.append(record.ops.full((record.samples - len(starts), like.shape[1]), math.nan, like))
+        parts.append(_nan(record, record.samples - len(starts)))
     return record.ops.cat(parts)
+
+
+def _nan(record: Record, count: int) -> Array:
+    like = next(iter(record.env.values()))
+    return record.ops.full((count, like.shape[1]), math.nan, like)
 
 
 def rules_at(
@@ -136,46 +125,33 @@ def rules_at(
 ) -> list[Array]:
     """Robustness of several requirements at sample `at`, `(1, batch)` each.
 
-    `end` is the treatment of windows that extend beyond the trace, as in `rule_signal`. `horizon` is the
-    length of a planning window in steps.
+    `end` is that of `rule_signal`; `horizon` is the length of a planning window in steps.
     """
     sides = [_sides(rule, record) for rule in rules]
     if any(sides):
-        pairs = [side for side in sides if side is not None]
-        others = [rule for rule, side in zip(rules, sides, strict=True) if side is None]
-        least, most, known = (
-            iter(rules_at(each, record.sure, at, horizon, end))
-            for each in (*zip(*pairs, strict=True), others)
-        )
-        return [
-            next(known) if side is None else _agreed(next(least), next(most), record, end) for side in sides
-        ]
-    starts_of_all = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at) for rule in rules]
-    formulas = [rule.under(record.semantics) for rule in rules]
+        known = [each for rule, pair in zip(rules, sides, strict=True) for each in pair or (rule,)]
+        rows = iter(rules_at(known, record.sure, at, horizon, end))
+        return [_agreed(next(rows), next(rows), record, end) if pair else next(rows) for pair in sides]
+    starts = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at).start for rule in rules]
     together = [
-        formula
-        for rule, formula, starts in zip(rules, formulas, starts_of_all, strict=True)
-        if starts.start == at and window_of(rule, horizon) is None and _has_value(rule, record, at, end)
+        rule.under(record.semantics)
+        for rule, start in zip(rules, starts, strict=True)
+        if start == at and window_of(rule, horizon) is None and _has_value(rule, record, at, end)
     ]
     here = range(at, at + 1)
     values = dict(zip(together, record.values(together, here, end), strict=True)) if together else {}
+    found = [values.get(rule.under(record.semantics)) for rule in rules]
     return [
-        values[formula] if formula in values else _alone(rule, record, starts.start, horizon, end)
-        for rule, formula, starts in zip(rules, formulas, starts_of_all, strict=True)
+        _alone(rule, record, start, horizon, end) if row is None else row
+        for rule, start, row in zip(rules, starts, found, strict=True)
     ]
 
 
-def _sides(
-    rule: CompiledRequirement, record: Record
-) -> tuple[CompiledRequirement, CompiledRequirement] | None:
-    """Return two copies of a requirement, for a lower and an upper bound on its robustness.
-
-    The bounds hold for all unknown values. None is returned if no value that the requirement reads can be
-    unknown.
-    """
+def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, ...]:
+    """Requirements for a lower and an upper bound; none if nothing that `rule` reads can be unknown."""
     least, most = record.sides(rule.under(record.semantics))
     if least is most:
-        return None
+        return ()
     return replace(rule, formula=least, lowered=least), replace(rule, formula=most, lowered=most)
 
 
@@ -195,8 +171,7 @@ def _alone(rule: CompiledRequirement, record: Record, at: int, horizon: int | No
     inner = record if stop is None else record.cut(stop)
     whole = stop is None or stop <= record.samples
     if end == "strict" and not (whole and _has_value(rule, inner, at, end)):
-        like = next(iter(record.env.values()))
-        return record.ops.full((1, like.shape[1]), math.nan, like)
+        return _nan(record, 1)
     going_on = not whole and end in ("lower", "upper")
     formula = rule.under(record.semantics)
     return inner.values([formula], range(at, at + 1), end, stop if going_on else None)[0]
@@ -210,12 +185,7 @@ def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: G
         return None
     unit, step = ("samples", 1.0) if grid.dt is None else ("s", float(grid.dt))
     needed, length = (starts.stop - 1 + max(rule.reach, window)) * step, (samples - 1) * step
-    return Diagnostic(
-        "E306",
-        f"this needs {needed:.6g} {unit} of signal; the trace has {length:.6g} {unit}",
-        rule.typed.written.span,
-        help=(
-            f"record {needed - length:.6g} {unit} more, or shorten the intervals",
-            "`--end truncate` evaluates on what there is",
-        ),
-    )
+    more = f"record {needed - length:.6g} {unit} more, or shorten the intervals"
+    help_ = (more, "`--end truncate` evaluates on what there is")
+    message = f"this needs {needed:.6g} {unit} of signal; the trace has {length:.6g} {unit}"
+    return Diagnostic("E306", message, rule.typed.written.span, help=help_)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
@@ -10,16 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir.support import columns
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.signals import Gap, Signals
 from stlc.monitor.values import Record
 from stlc.registry import closest
+from stlc.trace.resample import TimeRange
 
 Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
+
+_ROUNDING = 1e-6
+"""Share of a step by which times may be off the grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +65,65 @@ class Prepared:
 
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; the sample number if the time step is unknown."""
+        if self.signals.times is not None and 0 <= sample < len(self.signals.times):
+            return float(self.signals.times[sample])
         return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
+
+    @property
+    def whole(self) -> TimeRange | None:
+        """Time in which any signal was seen, if signals were seen at different times."""
+        spans = self.signals.spans.values()
+        if self.signals.dt is None or not spans or not self.signals.samples:
+            return None
+        first = min(span.first for span in spans)
+        return TimeRange(first, max(max(span.last for span in spans), first))
+
+    def seen(self, rule: CompiledRequirement) -> TimeRange | None:
+        """Time in which all signals of a requirement were seen (E602 without one); None if it is `whole`."""
+        whole = found = self.whole
+        if whole is None or found is None or rule.absolute:
+            return None
+        spans = {name: span for name, span in self.signals.spans.items() if name in columns(rule.formula)}
+        for span in spans.values():
+            found = found.within(span)
+        if found.last < found.first:
+            told = [
+                f"`{name}` is "
+                + (f"seen from {x.first:.6g} s to {x.last:.6g} s" if x.first <= x.last else "never seen")
+                for name, x in spans.items()
+            ]
+            message = f"the signals of `{rule.name}` in `{self.signals.name}` have no time in common"
+            raise TraceError(Diagnostic("E602", message, rule.span, note=("; ".join(told),)))
+        return None if found == whole else found
+
+    def part(self, rule: CompiledRequirement) -> Part:
+        """Return the samples on which a requirement is judged: those at which its signals were seen."""
+        seen, samples, dt = self.seen(rule), self.signals.samples, self.signals.dt
+        if seen is None or dt is None:
+            return Part(0, self.record.samples)
+        first = math.ceil((seen.first - self.signals.t0) / dt - _ROUNDING)
+        stop = math.floor((seen.last - self.signals.t0) / dt + _ROUNDING) + 1
+        stop = max(min(stop, samples), min(first, samples - 1) + 1)
+        return Part(min(max(first, 0), samples - 1), stop, seen)
 
     def moment(self, sample: int) -> str:
         """Time of a sample as text: `t = 4.6 s`, or `sample 46` if the time step is unknown."""
         return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Samples of a trace on which a requirement is judged.
+
+    Attributes:
+        first: index of the first one.
+        stop: index after the last one.
+        seen: time in which all signals of the requirement were seen; None if that is the whole recording.
+    """
+
+    first: int
+    stop: int
+    seen: TimeRange | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +132,16 @@ class Judgement:
 
     Attributes:
         rule: the requirement.
-        start: the first sample at which the requirement is evaluated. Row i of `low` belongs to sample
-            `start` + i.
+        start: the first sample at which the requirement is evaluated, that of the first row of `low`.
         low: least robustness over all continuations of the traces, (instants, traces).
         high: greatest robustness; the same array as `low` if nothing is unknown.
         holds: whether the requirement is certainly satisfied, (instants, traces).
         fails: whether the requirement is certainly violated, (instants, traces).
         shape: axes of the signals before their time axis; () for a single trace.
-        scope: True for traces that satisfy the assumptions, (traces,); None if all traces do. Traces that
-            violate the assumptions do not affect verdicts over all traces.
-        reported: `low` and `high` in the semantics (definition of min and max) that the caller requested;
-            None if the caller requested the exact semantics.
+        scope: True for traces that satisfy the assumptions, (traces,); None if all do. The others do not
+            affect verdicts over all traces.
+        reported: `low` and `high` in the requested semantics (definition of min and max); None: the exact.
+        part: the samples on which the requirement is judged; None for all.
     """
 
     rule: CompiledRequirement
@@ -94,13 +153,11 @@ class Judgement:
     shape: tuple[int, ...]
     scope: Bools | None = field(default=None, repr=False)
     reported: tuple[Floats, Floats] | None = field(default=None, repr=False)
+    part: Part | None = None
 
     @property
     def margins(self) -> tuple[Floats, Floats]:
-        """Least and greatest robustness, each (instants, traces).
-
-        They are computed in the semantics (definition of min and max) that the caller requested.
-        """
+        """Least and greatest robustness in the requested semantics, each (instants, traces)."""
         return (self.low, self.high) if self.reported is None else self.reported
 
     @property
@@ -133,10 +190,7 @@ class Judgement:
 
     @property
     def overall(self) -> Status:
-        """Status over all traces that satisfy the assumptions.
-
-        It is violated if any trace violates the requirement, satisfied if all satisfy it, else inconclusive.
-        """
+        """Status over traces in scope: violated if any is, satisfied if all are, else inconclusive."""
         holds = self.counted(self.holds)
         return _status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
@@ -147,10 +201,7 @@ class Judgement:
 
     @property
     def bounds(self) -> tuple[Any, Any]:
-        """Lower and upper bound on the least robustness over the evaluated instants.
-
-        The bounds hold for all continuations of the trace. They are floats, or arrays for a batch of traces.
-        """
+        """Bounds on `robustness` over all continuations of the trace: floats, or arrays for a batch."""
         low, high = self.margins
         return _shaped(low.min(axis=0), self.shape), _shaped(high.min(axis=0), self.shape)
 
@@ -158,8 +209,8 @@ class Judgement:
     def robustness(self) -> Any:
         """The least robustness over the evaluated instants: a float, or an array for a batch of traces.
 
-        If a trace is too short for an exact value, the lower bound is returned for a satisfied requirement,
-        the upper bound for a violated one, and NaN if the verdict is inconclusive.
+        If a trace is too short for an exact value, it is the lower bound if the requirement is satisfied, the
+        upper bound if it is violated, else NaN.
         """
         return _shaped(self.least, self.shape)
 
@@ -168,8 +219,7 @@ class Judgement:
         """Array (traces,) of the values that `robustness` returns."""
         low, high = (end.min(axis=0) for end in self.margins)
         known = np.where(self.holds.all(axis=0), low, np.nan)
-        known = np.where(self.fails.any(axis=0), high, known)
-        return np.where(low == high, low, known)
+        return np.where(low == high, low, np.where(self.fails.any(axis=0), high, known))
 
     @property
     def share(self) -> float:
@@ -184,11 +234,7 @@ class Judgement:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Return (trace, sample): the index of the trace, and the sample at which its robustness is least.
-
-        If the requirement is violated, the upper bounds on the robustness (`high`) are compared. Otherwise
-        the lower bounds (`low`) are compared.
-        """
+        """Trace and sample with the least `high` if the requirement is violated, else the least `low`."""
         values = self.high if self.counted(self.fails).any() else self.low
         if self.scope is not None and self.scope.any():
             values = np.where(self.scope, values, np.inf)
@@ -230,17 +276,16 @@ class Verdict:
 
     @property
     def statuses(self) -> list[Status]:
-        """Status of each trace: `violated`, `satisfied`, `inconclusive` or `out of scope`.
+        """Status of each trace: `violated` if it violates any requirement, `satisfied` if it satisfies all.
 
-        A trace that violates the assumptions is out of scope. Any other trace is violated if it violates any
-        requirement, satisfied if it satisfies all of them, and else inconclusive.
+        Else it is `inconclusive`; `out of scope` if it violates the assumptions.
         """
-        rows = [judgement.statuses for judgement in self.requirements]
+        rows = zip(*(judgement.statuses for judgement in self.requirements), strict=True)
         return [
             "out of scope"
-            if "out of scope" in column
-            else _status("violated" in column, {*column} <= {"satisfied"})
-            for column in zip(*rows, strict=True)
+            if "out of scope" in found
+            else _status("violated" in found, found <= {"satisfied"})
+            for found in map(set, rows)
         ]
 
     @property
@@ -249,10 +294,7 @@ class Verdict:
         return _shaped(np.array(self.statuses), self.shape)
 
     def within(self, scope: Bools) -> Verdict:
-        """Return a copy of the verdict that counts only the traces that satisfy the assumptions.
-
-        The array `scope`, (traces,), is True for these traces.
-        """
+        """Return a verdict that counts only traces in `scope`, (traces,), which satisfy the assumptions."""
         if scope.all():
             return self
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
@@ -265,10 +307,7 @@ class Verdict:
 
     @property
     def overall(self) -> Status:
-        """Status over all requirements and all traces that satisfy the assumptions.
-
-        It is violated if any requirement is violated, satisfied if all are satisfied, else inconclusive.
-        """
+        """Status over traces in scope: violated if a requirement is, satisfied if all, else inconclusive."""
         found = {judgement.overall for judgement in self.requirements}
         return _status("violated" in found, found <= {"satisfied"})
 
@@ -285,40 +324,26 @@ class Verdict:
 
     @property
     def share(self) -> float:
-        """Share of the instants of all traces at which all requirements certainly hold.
-
-        If a requirement is evaluated only once, its verdict counts at every instant.
-        """
-        most = self._most_instants
-        return self._mean(np.logical_and.reduce([self._spread(j, j.holds, most) for j in self.requirements]))
+        """Share of instants at which all requirements certainly hold; one evaluated once counts at each."""
+        return self._share([judgement.holds for judgement in self.requirements], np.all)
 
     @property
     def failed_share(self) -> float:
         """Share of the instants of all traces at which at least one requirement is certainly violated."""
-        most = self._most_instants
-        return self._mean(np.logical_or.reduce([self._spread(j, j.fails, most) for j in self.requirements]))
+        return self._share([judgement.fails for judgement in self.requirements], np.any)
 
-    @property
-    def _most_instants(self) -> int:
-        """Greatest number of instants at which any of the requirements is evaluated."""
-        return max(judgement.instants for judgement in self.requirements)
+    def _share(self, truths: Sequence[Bools], join: Callable[..., Bools]) -> float:
+        """Share of the instants at which all, or any, of `truths`, each (instants, traces), are true.
 
-    def _mean(self, truth: Bools) -> float:
-        counted = self.requirements[0].counted(truth)
-        return float(counted.mean()) if counted.size else 0.0
-
-    def _spread(self, judgement: Judgement, truth: Bools, most: int) -> Bools:
-        """Return the truth values of a judgement at `most` instants, (most, traces).
-
-        `truth` is `judgement.holds` or `judgement.fails`. If the judgement has `most` instants, `truth` is
-        returned unchanged. Otherwise one truth value per trace is repeated `most` times. For `holds`, this
-        value is True if the requirement holds at all of its own instants. For `fails`, this value is True if
-        the requirement fails at any of them.
+        Fewer truth values than the others have are joined to one per trace, which counts at every instant.
         """
-        if judgement.instants == most:
-            return truth
-        once = truth.all(axis=0) if truth is judgement.holds else truth.any(axis=0)
-        return np.broadcast_to(once, (most, self.traces))
+        most = max(map(len, truths))
+        spread = [
+            truth if len(truth) == most else np.broadcast_to(join(truth, axis=0), (most, self.traces))
+            for truth in truths
+        ]
+        counted = self.requirements[0].counted(join(spread, axis=0))
+        return float(counted.mean()) if counted.size else 0.0
 
     @property
     def satisfied_traces(self) -> int:
@@ -327,10 +352,7 @@ class Verdict:
 
 
 def beside(moment: str, start: str) -> str:
-    """Return the text of an instant, followed by the start of its window if that is different.
-
-    Example: `t = 4.6 s (window from 2 s)`.
-    """
+    """Text of an instant, and of the start of its window if that differs: `t = 4 s (window from 2 s)`."""
     return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"
 
 

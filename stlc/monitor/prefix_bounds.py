@@ -12,8 +12,8 @@ after the last one. Values after the last sample then do not count.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,16 +22,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, farthest
 from stlc.compile.ir.traverse import children, map_children, nodes
 
-Floats: TypeAlias = NDArray[np.float64]
-
 FAR = 1 << 40
 """More samples than any trace has."""
 
 SEEN = "@seen"
 """A column that is 1 at every sample."""
-
-_SEEN = ir.Predicate(ir.Signal(SEEN), guard=True)
-_UNSEEN = ir.Predicate(ir.Signal(SEEN), sign=-1, guard=True)
 
 
 def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
@@ -44,78 +39,33 @@ def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bo
         end: "lower" or "upper" bound.
         cut: True if the end of the trace clips all windows, False if it clips only unbounded ones.
     """
-    return _PrefixBound(end == "lower", cut).of(formula)
+    least = end == "lower"
+
+    def bound(node: ir.Formula) -> ir.Formula:
+        found = map_children(node, formulas=bound)
+        if isinstance(found, (ir.Temporal, ir.Until)):
+            clipped = cut or found.window.hi is None
+            if (found.op in ("eventually", "until")) is not least:  # an early end is not the worst case
+                return seen(found, found.window.lo) if clipped and not cut else found
+            if clipped and isinstance(found, ir.Temporal):  # only instants that exist count
+                return replace(found, body=seen(found.body))
+            if clipped and isinstance(found, ir.Until):
+                return replace(found, right=seen(found.right))
+        elif isinstance(found, ir.Shift) and cut and found.steps > 0 and found.weak is not least:
+            return replace(found, body=seen(found.body))
+        return found
+
+    def seen(node: ir.Formula, later: int = 0) -> ir.Formula:
+        """Make the bound infinite at each instant k for which sample k + `later` is missing."""
+        there = ir.Predicate(ir.Signal(SEEN), sign=1 if least else -1, guard=True)
+        return ir.BoolOp("and" if least else "or", (node, ir.Shift(later, there) if later else there))
+
+    return bound(formula)
 
 
-@dataclass(frozen=True, slots=True)
-class _PrefixBound:
-    least: bool
-    cut: bool
-
-    def of(self, formula: ir.Formula) -> ir.Formula:
-        """Return a formula whose value is a bound on `formula`, wherever the trace ends.
-
-        The trace may end with the latest sample, or later. If it ends early, some instants of a window do not
-        exist. These instants are left out if an early end is the worst case for the bound.
-        """
-        match formula:
-            case ir.Temporal(op, window, body):
-                found = self._found(body, some=op == "eventually", cut=self._cuts(window))
-                return self._begun(replace(formula, body=found), window, some=op == "eventually")
-            case ir.Until(op, window, left, right):
-                found = self._found(right, some=op == "until", cut=self._cuts(window))
-                whole = replace(formula, left=self.of(left), right=found)
-                return self._begun(whole, window, some=op == "until")
-            case ir.Shift(steps, body):
-                found = self._found(body, some=not formula.weak, cut=self.cut and steps > 0)
-                return replace(formula, body=found)
-            case _:
-                return map_children(formula, formulas=self.of)
-
-    def _cuts(self, window: ir.Window) -> bool:
-        return self.cut or window.hi is None
-
-    def _found(self, body: ir.Formula, *, some: bool, cut: bool) -> ir.Formula:
-        """Return a bound on the body of a window, wherever the trace ends.
-
-        If an early end of the trace is the worst case for the bound, only existing samples count.
-
-        Args:
-            body: the body.
-            some: True if the body must hold at some instant of the window, False if at every instant.
-            cut: whether the end of the trace clips the window.
-        """
-        inner = self.of(body)
-        return self._seen(inner, 0) if cut and some is self.least else inner
-
-    def _begun(self, formula: ir.Formula, window: ir.Window, *, some: bool) -> ir.Formula:
-        """Make the bound on an unbounded operator infinite if its window starts after the last sample.
-
-        Nothing is known in this case. `some` is True if the body must hold at some instant of the window,
-        False if at every instant. The formula is returned unchanged if an empty window has an infinite bound
-        anyway, or if the end of the trace clips all windows (`cut`).
-        """
-        if window.hi is not None or self.cut or some is self.least:
-            return formula
-        return self._seen(formula, window.lo)
-
-    def _seen(self, formula: ir.Formula, later: int) -> ir.Formula:
-        """Make the value of `formula` infinite at each instant k for which sample k + `later` is missing.
-
-        The value of `formula` is a bound. An infinite bound contains no information. The sample is missing if
-        it has not been received yet.
-        """
-        there = _SEEN if self.least else _UNSEEN
-        then = ir.Shift(later, there) if later else there
-        return ir.BoolOp("and" if self.least else "or", (formula, then))
-
-
-def with_seen(signals: Mapping[str, Floats]) -> Mapping[str, Floats]:
+def with_seen(signals: Mapping[str, NDArray[np.float64]]) -> Mapping[str, NDArray[np.float64]]:
     """Return the signals (samples, traces), and the additional signal `SEEN`, which is 1 at every sample."""
     return {**signals, SEEN: np.broadcast_to(1.0, next(iter(signals.values())).shape)}
-
-
-# ---------------------------------------------------------------- windows without an end
 
 
 def own_span(node: ir.Formula) -> Reach:

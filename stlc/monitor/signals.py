@@ -5,17 +5,21 @@ The evaluator reads each signal as a column, an array `(time, batch)`.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from itertools import islice
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.frontend.tags import BETWEEN, age_of
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns as columns_of
 from stlc.compile.ir.traverse import numbers, subexpressions
@@ -23,26 +27,23 @@ from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.escape import visible
 from stlc.grammar import ast
+from stlc.monitor.cells import Cells
+from stlc.monitor.given import UNNAMED, Given
 from stlc.registry import closest
 from stlc.signature import Column, Kind
 from stlc.source import Span
 from stlc.trace import AS_IT_IS, Reading, Trace
 from stlc.trace.enums import TRUTH, Words
-from stlc.trace.recording import conversion
-
-Given: TypeAlias = Mapping[str, Any]
-"""Signal -> array (time,) or (…, time); a vector is (…, time, k)."""
+from stlc.trace.formats.table import GROUPS
+from stlc.trace.recording import Conversion, conversion
+from stlc.trace.resample import Between, How, Moments, TimeRange
+from stlc.units import SYMBOLS, same_dims, written_unit
 
 CLOCK = "t"
 """Name under which a trace also offers its time in seconds."""
 
-UNNAMED = "the signals"
-
 _COMPONENT = re.compile(r"(?P<name>.+)\[(?P<index>\d+)\]")
 _KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
-
-
-# ------------------------------------------------------------------ signals that are read
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,28 +66,25 @@ class Need:
 def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[Need, ...]:
     """Return the signals that the requirements `rules` read, in the order of the specification.
 
-    Raises:
-        UsageError: E107, the requirements call functions that are not loaded.
+    Raises UsageError (E107) if the requirements call functions that are not loaded.
     """
     _require_functions(compiled, rules)
     read = [(rule.name, columns_of(rule.formula)) for rule in rules]
-    spans = {
-        item.name: item.name_span for item in compiled.spec.items if isinstance(item, (ast.Signal, ast.Param))
-    }
+    items = (item for item in compiled.spec.items if isinstance(item, (ast.Signal, ast.Param)))
+    spans = {item.name: item.name_span for item in items}
     parameters = {each.column.name for each in compiled.typed.parameters}
     found = []
     for column in compiled.signature.columns:
         if by := tuple(rule for rule, names in read if column.name in names):
-            base = match["name"] if (match := _COMPONENT.fullmatch(column.name)) else column.name
-            found.append(Need(column, by, spans.get(base), column.name in parameters))
+            span = spans.get(column.name.partition("[")[0])
+            found.append(Need(column, by, span, column.name in parameters))
     return tuple(found)
 
 
 def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> None:
     parts = (part for rule in rules for num in numbers(rule.formula) for part in subexpressions(num))
-    missing = dict.fromkeys(
-        part.name for part in parts if isinstance(part, ir.Extern) and part.function is None
-    )
+    calls = (part for part in parts if isinstance(part, ir.Extern))
+    missing = dict.fromkeys(call.name for call in calls if call.function is None)
     if not missing:
         return
     places = {item.name: item.name_span for item in compiled.spec.items if isinstance(item, ast.Extern)}
@@ -95,23 +93,22 @@ def _require_functions(compiled: Compiled, rules: Sequence[CompiledRequirement])
     raise UsageError(*(Diagnostic("E107", message.format(n), places.get(n), help=help_) for n in missing))
 
 
-def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
-    """Return the options `requested`, completed by the kinds and words of the declared signals.
+def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[str] | None = None) -> Reading:
+    """Return the options `requested`, completed by what the specification declares of its signals.
 
     Args:
-        spec: the specification, which declares the signals. It gives their kinds (such as bool or enum), and
-            the numbers that words (members of an enum) stand for.
-        requested: options of the user: the time grid, and the names that signals have in the file. The key of
-            such a name is the signal, or the text after `from` in the declaration of the signal.
+        spec: the specification. It declares the kinds of signals, the numbers that words (members of an enum)
+            stand for, and the values between samples (`@hold`, `@linear`, `@angle`).
+        requested: options of the user, keyed by signals, or by the text after `from` in their declarations.
+        read: names of the signals that requirements read, as compiled; None: all that the file holds.
+
+    Raises UsageError (U101) if a name is that of no signal.
     """
     signals = [item for item in spec.items if isinstance(item, ast.Signal)]
     columns = {item.name: item.column for item in signals if item.column}
 
     def column(name: str) -> str:
-        """Return the name that a signal has in the file.
-
-        Example: after the declaration `p from "q"`, the vector component `p[0]` is called `q[0]` in the file.
-        """
+        """Name in the file: declared as `p from "q"`, the component `p[0]` is called `q[0]` there."""
         base, bracket, index = name.partition("[")
         return columns.get(name) or f"{columns.get(base, base)}{bracket}{index}"
 
@@ -119,16 +116,57 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS) -> Reading:
     worth |= {item.name: dict(item.members) for item in spec.items if isinstance(item, ast.Enum)}
     kinds: dict[str, Kind] = {}
     words: dict[str, Words] = {}
+    between: dict[str, Between] = {}
+    timelike: dict[str, bool] = {}
     for item in signals:
         name = item.column or item.name
         words[name] = {} if item.type is None else worth.get(item.type.name, {})
-        if item.type is not None:
-            kinds[name] = _KINDS.get(item.type.name, "enum")
+        kinds[name] = "real" if item.type is None else _KINDS.get(item.type.name, "enum")
+        timelike[name] = not item.unit or same_dims(written_unit(item.unit), SYMBOLS["s"])
+        if (declared := _declared_between(item)) is not None:
+            between[name] = declared
+    _require_signals(requested, spec, columns)
+    declaration = {item.column or item.name: item for item in reversed(signals)}
+    for name, each in requested.between.items():
+        between[column(name)] = _turned(each, declaration.get(column(name)))
     names = {column(name): there for name, there in requested.names.items()}
-    return replace(requested, names=names, kinds=kinds, words=words)
+    timely = None
+    if read is not None:
+        timely = {name: timelike.get(name.partition("[")[0], timelike.get(name, True)) for name in read}
+    return replace(requested, names=names, kinds=kinds, words=words, between=between, read=timely)
 
 
-# ------------------------------------------------------------------------------- columns
+def _require_signals(requested: Reading, spec: ast.Spec, columns: Mapping[str, str]) -> None:
+    """Raise UsageError (U101) if an option names a signal that the specification does not declare."""
+    declared = [item.name for item in spec.items if isinstance(item, (ast.Signal, ast.Param))]
+    known = {*declared, *columns.values(), CLOCK, *GROUPS}
+    findings = []
+    for option, names in (("--map", requested.names), ("--between", requested.between)):
+        for name in names:
+            if name not in known and name.partition("[")[0] not in known:
+                near = closest(name, declared)
+                help_ = (f"did you mean `{near}`?",) if near else ()
+                note = (f"signals: {', '.join(declared)}",)
+                message = f"`{option} {name}=…`: the specification has no signal `{name}`"
+                findings.append(Diagnostic("U101", message, help=help_, note=note))
+    if findings:
+        raise UsageError(*findings)
+
+
+def _declared_between(item: ast.Signal) -> Between | None:
+    """Values between samples that a tag of a declaration states, such as `@hold(0.5 s)`."""
+    for tag in item.tags:
+        for how in get_args(How):
+            if tag.name == how and how in BETWEEN:
+                return _turned(Between(how, age_of(tag)), item)
+    return None
+
+
+def _turned(between: Between, item: ast.Signal | None) -> Between:
+    """Values between samples with a full turn in the unit of the signal."""
+    if between.how != "angle" or item is None or not item.unit:
+        return between
+    return replace(between, period=2.0 * math.pi / written_unit(item.unit).scale)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +181,9 @@ class Signals:
         name: name of the trace, for messages.
         dt: time step in seconds; None if it is unknown.
         t0: time of the first sample in seconds.
+        cells: recorded values between the samples, if the signals were resampled.
+        spans: signal -> time in which it was seen, if the signals were resampled.
+        times: time of each sample in seconds, where that differs from the grid; None if it does not.
     """
 
     env: Mapping[str, Array]
@@ -152,6 +193,9 @@ class Signals:
     name: str = UNNAMED
     dt: float | None = None
     t0: float = 0.0
+    cells: Cells | None = None
+    spans: Mapping[str, TimeRange] = field(default_factory=dict)
+    times: NDArray[np.float64] | None = None
 
     @property
     def batch(self) -> int:
@@ -163,19 +207,24 @@ class Signals:
         """Unknown samples (NaN) of every signal that contains NaN, by name; {} if arrays are not NumPy."""
         if self.ops is not NUMPY:
             return {}
-        found = {name: Gap().with_more(np.isnan(values)) for name, values in self.env.items()}
+        found = {name: Gap().with_more(self._unknown(name, values)) for name, values in self.env.items()}
         return {name: gap for name, gap in found.items() if gap.samples}
+
+    def _unknown(self, name: str, values: Array) -> NDArray[np.bool_]:
+        """Samples at which a signal is unknown although it was seen before and after, (time, batch)."""
+        unknown = np.isnan(values)
+        span = self.spans.get(name)
+        if span is not None and self.dt and unknown.any():
+            times = self.t0 + self.dt * np.arange(self.samples)
+            unknown[(times < span.first) | (times > span.last)] = False
+        return np.asarray(unknown)
 
     def like_given(self, values: Array) -> Array:
         """Reshape values (time, batch) to (…, time), the shape in which the signals were given."""
         return values.swapaxes(0, 1).reshape((*self.shape, len(values)))
 
     def at_one(self, values: Array) -> Array:
-        """Reshape values (1, batch) of one sample, with one entry per trace.
-
-        The result has the shape that the signals were given in, without the time axis: (traces,) for signals
-        (traces, samples), and a single number for signals (samples,).
-        """
+        """Reshape values (1, batch) of one sample to (…), the shape of the signals without the time axis."""
         flat = values.reshape(self.shape)
         return flat if self.shape or self.ops is not NUMPY else np.float64(flat)
 
@@ -194,7 +243,7 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
     name = UNNAMED if trace is None else trace.name
     data: Given = given if not isinstance(given, Trace) else {CLOCK: given.times, **given.data}
     found = {need.column.name: _find(data, need.column.name) for need in needs}
-    there = data if trace is None else {**data, **trace.extras}
+    there = data if trace is None else {**dict.fromkeys(trace.others), **data, **trace.extras}
     missing = [_missing(need, there, name) for need in needs if found[need.column.name] is None]
     if missing:
         raise TraceError(*missing)
@@ -212,20 +261,20 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
 
         given_tensors = [found[key] for key in tensors]
         return Signals(_torch_columns(found, given_tensors, (*shape, samples)), shape, samples, TORCH, name)
-    columns = {key: _numpy_column(values, (*shape, samples)) for key, values in found.items()}
-    signals = Signals(columns, shape, samples, NUMPY, name)
-    if trace is not None:
-        columns = _in_units(columns, needs, trace)
-        signals = Signals(columns, (trace.traces,), samples, NUMPY, name, trace.dt, trace.t0)
-    _check_finite(signals, needs)
-    return signals
+    arrays = (np.broadcast_to(np.asarray(x, dtype=np.float64), (*shape, samples)) for x in found.values())
+    flat = (np.ascontiguousarray(array.reshape(-1, samples).T) for array in arrays)
+    columns = dict(zip(found, flat, strict=True))
+    if trace is None:
+        return Signals(columns, shape, samples, NUMPY, name)
+    changes = _conversions(needs, trace)
+    columns = {key: changes[key](values) if key in changes else values for key, values in columns.items()}
+    cells = None if trace.moments is None else _cells(trace.moments, columns, changes)
+    spans = {key: span for key, span in trace.spans.items() if key in columns}
+    return Signals(columns, (trace.traces,), samples, NUMPY, name, trace.dt, trace.t0, cells, spans)
 
 
 def _find(data: Given, name: str) -> Any:
-    """Return the array called `name`; None if there is none.
-
-    A component such as `q[0]` is also found in the vector `q`.
-    """
+    """Return the array called `name`, also a component such as `q[0]` of a vector `q`; None without one."""
     index = None
     if name not in data:
         match = _COMPONENT.fullmatch(name)
@@ -241,51 +290,42 @@ def _find(data: Given, name: str) -> Any:
 def _missing(need: Need, data: Given, name: str) -> Diagnostic:
     wanted = need.column.name
     near = closest(wanted, data)
-    shapes = ", ".join(f"{key} {tuple(np.shape(values))}" for key, values in data.items())
+    first = islice(data.items(), 40)
+    shapes = ", ".join(key if x is None else f"{key} {tuple(np.shape(x))}" for key, x in first)
     help_ = () if near is None else (f"did you mean `{near}`? map it with  --map {wanted}={near}",)
     if need.parameter:
-        value = f"{need.column.low or 0:g}{need.column.unit}"
-        either = "or " if help_ else ""
-        advice = f"{either}give it one value for all traces:  --set {wanted.partition('[')[0]}={value}"
-        help_ = (*help_, advice)
-    return Diagnostic(
-        "E601",
-        f"trace `{name}` has no signal `{wanted}`" if name != UNNAMED else f"no signal `{wanted}` is given",
-        need.span,
-        label=f"needed by: {', '.join(need.by)}",
-        help=help_,
-        note=(f"arrays in {name}: {shapes}",),
-    )
+        option = f"--set {wanted.partition('[')[0]}={need.column.low or 0:g}{need.column.unit}"
+        help_ = (*help_, f"{'or ' if help_ else ''}give it one value for all traces:  {option}")
+    message = f"no signal `{wanted}` is given"
+    if name != UNNAMED:
+        message = f"trace `{name}` has no signal `{wanted}`"
+    label, note = f"needed by: {', '.join(need.by)}", (f"arrays in {name}: {shapes}",)
+    return Diagnostic("E601", message, need.span, label=label, help=help_, note=note)
 
 
 def _common_shape(arrays: Mapping[str, Any], name: str) -> tuple[tuple[int, ...], int]:
-    """Return the shape of the arrays without their time axis, and their number of samples.
+    """Shape of the arrays without their time axis, and number of samples; single numbers fit any."""
 
-    An array that is a single number is a constant signal.
-    """
+    def unfit(what: str) -> TraceError:
+        return TraceError(Diagnostic("E605", f"{name}: {what}"))
+
     lengths = {key: int(values.shape[-1]) for key, values in arrays.items() if values.ndim}
     if not lengths:
-        raise TraceError(Diagnostic("E605", f"{name}: no signal has a time axis"))
+        raise unfit("no signal has a time axis")
     first, samples = next(iter(lengths.items()))
-    odd = [key for key, length in lengths.items() if length != samples]
-    if odd:
-        message = f"`{odd[0]}` has {lengths[odd[0]]} samples, `{first}` has {samples}"
-        raise TraceError(Diagnostic("E605", f"{name}: {message}"))
+    for key, length in lengths.items():
+        if length != samples:
+            raise unfit(f"`{key}` has {length} samples, `{first}` has {samples}")
     if not samples:
-        raise TraceError(Diagnostic("E605", f"{name}: the signals hold no samples"))
+        raise unfit("the signals hold no samples")
     try:
         shape = np.broadcast_shapes(*(tuple(values.shape[:-1]) for values in arrays.values()))
     except ValueError:
         shapes = ", ".join(f"{key} {tuple(values.shape)}" for key, values in arrays.items())
-        raise TraceError(Diagnostic("E605", f"{name}: the arrays do not fit together: {shapes}")) from None
+        raise unfit(f"the arrays do not fit together: {shapes}") from None
     if 0 in shape:
-        raise TraceError(Diagnostic("E605", f"{name}: the arrays hold no traces"))
+        raise unfit("the arrays hold no traces")
     return shape, samples
-
-
-def _numpy_column(values: Any, shape: tuple[int, ...]) -> Array:
-    full = np.broadcast_to(np.asarray(values, dtype=np.float64), shape)
-    return np.ascontiguousarray(full.reshape(-1, shape[-1]).T)
 
 
 def _torch_columns(
@@ -293,66 +333,42 @@ def _torch_columns(
 ) -> dict[str, Array]:
     torch = sys.modules["torch"]
     floating = [tensor.dtype for tensor in tensors if tensor.is_floating_point()]
-    dtype = floating[0] if floating else torch.get_default_dtype()
-    for other in floating[1:]:
-        dtype = torch.promote_types(dtype, other)
-
-    def column(values: Any) -> Array:
-        full = torch.as_tensor(values, dtype=dtype, device=tensors[0].device).broadcast_to(shape)
-        return full.reshape(-1, shape[-1]).T
-
-    return {name: column(values) for name, values in arrays.items()}
+    dtype = reduce(torch.promote_types, floating) if floating else torch.get_default_dtype()
+    device = tensors[0].device
+    full = (torch.as_tensor(x, dtype=dtype, device=device).broadcast_to(shape) for x in arrays.values())
+    return {name: x.reshape(-1, shape[-1]).T for name, x in zip(arrays, full, strict=True)}
 
 
-def _in_units(columns: Mapping[str, Array], needs: Sequence[Need], trace: Trace) -> dict[str, Array]:
-    """Convert signals from the units in the trace to those that the specification declares.
-
-    A signal with an unknown unit is unchanged.
-
-    Raises TraceError (E605) if two units measure different quantities.
-    """
-    converted = dict(columns)
+def _conversions(needs: Sequence[Need], trace: Trace) -> dict[str, Conversion]:
+    """Conversions to declared units, where they differ. Raises TraceError (E605) for other quantities."""
+    changes: dict[str, Conversion | None] = {}
     findings: list[Diagnostic] = []
-    for need in needs:
-        name = need.column.name
-        if name not in trace.signature:
-            continue
+    for column, span in ((need.column, need.span) for need in needs if need.column.name in trace.signature):
         try:
-            change = conversion(trace.name, need.column, trace.signature[name].unit, need.span)
+            unit = trace.signature[column.name].unit
+            changes[column.name] = conversion(trace.name, column, unit, span)
         except TraceError as error:
             findings += error.diagnostics
-            continue
-        if change is not None:
-            converted[name] = change(converted[name])
     if findings:
         raise TraceError(*findings)
-    return converted
+    return {name: change for name, change in changes.items() if change is not None}
 
 
-def _check_finite(signals: Signals, needs: Sequence[Need]) -> None:
-    findings = []
-    for need in needs:
-        bad = np.isinf(signals.env[need.column.name])
-        if bad.any():
-            sample = int(np.argmax(bad.any(axis=1)))
-            trace = int(np.argmax(bad[sample]))
-            value = signals.env[need.column.name][sample, trace]
-            place = f"t = {signals.t0 + sample * signals.dt:.6g} s" if signals.dt else f"sample {sample}"
-            where = f"trace {trace}, {place}" if signals.shape else place
-            finding = not_finite(f"`{need.column.name}` in {signals.name}", value, where, need)
-            findings.append(finding.with_note(f"{int(bad.sum())} of {bad.size} values are infinite"))
-    if findings:
-        raise TraceError(*findings)
+def _cells(moments: Moments, columns: Mapping[str, Array], changes: Mapping[str, Conversion]) -> Cells:
+    """Recorded values of the signals in `columns` in the units of the specification."""
 
+    def converted(name: str, values: Array) -> Array:
+        return changes[name](values).T if name in changes else values.T
 
-def not_finite(signal: str, value: float, where: str, need: Need) -> Diagnostic:
-    """Finding E604: a signal has the infinite value `value`; `where` is its instant as text."""
-    return Diagnostic(
-        "E604",
-        f"{signal} is {value} at {where}",
-        help=("leave the cell empty where nothing was measured: then what needs it is inconclusive",),
-        note=(f"needed by: {', '.join(need.by)}",),
-    )
+    before = {name: converted(name, x) for name, x in moments.before.items() if name in columns}
+    after = {
+        name: x if moments.after[name] is moments.before[name] else converted(name, moments.after[name])
+        for name, x in before.items()
+    }
+    if CLOCK in columns and CLOCK not in before:
+        batch = next((values.shape[1] for values in before.values()), 1)
+        before[CLOCK] = after[CLOCK] = np.repeat(moments.times[:, None], batch, axis=1)
+    return Cells(moments.times, moments.starts, before, after, {CLOCK: -1, **moments.clocks})
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,11 +386,7 @@ class Gap:
     last: int = 0
 
     def with_more(self, unknown: NDArray[np.bool_], offset: int = 0) -> Gap:
-        """Return a gap that also includes the unknown samples of further data.
-
-        The array `unknown`, (samples,) or (samples, traces), is True at these samples. `offset` is the index
-        in the trace of the first row of `unknown`.
-        """
+        """Return a gap that includes `unknown`, (samples,) or (samples, traces), from sample `offset` on."""
         rows = np.flatnonzero(unknown.reshape(len(unknown), -1).any(axis=1))
         if not len(rows):
             return self

@@ -11,6 +11,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from stlc.compile.backends.array.interval import EPSILON, Floats, Intervals, magnitudes, mul, widened
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.namespace import Array
@@ -22,12 +24,10 @@ from stlc.grammar import ast
 from stlc.monitor.values import Record
 from stlc.registry import closest
 from stlc.signature import Column
-from stlc.source import Span
 from stlc.units import DIMENSIONLESS, Unit, parse_unit, same_dims
 
 _AMOUNT = re.compile(r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>.*)")
-_COMPONENT = re.compile(r"(?P<name>.+)\[\d+\]")
-_FORM = "an amount with its unit, or a percentage of the value: 0.1m, 2%"
+_INDEX = re.compile(r"(?<=.)\[\d+\]\Z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +48,13 @@ class Uncertainty:
     def parse(text: str) -> Uncertainty:
         """Return the uncertainty that a text such as `0.1m`, `0.1` or `2%` states.
 
-        Raises:
-            ValueError: the text is no amount, or its unit is unknown; the message says what is expected.
+        Raises ValueError, which says what is expected, if the text is no amount or its unit is unknown.
         """
         match = _AMOUNT.fullmatch(text.strip())
         if match is None or not math.isfinite(float(match["number"])):
-            raise ValueError(f"`{text}` is not {_FORM}")
+            raise ValueError(
+                f"`{text}` is not an amount with its unit, or a percentage of the value: 0.1m, 2%"
+            )
         number, unit = float(match["number"]), match["unit"].strip()
         if unit == "%":
             return Uncertainty(relative=number / 100.0)
@@ -78,16 +79,20 @@ def uncertain_record(
         UsageError: U101, an unknown signal, a unit that measures something else, or a signal without order;
             a requirement calls a Python function, whose values have no bounds.
     """
-    findings = [found for name, each in uncertain.items() if (found := _misfit(name, each, compiled))]
+    columns = {column.name: column for column in compiled.signature.columns}
+    findings = [found for name, x in uncertain.items() if (found := _misfit(name, x, columns, compiled.spec))]
     findings += _opaque(rules)
     if findings:
         raise UsageError(*findings)
-    columns = {column.name: column for column in compiled.signature.columns}
+    given, holes = record.env, record.holes
+    if record.cells is not None:
+        given, holes = record.cells.interval_env()
     env: dict[str, Array] = {}
-    for name, values in record.env.items():
-        known = _of(name, uncertain)
-        env[name] = Intervals.point(values) if known is None else _around(values, known, columns[name])
-    return replace(record, env=env, ops=INTERVALS, computed=False)
+    for name, values in given.items():
+        known = uncertain.get(name, uncertain.get(_INDEX.sub("", name)))
+        centre = values if isinstance(values, Intervals) else Intervals.point(values)
+        env[name] = centre if known is None else _around(centre, known, columns[name])
+    return replace(record, env=env, ops=INTERVALS, computed=False, holes=holes, cells=None)
 
 
 def outer(low: Array, high: Array) -> tuple[Floats, Floats]:
@@ -95,36 +100,38 @@ def outer(low: Array, high: Array) -> tuple[Floats, Floats]:
     return (low.low, high.high) if isinstance(low, Intervals) else (low, high)
 
 
-def _of(name: str, uncertain: Uncertainties) -> Uncertainty | None:
-    match = _COMPONENT.fullmatch(name)
-    return uncertain.get(name, uncertain.get(match["name"]) if match else None)
+def outer_of(values: Array, end: str) -> Array:
+    """Numbers for intervals: the end that is asked for, or NaN where both differ; numbers are unchanged."""
+    if not isinstance(values, Intervals):
+        return values
+    low, high = values.low, values.high
+    return low if end == "lower" else high if end == "upper" else np.where(low == high, low, math.nan)
 
 
-def _around(values: Floats, known: Uncertainty, column: Column) -> Intervals:
+def _around(centre: Intervals, known: Uncertainty, column: Column) -> Intervals:
     """Intervals around samples, in the unit of the signal and rounded outward."""
-    centre = Intervals.point(values)
     factor = float(known.unit.ratio / column.unit.ratio) if known.unit.text else 1.0
     share, amount = known.relative * (1.0 + EPSILON), known.absolute * factor * (1.0 + 2.0 * EPSILON)
     if not share and not amount:
         return centre
     error = (mul(magnitudes(centre), share) + amount).high if share else amount
-    return widened(values - error, values + error)
+    return widened(centre.low - error, centre.high + error)
 
 
-# -------------------------------------------------------------------------- what is refused
-
-
-def _misfit(name: str, uncertain: Uncertainty, compiled: Compiled) -> Diagnostic | None:
+def _misfit(
+    name: str, uncertain: Uncertainty, columns: Mapping[str, Column], spec: ast.Spec
+) -> Diagnostic | None:
     """Return the reason for which a signal cannot have this uncertainty; None if it can."""
-    columns = {column.name: column for column in compiled.signature.columns}
-    bases = {match["name"]: key for key in columns if (match := _COMPONENT.fullmatch(key))}
-    known = columns.get(name) or columns.get(bases.get(name, ""))
+    vectors = {_INDEX.sub("", key): column for key, column in columns.items()}
+    known = columns.get(name) or vectors.get(name)
     if known is None:
-        near = closest(name, [*columns, *bases])
+        near = closest(name, {**columns, **vectors})
         help_ = (f"did you mean `{near}`?",) if near else ()
         note = (f"signals: {', '.join(columns)}",)
         return Diagnostic("U101", f"`--uncertain {name}=…`: no signal `{name}`", help=help_, note=note)
-    span, label = _declaration(name, compiled)
+    signals = (item for item in spec.items if isinstance(item, (ast.Signal, ast.Param)))
+    span = next((item.name_span for item in signals if item.name == _INDEX.sub("", name)), None)
+    label = "declared here" if span else ""
     if known.kind in ("bool", "enum"):
         message = f"`--uncertain {name}=…`: a signal of type {known.kind} has no error"
         return Diagnostic("U101", message, span, label=label)
@@ -136,25 +143,13 @@ def _misfit(name: str, uncertain: Uncertainty, compiled: Compiled) -> Diagnostic
     return Diagnostic("U101", message, span, label=label, help=help_)
 
 
-def _declaration(name: str, compiled: Compiled) -> tuple[Span | None, str]:
-    base = match["name"] if (match := _COMPONENT.fullmatch(name)) else name
-    for item in compiled.spec.items:
-        if isinstance(item, (ast.Signal, ast.Param)) and item.name == base:
-            return item.name_span, "declared here"
-    return None, ""
-
-
 def _opaque(rules: Sequence[CompiledRequirement]) -> list[Diagnostic]:
     """Return a finding for each requirement that calls a Python function."""
     findings = []
     for rule in rules:
         parts = (part for num in numbers(rule.formula) for part in subexpressions(num))
-        names = dict.fromkeys(
-            part.name
-            for part in parts
-            if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body)
-        )
-        for name in names:
+        calls = (part for part in parts if isinstance(part, ir.Extern))
+        for name in dict.fromkeys(call.name for call in calls if not isinstance(call.function, ir.Body)):
             message = f"`--uncertain`: `{name}` is a Python function, whose values have no bounds"
             help_ = ("judge the other requirements: --require NAME",)
             findings.append(Diagnostic("U101", message, rule.span, label="calls it", help=help_))

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from itertools import chain
+from typing import Literal, TypeAlias, cast
 
 import numpy as np
 
 from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.support import columns_of, history
-from stlc.compile.ir.traverse import map_children, subexpressions
+from stlc.compile.ir.traverse import map_children, nodes, subexpressions
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Exact, Semantics
+from stlc.monitor.cells import Cells
 from stlc.monitor.holes import holes_in, partial, unsure, without_holes
 
 Ends: TypeAlias = Literal["open", "truncate"]
@@ -36,6 +39,8 @@ class Record:
         semantics: definition of minimum and maximum.
         holes: names of the signals with unknown values (`stlc.monitor.holes`).
         computed: whether NaN that a function gives outside of its domain is unknown too.
+        cells: recorded values between the samples, if the signals were resampled.
+        loose: whether a step of the grid counts as a whole: windows end at an instant of their own.
     """
 
     env: Mapping[str, Array]
@@ -43,30 +48,44 @@ class Record:
     semantics: Semantics = Exact()  # noqa: RUF009 - frozen
     holes: frozenset[str] = frozenset()
     computed: bool = False
+    cells: Cells | None = None
+    loose: bool = False
 
     @staticmethod
-    def of(env: Mapping[str, Array], ops: Ops) -> Record:
+    def of(env: Mapping[str, Array], ops: Ops, cells: Cells | None = None) -> Record:
         """Return a record of the signals `env`; in NumPy arrays, NaN is an unknown value."""
         holes = holes_in(env) if ops is NUMPY else frozenset[str]()
-        return Record(without_holes(env, holes) if holes else env, ops, holes=holes, computed=ops is NUMPY)
+        filled = without_holes(env, holes) if holes else env
+        return Record(filled, ops, holes=holes, computed=ops is NUMPY, cells=cells)
 
     @property
     def sure(self) -> Record:
-        """Copy of this record in which nothing counts as unknown.
+        """Copy without unknown values, for formulas that account for them themselves (`sides`)."""
+        return replace(self, holes=frozenset(), computed=False, cells=None)
 
-        Formulas that account for unknown values themselves are evaluated on this copy.
-        """
-        return replace(self, holes=frozenset(), computed=False)
+    def of_cells(self, formula: ir.Formula, *, loose: bool) -> Record:
+        """Copy in which every recorded sample counts for `formula`; signals are intervals for a `freeze`."""
+        if self.cells is None:
+            return self
+        if not self.semantics.exact:
+            return replace(self, cells=None)
+        if any(isinstance(node, ir.Freeze) for node in nodes(formula)):
+            env, holes = self.cells.interval_env()
+            return Record(env, INTERVALS, self.semantics, holes)
+        ready = replace(self, env=dict(self.env), loose=loose)
+        ready.sides(formula)
+        return ready
 
     def sides(self, formula: ir.Formula) -> tuple[ir.Formula, ir.Formula]:
         """Return two formulas, for a lower and an upper bound on `formula`, to be evaluated on `sure`.
 
         Both are `formula` itself if no value that it reads can be unknown.
         """
+        if self.cells is not None and self.semantics.exact:
+            return self.cells.sides(formula, cast("dict[str, Array]", self.env), loose=self.loose)
         if not self.holes and not (self.computed and partial(formula)):
             return formula, formula
-        least = unsure(formula, self.holes, least=True, computed=self.computed)
-        most = unsure(formula, self.holes, least=False, computed=self.computed)
+        least, most = (unsure(formula, self.holes, least=x, computed=self.computed) for x in (True, False))
         return (formula, formula) if least == most else (least, most)
 
     @property
@@ -76,7 +95,11 @@ class Record:
 
     def cut(self, stop: int) -> Record:
         """Return a record of the first `stop` samples."""
-        return self if stop >= self.samples else replace(self, env={n: x[:stop] for n, x in self.env.items()})
+        return self if stop >= self.samples else self.part(0, stop)
+
+    def part(self, first: int, stop: int) -> Record:
+        """Return a record of the samples from `first` up to `stop`."""
+        return replace(self, env={name: x[first:stop] for name, x in self.env.items()})
 
     def values(
         self, formulas: Sequence[ir.Formula], instants: range, end: Boundary, stop: int | None = None
@@ -85,7 +108,7 @@ class Record:
 
         `end` is the treatment of windows that extend beyond the last sample: "strict" gives NaN, "truncate"
         clips them, "lower" and "upper" give a bound. If the trace continues, `stop` is the number of samples
-        in the complete trace. Unbounded windows then extend to the end of the complete trace.
+        in the complete trace, to whose end unbounded windows extend.
         """
         return evaluate(
             formulas,
@@ -104,15 +127,16 @@ def bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest values at consecutive instants, each `(count, batch)`.
 
-    If nothing is unknown, the same array is returned twice. `ends` is the treatment of windows that extend
-    beyond the trace: "open" computes bounds, "truncate" clips the windows. `stop` is the number of samples in
-    the complete trace, if the record contains fewer.
+    If nothing is unknown, the same array is returned twice. `stop` is the number of samples in the complete
+    trace, if the record contains fewer.
     """
     least, most = record.sides(formula)
-    end: Boundary | None = "truncate" if ends == "truncate" else None
-    stop = None if end is not None or stop is None or stop <= record.samples else stop
-    if end is None and stop is None and defined(formula, record.samples)[starts.start : starts.stop].all():
-        end = "strict"
+    end: Boundary | None = None
+    if ends == "truncate":
+        end = "truncate"
+    elif stop is None or stop <= record.samples:
+        stop = None
+        end = "strict" if defined(formula, record.samples)[starts.start : starts.stop].all() else None
     if end is None:
         (low,) = record.values([least], starts, "lower", stop)
         (high,) = record.values([most], starts, "upper", stop)
@@ -129,31 +153,29 @@ def window_bounds(
 ) -> tuple[Array, Array]:
     """Least and greatest values of a formula whose `end` moves with the instant, each `(count, batch)`.
 
-    `end` is `window` samples after each instant. Each instant is evaluated on its own excerpt of the trace.
-    The excerpt begins before the instant, so that past operators find their samples, and stops at `end`. Many
-    excerpts form one batch. If the trace is too short for an excerpt, the missing samples are unknown. If
-    `ends` is "truncate", the excerpt stops at the last sample instead.
+    `end` is `window` samples after each instant. Each instant is evaluated on its own excerpt of the trace,
+    from the first sample that past operators read to `end`. If the trace is too short for an excerpt, the
+    missing samples are unknown; if `ends` is "truncate", the excerpt stops at the last sample instead.
     """
     back = history(formula)
     early = range(starts.start, max(min(back, starts.stop), starts.start))
-    pairs = [bounds(formula, record.cut(stop := k + window + 1), range(k, k + 1), ends, stop) for k in early]
-    for inner, count in _unrolled(record, range(early.stop, starts.stop), back, window):
-        low, high = bounds(formula, inner, range(back, back + 1), ends, back + window + 1)
-        same = low is high
-        low = low.reshape(count, -1)
-        pairs.append((low, low if same else high.reshape(count, -1)))
-    low = record.ops.cat([pair[0] for pair in pairs])
-    if all(pair[0] is pair[1] for pair in pairs):
-        return low, low
-    return low, record.ops.cat([pair[1] for pair in pairs])
+    excerpts = [(record.cut(k + window + 1), k, 1) for k in early]
+    later = _unrolled(record, range(early.stop, starts.stop), back, window)
+    lows, highs = [], []
+    for inner, k, count in chain(excerpts, later):
+        low, high = bounds(formula, inner, range(k, k + 1), ends, k + window + 1)
+        lows.append(low.reshape(count, -1))
+        highs.append(lows[-1] if high is low else high.reshape(count, -1))
+    whole = record.ops.cat(lows)
+    same = all(low is high for low, high in zip(lows, highs, strict=True))
+    return whole, whole if same else record.ops.cat(highs)
 
 
-def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int]]:
+def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator[tuple[Record, int, int]]:
     """Cut the trace into overlapping excerpts, one per instant in `starts`, and yield them in groups.
 
-    The excerpt of instant k contains the samples from k - `back` to k + `window`; it is shorter at the end of
-    the trace. A group is yielded as (record, number of instants). The record contains the excerpts of these
-    instants as one batch.
+    The excerpt of instant k goes from k - `back` to k + `window`, or to the end of the trace. A group is a
+    record of its excerpts as one batch, `back`, and the number of its instants.
     """
     length = back + window + 1
     whole = max(min(starts.stop, record.samples - window), starts.start)
@@ -163,19 +185,16 @@ def _unrolled(record: Record, starts: range, back: int, window: int) -> Iterator
         chosen = np.arange(begin, min(begin + step, whole))
         rows = np.arange(-back, window + 1)[:, None] + chosen
         env = {name: x[rows].reshape(length, len(chosen) * batch) for name, x in record.env.items()}
-        yield replace(record, env=env), len(chosen)
+        yield replace(record, env=env), back, len(chosen)
     for k in range(whole, starts.stop):
-        yield replace(record, env={name: x[k - back :] for name, x in record.env.items()}), 1
-
-
-# --------------------------------------------------------------------------- missing signals
+        yield replace(record, env={name: x[k - back :] for name, x in record.env.items()}), back, 1
 
 
 def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formula:
     """Return the formula with every predicate that reads a missing signal assumed true.
 
-    Signals not in `names` are missing. The value of the result is an upper bound on the formula. A `freeze`
-    may store a missing signal under a name; this name then also counts as missing.
+    Signals not in `names` are missing, and so are names under which a `freeze` stores one. The value of the
+    result is an upper bound on the formula.
     """
     match formula:
         case ir.Predicate(num=num):
@@ -193,14 +212,8 @@ def _read(num: ir.Num) -> set[str]:
     return {*columns_of(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
 
 
-# ------------------------------------------------------------------ strict predicates
-
-
 def by_truth(formula: ir.Formula) -> ir.Formula:
-    """Return the formula with truth values, +inf (true) or -inf (false), in place of predicate margins.
-
-    `a > b` is true if its margin a - b is above 0, `a >= b` if it is at least 0. There is no tolerance.
-    """
+    """Return the formula with +inf for true and -inf for false predicates; `a >= b` is true at margin 0."""
     if isinstance(formula, ir.Predicate):
         return replace(formula, guard=True)
     return map_children(formula, formulas=by_truth)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -12,6 +13,8 @@ import numpy as np
 
 from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir.discretize import Grid, lacks
+from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.traverse import numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import TOLERANCE, Semantics, semantics_of
@@ -19,7 +22,9 @@ from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.monitor.grid import Times, given_times, named_times, recorded_times, system_of
+from stlc.monitor.given import UNNAMED, Given, is_frame, trace_of_frame
+from stlc.monitor.given import plain as plain_signals
+from stlc.monitor.grid import Times, agreed_times, given_times, named_times, require_windows, system_of
 from stlc.monitor.instants import (
     At,
     check_length,
@@ -28,10 +33,11 @@ from stlc.monitor.instants import (
     rule_signal,
     rules_at,
     starts_of,
+    window_of,
 )
-from stlc.monitor.judgement import Bools, Judgement, Prepared, Status, Verdict, unknown_requirement
-from stlc.monitor.signals import Given, Need, arrange, needs_of, reading_of
-from stlc.monitor.uncertain import Uncertainties, outer, uncertain_record
+from stlc.monitor.judgement import Bools, Judgement, Part, Prepared, Status, Verdict, unknown_requirement
+from stlc.monitor.signals import Need, arrange, needs_of, reading_of
+from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
 from stlc.monitor.values import Ends, Record, by_truth
 from stlc.source import Source
 from stlc.trace import Trace, load_trace
@@ -42,7 +48,7 @@ if TYPE_CHECKING:
 __all__ = ["Judgement", "Monitor", "Status", "Verdict"]
 
 Subject: TypeAlias = Given | Trace | Path | str
-"""Signals by name, a trace, or the path of one."""
+"""Signals by name, a data frame, a trace, or the path of one."""
 
 Seconds: TypeAlias = float | Fraction
 
@@ -77,7 +83,11 @@ class Monitor:
         system: str | Path | None = None,
         overrides: Mapping[str, str] | None = None,
     ) -> None:
-        self.spec = spec if isinstance(spec, ast.Spec) else parse(_source(spec))
+        if isinstance(spec, Path) or (
+            isinstance(spec, str) and spec.endswith(_SUFFIXES) and "\n" not in spec
+        ):
+            spec = parse(read_source(spec))
+        self.spec = parse(Source("<text>", spec)) if isinstance(spec, str) else spec
         self._given = given_times(dt, horizon)
         self._overrides = dict(overrides or {})
         self._system, self._interface = Times(), None
@@ -86,7 +96,7 @@ class Monitor:
         self._resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
         self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}
-        known = Times(self._given.dt, self._given.horizon).or_else(self._system)
+        known = self._given.or_else(self._system)
         if not self._lacks(known):  # else the first trace may give the time step
             self._compile(known)
 
@@ -94,6 +104,16 @@ class Monitor:
     def requirements(self) -> tuple[str, ...]:
         """Names of the requirements, in order."""
         return tuple(item.name for item in self.spec.items if isinstance(item, ast.Require))
+
+    def reads(self, require: Sequence[str] = ()) -> frozenset[str]:
+        """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
+        known = [each.name for each in self._resolved.requirements]
+        for name in require:
+            if name not in known:
+                raise unknown_requirement(name, known)
+        chosen = [each for each in self._resolved.requirements if not require or each.name in require]
+        formulas = [each.formula for each in (*chosen, *self._resolved.assumptions)]
+        return frozenset().union(*(columns_of(num) for formula in formulas for num in numbers(formula)))
 
     @property
     def compiled(self) -> Compiled:
@@ -105,8 +125,6 @@ class Monitor:
         """Seconds of signal that a verdict at time 0 needs; a window `[a, inf)` counts as `a` seconds."""
         return float(self.compiled.reach * (self.compiled.grid.dt or 0))
 
-    # ----------------------------------------------------------------- evaluation
-
     def check(
         self,
         signals: Subject,
@@ -117,20 +135,22 @@ class Monitor:
         require: Sequence[str] = (),
         semantics: str | Semantics = "exact",
         uncertain: Uncertainties | None = None,
+        strict: bool = False,
     ) -> Verdict:
         """Evaluate every requirement at the instants that it prescribes (`stlc.monitor.instants`).
 
         Args:
-            signals: signals by name, or a trace, or the path of a trace file.
-            at: a sample number, or "all" for every sample with a complete window; None: each requirement's
-                own instants.
+            signals: signals by name, a data frame of pandas or polars, a trace, or the path of a trace file.
+                Under the key `time` or `t` there may be times, unless a requirement reads it as a signal.
+            at: a sample number; "all" for every sample with a complete window; None: those prescribed.
             end: treatment of a trace that is too short: "open" computes bounds over all its continuations and
                 may be inconclusive, "strict" raises an error, "truncate" clips the windows.
-            tolerance: a requirement is satisfied if its robustness is at least minus this value. If the
-                tolerance is 0, the truth values of the predicates decide: then `<` and `<=` differ.
+            tolerance: a requirement is satisfied if its robustness is at least minus this value. If it is 0,
+                the truth values of the predicates decide: then `<` and `<=` differ.
             require: names of the requirements to evaluate; empty: all.
-            semantics: semantics of the reported robustness, or its name; verdicts and causes are always
-                exact.
+            semantics: that of the reported robustness, or its name; verdicts and causes are always exact.
+            strict: whether times at which some signals of a requirement were not seen yet, or no more, are
+                unknown. Otherwise it is judged while all were seen (`Judgement.part`).
             uncertain: greatest errors of signals. Robustness and verdicts are then bounds over all samples
                 within these errors; causes are those of the samples as they are.
 
@@ -144,21 +164,24 @@ class Monitor:
         if uncertain and not reported.exact:
             raise UsageError(Diagnostic("U101", "uncertain signals have bounds in exact semantics only"))
         ready = self._prepare(signals, require, plain=True)
-        judged = _with_errors(ready, uncertain) if uncertain else ready
-        samples = ready.signals.samples
-        starts = [starts_of(rule, samples, ready.horizon, at) for rule in ready.rules]
+        judged = ready
+        if uncertain:
+            rules = (*ready.rules, *ready.compiled.assumptions)
+            judged = replace(ready, record=uncertain_record(ready.record, uncertain, ready.compiled, rules))
+        where = []
+        for rule in ready.rules:
+            part = Part(0, ready.record.samples) if strict else ready.part(rule)
+            where.append((rule, part, _starts(rule, part, ready, at)))
         if end == "strict":
-            checked = zip(ready.rules, starts, strict=True)
-            findings = [check_length(rule, samples, its, ready.compiled.grid) for rule, its in checked]
+            grid = ready.compiled.grid
+            findings = [check_length(rule, part.stop - part.first, its, grid) for rule, part, its in where]
             if any(findings):
                 raise TraceError(*filter(None, findings))
-        judgements = [
-            _judge(rule, judged, its, "truncate" if end == "truncate" else "open", tolerance)
-            for rule, its in zip(ready.rules, starts, strict=True)
-        ]
+        ends: Ends = "truncate" if end == "truncate" else "open"
+        judgements = [_judge(rule, judged, its, ends, tolerance, part) for rule, part, its in where]
         if not reported.exact:
             ready = ready.under(reported)
-            judgements = [_reported(judgement, ready, end) for judgement in judgements]
+            judgements = [_reported(judgement, ready, ends) for judgement in judgements]
         return Verdict(tuple(judgements), ready).within(_scope(judged, tolerance))
 
     def robustness(
@@ -173,8 +196,7 @@ class Monitor:
         """Robustness of the specification: the least `weight * robustness / scale` of all requirements.
 
         Args:
-            signals: signals by name, or a trace, or the path of a trace file; arrays are (time,) or (…,
-                time).
+            signals: signals by name, a trace, or the path of a trace file; arrays are (time,) or (…, time).
             end: "strict" gives NaN where a window is incomplete, "truncate" clips windows.
             at: sample at which to evaluate; None: at every sample.
             smoothing: scale k of the log-sum-exp semantics. If given, this semantics is used.
@@ -193,21 +215,14 @@ class Monitor:
         at: int | None = None,
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
-        """Robustness of each requirement by name, without weight and scale.
-
-        The method `robustness` explains the arguments.
-        """
+        """Robustness of each requirement by name, without weight and scale; arguments as of `robustness`."""
         ready = self._prepare(signals, ()).under(semantics_of(semantics))
         shaped = ready.signals.like_given if at is None else ready.signals.at_one
         rows = _rows(ready, end, at)
         return {rule.name: shaped(row) for rule, row in zip(ready.rules, rows, strict=True)}
 
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
-        """Least and greatest robustness of the specification over all continuations of the signals.
-
-        A predicate that reads a missing sample is unknown. The arrays have the shape of the signals. If `at`
-        is given, the specification is evaluated at this sample only, and the arrays have no time axis.
-        """
+        """Least and greatest `robustness` over all continuations of the signals, in the same shape."""
         ready = self._prepare(signals, ())
         return _least(ready, "lower", at), _least(ready, "upper", at)
 
@@ -227,34 +242,47 @@ class Monitor:
             like: a trace, or the first piece of one, that gives `dt` and `T`.
             dt: time step in seconds, if neither `like` nor this monitor gives it.
 
-        Raises:
-            UsageError: U101, an unknown requirement, or a specification without requirements.
+        Raises UsageError (U101) for an unknown requirement, or a specification without requirements.
         """
         from stlc.monitor.online.online import Online
 
-        recorded = given_times(dt, None) if like is None else recorded_times(like, self._given)
+        if like is None:
+            recorded = given_times(dt, None)
+        else:
+            recorded = agreed_times(like.name, like.dt, like.meta.horizon, self._given)
         compiled = self._ready(recorded)
         return Online(compiled, _chosen(compiled, require), how)
 
-    # ------------------------------------------------------------------- compiling
-
     def _prepare(self, subject: Subject, require: Sequence[str], *, plain: bool = False) -> Prepared:
-        given = load_trace(subject, reading_of(self.spec)) if isinstance(subject, (str, Path)) else subject
-        recorded = recorded_times(given, self._given) if isinstance(given, Trace) else Times()
+        given, recorded = subject, Times()
+        if not isinstance(given, Trace):
+            reading = reading_of(self.spec, read=self.reads(require))
+            if isinstance(given, (str, Path)):
+                given = load_trace(given, reading)
+            elif is_frame(given):
+                step = None if self._given.dt is None else float(self._given.dt)
+                given = trace_of_frame(given, replace(reading, dt=step))
+            else:
+                given, found = plain_signals(given, reading)
+                recorded = Times() if found is None else agreed_times(UNNAMED, found, None, self._given)
+        if isinstance(given, Trace):
+            recorded = agreed_times(given.name, given.dt, given.meta.horizon, self._given)
         compiled = self._ready(recorded)
         rules = _chosen(compiled, require)
+        if isinstance(given, Trace):
+            require_windows(given, rules)
         key = (compiled.grid, tuple(rule.name for rule in rules), plain)
         if key not in self._needs:
             self._needs[key] = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
         signals = arrange(given, self._needs[key], plain=plain)
-        return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops))
+        return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops, signals.cells))
 
     def _ready(self, recorded: Times) -> Compiled:
         """Return the specification compiled for the time step and horizon that are known.
 
-        The time step is that of the trace (`recorded`), else the argument `dt` of the monitor, else that of
-        the system. The horizon is the argument `horizon` of the monitor, else that of the system, else that
-        of the trace. If either is still unknown, it is taken from the system that the specification names.
+        The time step is that of the trace (`recorded`), else the one given to the monitor, else that of the
+        system. The horizon is the one given, else that of the system, else that of the trace. What is still
+        unknown is taken from the system that the specification names.
         """
         step = recorded.or_else(Times(self._given.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._given.horizon).or_else(self._system).or_else(recorded)
@@ -267,31 +295,22 @@ class Monitor:
         try:
             return self._compile(known)
         except SpecError as error:
-            raise SpecError(*(self._who_knows(finding) for finding in error.diagnostics)) from None
+            if self.spec.system is None:
+                raise
+            note = f"the specification names `{self.spec.system}`, but there is no such file"
+            told = (each.with_note(note) if each.code == "E311" else each for each in error.diagnostics)
+            raise SpecError(*told) from None
 
     def _lacks(self, times: Times) -> bool:
         """True if the specification needs a time step or horizon that is unknown in `times`."""
         grid, spec = times.grid(), self._resolved
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
-    def _who_knows(self, finding: Diagnostic) -> Diagnostic:
-        """Add to E311 (unknown `dt` or `T`) the note that the system file in the specification is missing."""
-        if finding.code != "E311" or self.spec.system is None:
-            return finding
-        return finding.with_note(f"the specification names `{self.spec.system}`, but there is no such file")
-
     def _compile(self, times: Times) -> Compiled:
         grid = times.grid()
         if grid not in self._compiled:
             self._compiled[grid] = compile_resolved(self._resolved, grid, "check")
         return self._compiled[grid]
-
-
-def _source(spec: str | Path) -> Source:
-    """Return the source file at a path, or the text itself if `spec` does not look like a path."""
-    if isinstance(spec, Path) or (spec.endswith(_SUFFIXES) and "\n" not in spec):
-        return read_source(spec)
-    return Source("<text>", spec)
 
 
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
@@ -307,9 +326,16 @@ def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequireme
 
 def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
     """Robustness of every requirement, (samples, batch), or (1, batch) at the one sample `at`."""
-    if at is None:
-        return [rule_signal(rule, ready.record, ready.horizon, end) for rule in ready.rules]
-    return rules_at(ready.rules, ready.record, at, ready.horizon, end)
+    if at is not None and ready.record.cells is None:
+        return rules_at(ready.rules, ready.record, at, ready.horizon, end)
+    rows = []
+    for rule in ready.rules:  # a formula may need a record of its own
+        record = record_of(rule, ready, Part(0, ready.record.samples))
+        if at is None:
+            rows.append(rule_signal(rule, record, ready.horizon, end))
+        else:
+            rows += rules_at([rule], record, at, ready.horizon, end)
+    return [outer_of(row, end) for row in rows]
 
 
 def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
@@ -326,67 +352,75 @@ def _scope(ready: Prepared, tolerance: float) -> Bools:
     """Return for each trace whether it counts: False if it certainly violates an assumption, (traces,)."""
     scope = np.ones(ready.signals.batch, dtype=bool)
     for rule in ready.compiled.assumptions:
-        scope &= ~_judge(rule, ready, range(1), "open", tolerance).fails[0]
+        scope &= ~_judge(rule, ready, range(1), "open", tolerance, ready.part(rule)).fails[0]
     return scope
 
 
-def _with_errors(ready: Prepared, uncertain: Uncertainties) -> Prepared:
-    compiled = ready.compiled
-    rules = (*ready.rules, *compiled.assumptions)
-    return replace(ready, record=uncertain_record(ready.record, uncertain, compiled, rules))
+def _starts(rule: CompiledRequirement, part: Part, ready: Prepared, at: At) -> range:
+    """Instants at which a requirement is evaluated, counted from the first sample of its part."""
+    samples = part.stop - part.first
+    if not isinstance(at, int):
+        return starts_of(rule, samples, ready.horizon, at)
+    if not part.first or at >= ready.signals.samples:
+        return starts_of(rule, ready.signals.samples, ready.horizon, at)
+    if not part.first <= at < part.stop:
+        ends = f"{ready.moment(part.first)} to {ready.moment(part.stop - 1).removeprefix('t = ')}"
+        message = f"`{rule.name}` has no value at {ready.moment(at)}: its signals were seen from {ends}"
+        raise UsageError(Diagnostic("U101", message))
+    return starts_of(rule, samples, ready.horizon, at - part.first)
+
+
+def record_of(rule: CompiledRequirement, ready: Prepared, part: Part) -> Record:
+    """Samples of a part of a trace, of which every recorded one counts for the requirement."""
+    record = ready.record.of_cells(rule.formula, loose=window_of(rule, ready.horizon) is not None)
+    return record if part.stop - part.first == record.samples else record.part(part.first, part.stop)
 
 
 def _judge(
-    rule: CompiledRequirement, ready: Prepared, starts: range, ends: Ends, tolerance: float
+    rule: CompiledRequirement, ready: Prepared, starts: range, ends: Ends, tolerance: float, part: Part
 ) -> Judgement:
-    low, high = outer(*rule_bounds(rule, ready.record, starts, ready.horizon, ends))
+    low, high = outer(*rule_bounds(rule, record_of(rule, ready, part), starts, ready.horizon, ends))
     if tolerance > 0:
-        holds = low >= -tolerance
-        fails = high < -tolerance
+        holds, fails = low >= -tolerance, high < -tolerance
     else:
         plain = replace(rule, formula=by_truth(rule.formula))
-        least, most = outer(*rule_bounds(plain, ready.record, starts, ready.horizon, ends))
+        least, most = outer(*rule_bounds(plain, record_of(plain, ready, part), starts, ready.horizon, ends))
         holds, fails = least > 0, most < 0
-    return Judgement(rule, starts.start, low, high, holds, fails, ready.signals.shape)
+    start = part.first + starts.start
+    return Judgement(rule, start, low, high, holds, fails, ready.signals.shape, part=part)
 
 
 def first_violation(judgement: Judgement, subject: Prepared, tolerance: float = TOLERANCE) -> int:
     """Return the sample from which a violated requirement is certainly violated, whatever follows.
 
-    An online monitor reports the violation at this sample. It is found by bisection, since a prefix that
-    certainly violates a requirement does so however it goes on. If the end of the trace decides, the last
-    sample is returned.
-
-    Args:
-        judgement: a judgement that is `violated`.
-        subject: the evaluated signals, `Verdict.subject`.
-        tolerance: the tolerance of the judgement.
+    An online monitor reports the violation at this sample; if the end of the trace decides, it is the last.
+    It is found by bisection, since a prefix that certainly violates a requirement does so however it goes on.
+    `judgement` is `violated` with `tolerance`, and `subject` is that of its verdict.
     """
-    low, high = judgement.start + 1, subject.record.samples
-    while low < high:
-        middle = (low + high) // 2
-        cut = replace(subject, record=subject.record.cut(middle))
-        starts = range(judgement.start, min(judgement.start + judgement.instants, middle))
-        fails = _judge(judgement.rule, cut, starts, "open", tolerance).fails
-        if judgement.counted(fails).any():
-            high = middle
-        else:
-            low = middle + 1
-    return high - 1
+    part = judgement.part or Part(0, subject.record.samples)
+    start, first = judgement.start, part.first
+
+    def violated(stop: int) -> bool:
+        starts = range(start - first, min(start + judgement.instants, stop) - first)
+        shorter = replace(part, stop=stop)
+        fails = _judge(judgement.rule, subject, starts, "open", tolerance, shorter).fails
+        return bool(judgement.counted(fails).any())
+
+    return bisect_left(range(part.stop), True, lo=start + 1, key=violated) - 1
 
 
-def _reported(judgement: Judgement, ready: Prepared, end: Literal["open", "strict", "truncate"]) -> Judgement:
-    """Return a copy of the judgement whose `reported` bounds are in the semantics that `ready` selects.
+def _reported(judgement: Judgement, ready: Prepared, ends: Ends) -> Judgement:
+    """Return the judgement with `reported` bounds in the semantics of `ready`.
 
-    In some semantics, minimum and maximum are means, and bounds over unknown samples are not valid. In this
-    case only the sign of the exact bounds is reported: the lower bound is 0 or -inf, the upper bound 0 or
-    +inf.
+    If minimum and maximum are means, bounds over unknown samples are not valid. Then only the sign of the
+    exact bounds is reported: the lower bound is 0 or -inf, the upper bound 0 or +inf.
     """
-    starts = range(judgement.start, judgement.start + judgement.instants)
-    ends: Ends = "truncate" if end == "truncate" else "open"
-    low, high = rule_bounds(judgement.rule, ready.record, starts, ready.horizon, ends)
+    rule, part = judgement.rule, judgement.part or Part(0, ready.record.samples)
+    begin = judgement.start - part.first
+    starts = range(begin, begin + judgement.instants)
+    low, high = rule_bounds(rule, record_of(rule, ready, part), starts, ready.horizon, ends)
     if low is not high and not ready.record.semantics.bounded:
-        known = rule_known(judgement.rule, ready.signals.samples, starts, ready.horizon)[:, None]
+        known = rule_known(rule, part.stop - part.first, starts, ready.horizon)[:, None]
         low = np.where(known, low, np.where(judgement.low > 0.0, 0.0, -np.inf))
         high = np.where(known, high, np.where(judgement.high < 0.0, 0.0, np.inf))
     return replace(judgement, reported=(low, high))

@@ -119,7 +119,7 @@ _KINDS = ("unary", "unary", "unary", "binary", "binary", "many", "two", "not", "
 
 
 @st.composite
-def formulas(  # noqa: C901 - one case an operator
+def formulas(
     draw: st.DrawFn,
     *,
     bounded_only: bool = False,

@@ -292,7 +292,7 @@ class Robustness:
             self._known[key] = self._at(node, t, positive)
         return self._known[key]
 
-    def _at(self, node: typed.Formula, t: int, positive: bool) -> Interval | None:  # noqa: C901
+    def _at(self, node: typed.Formula, t: int, positive: bool) -> Interval | None:
         match node:
             case typed.Truth(_, value):
                 return TRUE if value else FALSE
@@ -441,7 +441,7 @@ def robustness(formula: typed.Formula, trace: Trace, t: int = 0) -> Interval | N
 # ------------------------------------------------------------- Boolean semantics
 
 
-def holds(formula: typed.Formula, trace: Trace, t: int = 0) -> bool:  # noqa: C901 - one case a node
+def holds(formula: typed.Formula, trace: Trace, t: int = 0) -> bool:
     """Truth of `formula` at sample `t`, windows cut to the trace, bounds on the grid."""
     match formula:
         case typed.Truth(_, value):

@@ -182,9 +182,7 @@ def predicates(draw: st.DrawFn, *, smooth: bool) -> str:
 
 
 @st.composite
-def formulas(  # noqa: C901 - one case an operator
-    draw: st.DrawFn, depth: int = 2, *, ahead: bool = True, smooth: bool = False
-) -> str:
+def formulas(draw: st.DrawFn, depth: int = 2, *, ahead: bool = True, smooth: bool = False) -> str:
     """Formulas with every operator; without `ahead` of the present and the past."""
     if depth == 0:
         return draw(predicates(smooth=smooth))

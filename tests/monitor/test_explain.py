@@ -48,8 +48,8 @@ def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[s
             found = judge.at(node.formula, node.sample, polarity)
             assert found is not None
             assert (found[0] > 0) if node.holds else (found[1] < 0), node
-        assert not node.signals or 0 <= node.sample < trace.samples
-        assert all(name in env for name in node.signals)
+        assert not node.reads or 0 <= node.sample < trace.samples
+        assert all(name in env for name, _ in node.reads)
 
 
 @settings(max_examples=30)

@@ -30,7 +30,7 @@ def written(folder: Path, rows: str) -> Path:
 
 def test_kinds_and_words_are_those_of_the_declarations() -> None:
     reading = reading_of(stlc.parse(SPEC), Reading({"x": "px"}, 0.5))
-    assert reading.kinds == {"Lamp": "enum", "on": "bool", "n": "int"}
+    assert reading.kinds == {"Lamp": "enum", "on": "bool", "n": "int", "x": "real"}
     assert reading.words is not None
     assert dict(reading.words["Lamp"]) == {"red": 0, "green": 1}
     assert (reading.words["on"]["yes"], reading.words["x"]) == (1.0, {})

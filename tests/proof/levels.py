@@ -127,7 +127,7 @@ class Sets:
             self._known[key] = self._of(formula, truth) & self.record.everywhere
         return self._known[key]
 
-    def _of(self, formula: Formula, truth: bool) -> Instants:  # noqa: C901 - one case a node
+    def _of(self, formula: Formula, truth: bool) -> Instants:
         match formula:
             case Constant(value):
                 return self.record.everywhere if value is truth else 0

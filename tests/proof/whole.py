@@ -30,9 +30,7 @@ Rows: TypeAlias = Sequence[Row]
 Names: TypeAlias = frozenset[str]
 
 
-def defined(  # noqa: C901 - one case a node
-    formula: Formula, rows: Rows, positive: bool = True, held: Names = frozenset()
-) -> Instants:
+def defined(formula: Formula, rows: Rows, positive: bool = True, held: Names = frozenset()) -> Instants:
     """Instants at which nothing that is read leaves the trace; `held`: names that are frozen around."""
     everywhere = (1 << len(rows)) - 1
     match formula:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import margin_unit, operands
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Label
 from stlc.grammar import ast
 from stlc.monitor.explain.causes import CauseFinder, CauseNode
-from stlc.monitor.instants import window_of
-from stlc.monitor.judgement import Judgement, Prepared, Verdict
+from stlc.monitor.instants import rule_bounds, window_of
+from stlc.monitor.judgement import Judgement, Part, Prepared, Verdict
 from stlc.monitor.values import Record
 from stlc.signature import Column
 from stlc.source import Span
@@ -55,8 +56,9 @@ class Cause:
         labels: the other parts to underline, and their texts.
         because: the cause in words, on one line.
         tree: tree of the sub-formulas that explain the violation, down to predicates.
-        alone: whether the robustness of the requirement rises if only the value of `predicate` at `sample`
-            rises.
+        alone: whether the robustness rises if only the value of `predicate` at `sample` rises.
+        subject: the trace from the first judged sample on, from which the tree counts samples.
+        first: index of this sample in the trace.
     """
 
     judgement: Judgement
@@ -72,6 +74,18 @@ class Cause:
     because: str
     tree: CauseNode
     alone: bool
+    subject: Prepared = field(compare=False, repr=False)
+    first: int = 0
+
+    @property
+    def started(self) -> str:
+        """Instant at which the requirement was evaluated, as text."""
+        return self.subject.moment(self.start - self.first)
+
+    @property
+    def moment(self) -> str:
+        """Instant at which the deciding predicate was evaluated, as text."""
+        return self.subject.moment(self.sample - self.first)
 
     @property
     def unit(self) -> str:
@@ -86,56 +100,57 @@ MOST = 500
 def explain(verdict: Verdict, name: str) -> Cause | None:
     """Return the cause of the worst violation of a requirement; None if it is not violated.
 
-    Raises:
-        UsageError: U101, there is no such requirement.
+    Raises UsageError (U101) if there is no such requirement.
     """
     judgement = verdict[name]
     if judgement.overall != "violated":
         return None
-    return _cause(judgement, verdict.subject, _definitions(verdict.subject.compiled.spec))
+    definitions = _definitions(verdict.subject.compiled.spec)
+    return _cause(judgement, verdict.subject, judgement.worst, definitions)
 
 
-def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause:
+def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause | None:
     """Return the cause of a violation by one trace in the window that begins at sample `start`.
 
-    Raises:
-        UsageError: U101, there is no such requirement.
+    None if no single sample in each step shows it. Raises UsageError (U101) for an unknown requirement.
     """
     definitions = _definitions(verdict.subject.compiled.spec)
-    return _cause(verdict[name], verdict.subject, definitions, (trace, start))
+    return _cause(verdict[name], verdict.subject, (trace, start), definitions)
 
 
 def explain_all(verdict: Verdict) -> dict[str, Cause]:
     """Return the causes of the first `MOST` violated requirements, by name of the requirement."""
     definitions = _definitions(verdict.subject.compiled.spec)
     violated = [judgement for judgement in verdict if judgement.overall == "violated"]
-    return {judgement.name: _cause(judgement, verdict.subject, definitions) for judgement in violated[:MOST]}
+    found = {x.name: _cause(x, verdict.subject, x.worst, definitions) for x in violated[:MOST]}
+    return {name: cause for name, cause in found.items() if cause is not None}
 
 
 def _cause(
-    judgement: Judgement,
-    subject: Prepared,
-    definitions: dict[str, ast.Expr],
-    at: tuple[int, int] | None = None,
-) -> Cause:
-    rule, (trace, start) = judgement.rule, judgement.worst if at is None else at
-    one_trace = {name: column[:, trace : trace + 1] for name, column in subject.record.env.items()}
-    given = subject.record
-    record = Record(one_trace, given.ops, holes=given.holes, computed=given.computed)
+    judgement: Judgement, subject: Prepared, at: tuple[int, int], definitions: dict[str, ast.Expr]
+) -> Cause | None:
+    rule, (trace, start) = judgement.rule, at
+    part = judgement.part or Part(0, subject.record.samples)
+    subject = _evidence(rule, subject, part, trace)
+    record, start = subject.record, start - part.first
+    if subject.signals.times is not None:  # of several samples in a step, one was chosen
+        (high,) = rule_bounds(rule, record, range(start, start + 1), subject.horizon, "open")[1]
+        if not float(high.max()) < 0.0:
+            return None
     window = window_of(rule, subject.horizon)
     stop = None if window is None else start + window + 1
-    record = record if stop is None else record.cut(stop)
-    going_on = stop if stop is not None and stop > record.samples else None
+    if stop is not None and stop <= record.samples:
+        record, stop = record.cut(stop), None
     formula = from_first_sample(rule.typed.formula) if rule.absolute else rule.typed.formula
-    tree, alone = CauseFinder(record, subject.compiled.grid, stop=going_on).why(formula, start)
+    tree, alone = CauseFinder(record, subject.compiled.grid, stop=stop).why(formula, start)
     words = _Words(subject, record, rule.typed.written, definitions)
     leaf = tree.leaf
     place, *labels = words.labels(tree)
     return Cause(
         judgement=judgement,
         trace=trace,
-        start=start,
-        sample=leaf.sample,
+        start=start + part.first,
+        sample=leaf.sample + part.first,
         time=subject.time(leaf.sample),
         predicate=_flat(leaf.span.text),
         span=leaf.span,
@@ -145,22 +160,31 @@ def _cause(
         because=words.because(tree),
         tree=tree,
         alone=alone,
+        subject=subject,
+        first=part.first,
     )
 
 
-# -------------------------------------------------------------------------- words
+def _evidence(rule: CompiledRequirement, subject: Prepared, part: Part, trace: int) -> Prepared:
+    """Samples on which a requirement is judged; of several in a step, the one most against it."""
+    given, signals = subject.record, subject.signals
+    times = None
+    if given.cells is None:
+        env = {name: column[:, trace : trace + 1] for name, column in given.env.items()}
+        record = Record(env, given.ops, holes=given.holes, computed=given.computed)
+    else:
+        env, times = given.cells.of_trace(trace).witness(rule.formula)
+        record = Record.of(env, given.ops)
+    if part.stop - part.first < record.samples:
+        record = record.part(part.first, part.stop)
+        times = None if times is None else times[part.first : part.stop]
+    t0 = signals.t0 + part.first * (signals.dt or 0.0)
+    return replace(subject, record=record, signals=replace(signals, t0=t0, times=times))
 
 
 @dataclass(frozen=True, slots=True)
 class _Words:
-    """Writer of the texts that explain the violation of one requirement.
-
-    Attributes:
-        subject: the evaluated signals and requirements.
-        record: the trace, up to the end of the evaluated window.
-        written: expression of the requirement, as it is written in the specification.
-        definitions: name of a definition in the specification -> its expression.
-    """
+    """Writer of the texts that explain the violation of the requirement `written` on the trace `record`."""
 
     subject: Prepared
     record: Record
@@ -183,22 +207,19 @@ class _Words:
         return tuple(seen.values())
 
     def labels(self, tree: CauseNode) -> list[Label]:
-        """Source locations to underline, each with its text.
-
-        The location of the deciding predicate comes first.
-        """
+        """Source locations to underline, each with its text; that of the deciding predicate is the first."""
         found: dict[Span, str] = {}
         for node in _labelled(tree):
-            found.setdefault(self.site(node.span), self.label(node))
-        first = self.site(_deciding(tree).span)
+            found.setdefault(self.site(_body(node).span), self.label(node))
+        deciding = tree
+        while deciding.until is None and deciding.parts:
+            deciding = deciding.parts[deciding.main]
+        first = self.site(_body(deciding).span)
         spans = sorted(found, key=lambda span: (span != first, span.start))
         return [Label(span, found[span]) for span in spans]
 
     def label(self, node: CauseNode) -> str:
-        """Text beside the underlined source of `node`: its truth value, and the instant.
-
-        If `node` is the left side of an implication, the values of its signals are added.
-        """
+        """Truth value and instant of `node`; of the left side of an implication, also its signals."""
         moment = self.subject.moment(node.sample)
         if node.until is not None:
             window = f"from {moment} to {self.subject.moment(node.until)}"
@@ -207,11 +228,7 @@ class _Words:
         return f"{'true' if node.holds else 'false'} at {moment}" + (f" ({values})" if values else "")
 
     def because(self, tree: CauseNode) -> str:
-        """The cause in words, as one line of text.
-
-        If the deciding predicate is on the left side of an implication, the text continues with the right
-        side.
-        """
+        """The cause in words, as one line; with both sides of an implication whose left side decides."""
         text = self.reason(tree)
         while tree.parts:
             if tree.parts[0].premise and tree.main == 0:
@@ -220,11 +237,7 @@ class _Words:
         return text
 
     def reason(self, tree: CauseNode) -> str:
-        """Return a sentence on the deciding predicate.
-
-        If the predicate is in the text of a definition, the sentence explains the name of this definition:
-        `before_junction means x < x_inter / 2, and x = 0.27 m …`.
-        """
+        """Sentence on the deciding predicate, or on its definition: `near means x < 2, and x = 0.27 m …`."""
         leaf = tree.leaf
         moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
         values = " and ".join(reading.text for reading in self.readings(leaf))
@@ -239,23 +252,18 @@ class _Words:
         return f"{text} {nearest}" if nearest else f"{text} is {truth} where {values}, at {moment}"
 
     def site(self, span: Span) -> Span:
-        """Return the part of the requirement to underline for the source location `span`.
-
-        If `span` lies in the requirement itself, it is returned. Otherwise it lies in the text of a
-        definition. The requirement then contains a name that refers to this definition, directly or through
-        other definitions. The location of the name is returned.
-        """
+        """Return `span`, or the name in the requirement that refers to it if it lies in a definition."""
         chain = self.chain(self.written, span)
         return chain[0].span if chain else span
 
     def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
         """Return the names that lead from the expression `expr` to the source location `span`.
 
-        Example: `expr` contains the name of the definition `a`, the text of `a` contains `b`, and the text of
-        `b` contains `span`. The result is (`a`, `b`). It is empty if `span` lies in `expr` itself, and None
-        if no name leads to `span`.
+        They are those of definitions, each in the text of the one before: none if `span` lies in `expr`
+        itself, and None if nothing leads to `span`.
         """
-        if _within(span, expr.span):
+        outer = expr.span
+        if span.source is outer.source and outer.start <= span.start and span.end <= outer.end:
             return ()
         for name in names_in(expr):
             body = self.definitions.get(name.name)
@@ -266,10 +274,7 @@ class _Words:
 
 
 def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
-    """Pairs (signal, offset in samples) that a predicate reads, in the order in which its text names them.
-
-    If the text contains the name of a definition, the signals in this definition come last.
-    """
+    """What a predicate reads, in the order in which its text names the signals; those of definitions last."""
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
     return sorted(
@@ -278,56 +283,37 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
 
 
 def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
-    """Yield the nodes of a tree of causes whose source is underlined.
+    """Yield the nodes to underline, none inside another.
 
-    Three kinds of nodes are underlined: left sides of implications, predicates, and the body of a temporal
-    operator if the body has the wrong truth value in the whole window. Nothing inside an underlined part is
-    underlined again.
+    These are left sides of implications, predicates, and temporal operators whose body has the wrong truth
+    value in the whole window.
     """
     if tree.premise or tree.until is not None or not tree.parts:
-        yield _body(tree)
+        yield tree
         return
     for part in tree.parts:
         yield from _labelled(part)
 
 
-def _deciding(tree: CauseNode) -> CauseNode:
-    """Node whose source is underlined first: it contains the predicate that decides the violation.
-
-    It is the body of a temporal operator if this body has the wrong truth value in the whole window.
-    Otherwise it is the predicate itself.
-    """
-    return _body(tree) if tree.until is not None or not tree.parts else _deciding(tree.parts[tree.main])
-
-
 def _closest(tree: CauseNode) -> bool:
-    """True if the predicate that decides the verdict fails at every instant of its window.
-
-    The explanation then shows the instant at which it comes closest to being true.
-    """
+    """True if the deciding predicate fails at every instant of its window."""
     if not tree.parts:
         return False
     part = tree.parts[tree.main]
     return _closest(part) or (tree.until is not None and not part.parts)
 
 
-def _body(node: CauseNode) -> CauseNode:
-    """Return a copy of `node` whose formula is the body of its temporal operator.
-
-    This is done only if the body has the wrong truth value in the whole window. Any other node is returned
-    unchanged.
-    """
+def _body(node: CauseNode) -> typed.Formula:
+    """The part to underline: of an operator whose body is wrong in the whole window, this body."""
     if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
-        return replace(node, formula=operands(node.formula)[-1])
-    return node
+        return operands(node.formula)[-1]
+    return node.formula
 
 
 def shown(value: float, column: Column) -> str:
     """Return a signal's value as text: the label of an enum member, else the number with its unit."""
-    for label, number in column.labels:
-        if number == value:
-            return label
-    return f"{value:.6g} {column.unit.text}".rstrip()
+    number = f"{value:.6g} {column.unit.text}".rstrip()
+    return next((label for label, worth in column.labels if worth == value), number)
 
 
 def names_in(expr: object) -> Iterator[ast.Name]:
@@ -344,10 +330,6 @@ def names_in(expr: object) -> Iterator[ast.Name]:
 
 def _definitions(spec: ast.Spec) -> dict[str, ast.Expr]:
     return {item.name: item.value for item in spec.items if isinstance(item, (ast.Def, ast.Region))}
-
-
-def _within(inner: Span, outer: Span) -> bool:
-    return inner.source is outer.source and outer.start <= inner.start and inner.end <= outer.end
 
 
 def _flat(text: str) -> str:

@@ -6,10 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
+from stlc.monitor.online.history import Floats
 
-Floats: TypeAlias = NDArray[np.float64]
 Ending: TypeAlias = Literal["open", "truncate"]
 
 
@@ -39,8 +37,7 @@ class RobustnessBounds(NamedTuple):
 class Tracker(Protocol):
     """Incremental evaluator of one requirement on a growing trace.
 
-    An instant is settled if later samples can no longer change the value there. Instants become settled in
-    order.
+    An instant is settled if later samples can no longer change its value. Instants are settled in order.
     """
 
     @property
@@ -48,13 +45,7 @@ class Tracker(Protocol):
         """Number of samples received."""
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples.
-
-        Args:
-            signals: signal name -> stored samples (stored, traces), up to the newest sample.
-            first: index in the trace of the first stored sample.
-            samples: number of samples that the trace now has.
-        """
+        """Add samples, now `samples` in total; `signals` has those from `first` on, (stored, traces) each."""
 
     @property
     def settled(self) -> int:
@@ -64,10 +55,7 @@ class Tracker(Protocol):
         """Bounds at the instants from `start` to `stop` (exclusive), over all continuations of the trace."""
 
     def ended(self, starts: range) -> RobustnessBounds:
-        """Final bounds on the robustness at the instants `starts`, now that the trace has ended.
-
-        A window that extends to the end of the trace now ends with the last sample.
-        """
+        """Bounds at the instants `starts`, if the trace, and windows to its end, end with the last sample."""
 
     def drop(self, start: int) -> int:
         """Free the memory of instants before `start`; returns the index of the first sample still needed."""

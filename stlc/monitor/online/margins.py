@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -13,13 +13,12 @@ from stlc.compile.ir.support import columns, history
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
-from stlc.monitor.online.history import ColumnHistory
+from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.trackers import RecomputeTracker
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
 
-Floats: TypeAlias = NDArray[np.float64]
 Counts: TypeAlias = NDArray[np.int64]
 
 
@@ -32,8 +31,7 @@ class Margin:
     Attributes:
         low: least robustness over all continuations of the trace. If the requirement is evaluated at every
             sample, this is the minimum over the windows that contain the latest sample.
-        high: greatest robustness over all continuations. If the requirement is evaluated at every sample,
-            this is the minimum over the same windows.
+        high: greatest robustness over all continuations, or its minimum over the same windows.
         violated: number of window starts at which the requirement is certainly violated.
         open: whether the requirement is undecided at any window start.
     """
@@ -44,11 +42,7 @@ class Margin:
     open: NDArray[np.bool_]
 
     def status(self, trace: int) -> Status:
-        """Status of one trace: `violated`, `satisfied` or `inconclusive`.
-
-        The status is violated if the requirement is violated at any window start, and satisfied if the
-        requirement is satisfied at every window start.
-        """
+        """Violated if violated at any window start of the trace, satisfied if at none and none is open."""
         if self.violated[trace]:
             return "violated"
         return "inconclusive" if self.open[trace] else "satisfied"
@@ -62,93 +56,59 @@ class _Watched:
     longer change the robustness there.
 
     Attributes:
-        rule: the requirement.
-        horizon: horizon `T` of the planning window in steps; None if unknown.
-        whole: evaluator of the bounds over all continuations of the traces.
+        everywhere: whether the requirement is evaluated at every sample or only at the first one.
+        ahead: number of later samples on which the value at an instant depends; None if it depends on all.
         next: the first window start that is not settled; all earlier window starts are settled.
-        violated: number of settled window starts that are violated, (traces,).
+        violated: number of settled window starts that are violated, (traces,) or 0.
         last: margins at the latest sample; None before the first evaluation.
     """
 
     rule: CompiledRequirement
-    horizon: int | None
-    whole: RecomputeTracker
+    tracker: RecomputeTracker
+    everywhere: bool
+    ahead: int | None
     next: int = 0
-    violated: Counts = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    violated: Counts | int = 0
     last: Margin | None = None
 
-    @property
-    def everywhere(self) -> bool:
-        """True if the requirement is evaluated at every sample, False if only at the first one."""
-        return self.rule.windowed and not self.rule.absolute and self.horizon is not None
+    @classmethod
+    def of(cls, rule: CompiledRequirement, horizon: int | None) -> _Watched:
+        everywhere = rule.windowed and not rule.absolute and horizon is not None
+        moving = window_of(rule, horizon)
+        ahead = max(rule.reach, moving or 0, (horizon or 0) if everywhere else 0)
+        to_end = rule.uses_end and moving is None
+        return cls(rule, RecomputeTracker(rule, horizon, "open"), everywhere, None if to_end else ahead)
 
     @property
-    def ahead(self) -> int | None:
-        """Number of later samples on which the value at an instant depends.
-
-        None if the value depends on all samples up to the end of the trace.
-        """
-        moving = window_of(self.rule, self.horizon)
-        if moving is not None:
-            return max(moving, self.rule.reach)
-        if self.rule.uses_end:
-            return None
-        counted = self.horizon if self.everywhere else None
-        return max(self.rule.reach, counted or 0)
-
     def needs(self) -> int:
         """Index of the first sample that later evaluations read."""
-        if not self.everywhere:
-            return 0
-        return max(self.next - history(self.rule.formula), 0)
+        return max(self.next - history(self.rule.formula), 0) if self.everywhere else 0
 
     def evaluate(self, env: Mapping[str, Floats], first: int, samples: int) -> Margin:
-        """Return the margin of the requirement at the latest sample.
+        """Return the margin of the requirement at the latest of `samples` samples.
 
-        The attributes `violated`, `next` and `last` are updated.
-
-        Args:
-            env: signal -> its stored samples, (stored, traces), beginning with sample `first`.
-            first: index of the first stored sample.
-            samples: number of samples received; the latest one has the index `samples` - 1.
+        `env` maps each signal to its stored samples, (stored, traces), from sample `first` on.
         """
-        if not self.everywhere and self.next:
-            assert self.last is not None
+        if self.last is not None and self.next and not self.everywhere:
             return self.last
         stop = samples if self.everywhere else 1
-        begin = max(self.needs(), first)  # a constant number of samples: its schedule is cached
-        starts = range(self.next - begin, stop - begin)
-        self.whole.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
-        shape = (len(starts), next(iter(env.values())).shape[1])
-        low, high = (np.broadcast_to(end, shape) for end in self.whole.of_all(starts))
-        fails, holds = high < -TOLERANCE, low >= -TOLERANCE
-        if len(self.violated) != low.shape[1]:
-            self.violated = np.zeros(low.shape[1], dtype=np.int64)
-        shown = self._shown(samples)
-        self.last = Margin(
-            low[shown:].min(0),
-            high[shown:].min(0),
-            self.violated + fails.sum(0),
-            np.logical_or.reduce(~fails & ~holds, axis=0),
+        begin = max(self.needs, first)  # a constant number of samples: its schedule is cached
+        self.tracker.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
+        shape = (stop - self.next, next(iter(env.values())).shape[1])
+        low, high = (
+            np.broadcast_to(end, shape) for end in self.tracker.of_all(range(self.next - begin, stop - begin))
         )
-        settled = self._settled(samples) - self.next
+        fails, holds = high < -TOLERANCE, low >= -TOLERANCE
+        whole = 0 if self.ahead is None else max(samples - self.ahead, 0)  # instants with complete windows
+        shown = max(whole - 1 - self.next, 0) if self.everywhere else 0
+        violated = self.violated + fails.sum(0)
+        undecided = np.logical_or.reduce(~fails & ~holds, axis=0)
+        self.last = Margin(low[shown:].min(0), high[shown:].min(0), violated, undecided)
+        settled = min(whole, stop) - self.next
         if settled > 0:
             self.violated = self.violated + fails[:settled].sum(0)
             self.next += settled
         return self.last
-
-    def _settled(self, samples: int) -> int:
-        """Index of the first window start whose robustness may still change after `samples` samples."""
-        if self.ahead is None:
-            return 0
-        whole = max(samples - self.ahead, 0)
-        return whole if self.everywhere else min(whole, 1)
-
-    def _shown(self, samples: int) -> int:
-        """Number of samples after `next` whose windows have ended; the margin leaves them out."""
-        if not self.everywhere or self.ahead is None:
-            return 0
-        return max(samples - 1 - self.ahead - self.next, 0)
 
 
 class Margins:
@@ -163,7 +123,7 @@ class Margins:
     """
 
     def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:
-        self._watched = [_Watched(rule, horizon, RecomputeTracker(rule, horizon, "open")) for rule in rules]
+        self._watched = [_Watched.of(rule, horizon) for rule in rules]
         self._names = sorted({name for rule in rules for name in columns(rule.formula)})
         self._history = ColumnHistory()
         self._found: dict[str, Margin] = {}
@@ -190,5 +150,5 @@ class Margins:
             env, first = self._history.columns(), self._history.first
             found = [each.evaluate(env, first, self.samples) for each in self._watched]
             self._found, self._evaluated = dict(zip(self.requirements, found, strict=True)), self.samples
-            self._history.forget(min([each.needs() for each in self._watched], default=self.samples))
+            self._history.forget(min([each.needs for each in self._watched], default=self.samples))
         return self._found

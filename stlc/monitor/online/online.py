@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import TOLERANCE
@@ -17,18 +16,16 @@ from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.online.bounds import RobustnessBounds, Tracker, TrackingOptions
-from stlc.monitor.online.history import ColumnHistory
+from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.paced import PacedTracker
 from stlc.monitor.online.tally import Flags, JudgedInstants, RequirementSummary
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
 from stlc.monitor.online.trackers import Trackers
-from stlc.monitor.signals import Gap, Need, arrange, needs_of, not_finite
+from stlc.monitor.signals import Gap, Need, arrange, needs_of
 from stlc.trace import Trace
 
-Floats: TypeAlias = NDArray[np.float64]
 Sample: TypeAlias = Mapping[str, Any]
 """Signal -> number; a vector is a list of them."""
-
 
 _BEYOND_FLOATS = 1 << 1023
 
@@ -88,8 +85,7 @@ class Watched:
         everywhere: whether the requirement is evaluated at every sample or only at one.
         values: evaluator of the robustness.
         truths: evaluator of truth values, +inf or -inf; None if the tolerance is not 0.
-        tolerance: the requirement is satisfied if its robustness is at least minus this value. If it is 0,
-            the truth values of the predicates decide.
+        tolerance: the tolerance, as in `How`.
         tally: summary of the instants whose verdict is final; these instants are called counted.
         decided: whether an instant already has a verdict, (instants,). The first entry belongs to the first
             instant that is not counted.
@@ -108,6 +104,17 @@ class Watched:
         """The evaluator of robustness and, if the tolerance is 0, the evaluator of truth values."""
         return (self.values,) if self.truths is None else (self.values, self.truths)
 
+    @property
+    def over(self) -> bool:
+        """True if the requirement is evaluated only once, and its verdict is final."""
+        return not self.everywhere and self.tally.instants > 0
+
+    @property
+    def pending(self) -> range:
+        """The received instants that are not yet part of the summary `tally`."""
+        samples = self.values.samples
+        return range(self.tally.next, samples if self.everywhere else min(self.tally.first + 1, samples))
+
     def grow(self, history: ColumnHistory) -> None:
         """Pass new samples to the evaluators."""
         if self.over or self.values.samples == history.samples:
@@ -120,14 +127,11 @@ class Watched:
         """True if the requirement is to be evaluated now that `samples` samples have been received."""
         return not self.over and (not isinstance(self.values, PacedTracker) or self.values.due(samples))
 
-    @property
-    def over(self) -> bool:
-        """True if the requirement is evaluated only once, and its verdict is final."""
-        return not self.everywhere and self.tally.instants > 0
-
-    def judged(self, start: int, stop: int) -> JudgedInstants:
-        """Return bounds and verdicts at the instants from `start` up to `stop` while the trace continues."""
-        return self._judged(*(tracker.live(start, stop) for tracker in self.trackers))
+    def judged(self, starts: range) -> JudgedInstants:
+        """Return bounds and verdicts at the instants `starts` while the trace continues."""
+        if not starts:
+            return self._judged(RobustnessBounds(np.zeros(0), np.zeros(0)))
+        return self._judged(*(tracker.live(starts.start, starts.stop) for tracker in self.trackers))
 
     def ended(self, starts: range) -> JudgedInstants:
         """Return bounds and verdicts at the instants `starts` once the trace has ended."""
@@ -140,10 +144,7 @@ class Watched:
         return JudgedInstants(low, high, truths.low > 0, truths.high < 0)
 
     def drop(self) -> int:
-        """Free the memory of instants whose value is final.
-
-        Returns the index of the first sample that is still needed.
-        """
+        """Free the memory of final instants; return the index of the first sample that is still needed."""
         return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in self.trackers)
 
 
@@ -161,6 +162,7 @@ class Online:
         self.how = how or How()
         self.compiled = compiled
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
+        self._names = [need.column.name for need in self._needs]
         self.gaps: dict[str, Gap] = {}
         """Samples at which signals are unknown."""
         self._history = ColumnHistory()
@@ -178,15 +180,12 @@ class Online:
             message = f"`{rule.name}` runs to the end: at every start it would stay open until then"
             raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
         ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
-        trackers = [
-            self._trackers.of(rule, TrackingOptions(ending, truth, begin), everywhere=everywhere)
-            for truth in ((False, True) if self.how.tolerance == 0 else (False,))
-        ]
-        truths = trackers[1] if trackers[1:] else None
+        options = TrackingOptions(ending, begin=begin)
+        values, truths = self._trackers.of(rule, options, everywhere=everywhere), None
+        if self.how.tolerance == 0:
+            truths = self._trackers.of(rule, replace(options, truth=True), everywhere=everywhere)
         tally = RequirementSummary(low_at=begin, high_at=begin, first=begin)
-        return Watched(rule, everywhere, trackers[0], truths, self.how.tolerance, tally)
-
-    # ------------------------------------------------------------------------ samples
+        return Watched(rule, everywhere, values, truths, self.how.tolerance, tally)
 
     def push(self, sample: Sample) -> tuple[Decision, ...]:
         """Add one sample; return the verdicts that this sample decides, in the order of the requirements.
@@ -194,22 +193,18 @@ class Online:
         NaN is an unknown value.
 
         Raises:
-            TraceError: E601, a signal is missing; E604, a value is infinite; E605, a value is not a single
-                number.
+            TraceError: E601, a signal is missing; E605, a value is not a single number.
         """
         values = [_number(sample, need) for need in self._needs]
-        for need, value in zip(self._needs, values, strict=True):
-            if not math.isfinite(value):
-                self._unknown(need, np.array([value]))
         rows = np.array(values).reshape(-1, 1, 1)
-        self._take({need.column.name: row for need, row in zip(self._needs, rows, strict=True)}, 1)
+        holes = [name for name, value in zip(self._names, values, strict=True) if math.isnan(value)]
+        self._take(dict(zip(self._names, rows, strict=True)), 1, holes)
         found: list[Decision] = []
         for watched in self._watched:
             if watched.due(self.samples):
                 watched.grow(self._history)
-                self._decide(watched, found)
-        self._count_settled(self._scope)
-        self._trim()
+                found += self._decide(watched)
+        self._settle(self._scope)
         return tuple(found)
 
     def feed(self, signals: Mapping[str, Any] | Trace) -> None:
@@ -222,111 +217,65 @@ class Online:
         """
         laid = arrange(signals, self._needs, plain=True)
         columns = {name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()}
-        for need in self._needs:
-            values = columns[need.column.name][:, 0]
-            if not np.isfinite(values).all():
-                self._unknown(need, values)
-        self._take(columns, laid.samples)
-        self._count_settled((*self._watched, *self._scope))
-        self._trim()
+        self._take(columns, laid.samples, [name for name in self._names if np.isnan(columns[name]).any()])
+        self._settle((*self._watched, *self._scope))
 
-    def _unknown(self, need: Need, values: Floats) -> None:
-        """Count the unknown samples (NaN) of the signal `need`, and record the result in `gaps`.
-
-        The array `values`, (samples,), contains the next samples of the signal. Raises TraceError (E604) if a
-        value is infinite.
-        """
-        if np.isinf(values).any():
-            first = int(np.argmax(np.isinf(values)))
-            moment = f"sample {self.samples + first}"
-            finding = not_finite(f"`{need.column.name}`", values[first], moment, need)
-            raise TraceError(finding)
-        gap = self.gaps.get(need.column.name, Gap())
-        self.gaps[need.column.name] = gap.with_more(np.isnan(values), self.samples)
-
-    def _take(self, columns: dict[str, Floats], count: int) -> None:
-        """Store `count` samples: arrays (count, 1) by signal name.
-
-        If the trace buffer (`TraceBuffer`) is full, the causes of the worst violations are stored, and then
-        the older half of the samples in the buffer is dropped.
-        """
+    def _take(self, columns: dict[str, Floats], count: int, holes: Sequence[str]) -> None:
+        """Store `count` samples: arrays (count, 1) by signal name; `holes` have unknown samples."""
+        for name in holes:
+            self.gaps[name] = self.gaps.get(name, Gap()).with_more(np.isnan(columns[name]), self.samples)
         columns = columns or {"": np.zeros((count, 1))}
-        if self._buffer is not None:
-            self._buffer.take(columns, count)
         self._history.take(columns, count)
-        if self._buffer is not None and self._buffer.full:
-            for watched in self._watched:
-                if (worst := self._worst(watched)) is not None:
-                    self._buffer.remember(watched.rule, worst)
-            self._buffer.forget()
+        if self._buffer is None:
+            return
+        self._buffer.take(columns, count)
+        if self._buffer.full:
+            found = [(watched.rule, self._worst(watched)) for watched in self._watched]
+            self._buffer.forget([(rule, worst) for rule, worst in found if worst is not None])
 
-    def _trim(self) -> None:
-        alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
-        self._history.forget(min((watched.drop() for watched in alive), default=self.samples))
-
-    # ----------------------------------------------------------------------- verdicts
-
-    def _pending(self, watched: Watched) -> tuple[int, int]:
-        """Range (start, stop) of the received instants that are not yet part of the summary `tally`."""
-        start, first, samples = watched.tally.next, watched.tally.first, watched.values.samples
-        return (start, samples if watched.everywhere else max(min(first + 1, samples), first))
-
-    def _decide(self, watched: Watched, found: list[Decision]) -> None:
-        """Append to `found` the verdicts that the latest sample decides.
-
-        Instants whose value can no longer change are added to the summary `tally`.
-        """
-        start, stop = self._pending(watched)
-        judged = watched.judged(start, stop)
+    def _decide(self, watched: Watched) -> list[Decision]:
+        """Return the verdicts that the latest sample decides, and count the final instants."""
+        found: list[Decision] = []
+        starts = watched.pending
+        judged = watched.judged(starts)
         known = judged.holds | judged.fails
         if np.count_nonzero(known) > np.count_nonzero(watched.decided):
             new = known.copy()
             new[: len(watched.decided)] &= ~watched.decided
-            found += [self._decision(watched.rule, judged, start, i) for i in np.flatnonzero(new).tolist()]
-        count = self._count(watched, judged)
+            for i in np.flatnonzero(new).tolist():
+                status: Status = "violated" if judged.fails[i] else "satisfied"
+                low, high, start = float(judged.low[i]), float(judged.high[i]), starts[i]
+                decision = Decision(
+                    watched.rule.name, start, self.time(start), status, low, high, self.samples - 1
+                )
+                found.append(decision)
+        count = min(max(self._countable(watched) - starts.start, 0), len(known))
+        watched.tally.add(judged, count)
         watched.decided = known[count:]
-
-    def _decision(self, rule: CompiledRequirement, judged: JudgedInstants, start: int, i: int) -> Decision:
-        status: Status = "violated" if judged.fails[i] else "satisfied"
-        low, high = float(judged.low[i]), float(judged.high[i])
-        return Decision(rule.name, start + i, self.time(start + i), status, low, high, self.samples - 1)
+        return found
 
     def _countable(self, watched: Watched) -> int:
-        """The first instant that cannot yet be added to the summary of final verdicts.
-
-        Its value may still change, or its window is incomplete.
-        """
+        """The first instant whose value may still change, or whose window is incomplete."""
         if not watched.everywhere:
             return watched.values.settled
         window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
         return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
 
-    def _count(self, watched: Watched, judged: JudgedInstants) -> int:
-        """Add the final instants of `judged` to the summary `tally`; return the number of these instants.
-
-        An instant is final if its value can no longer change.
-        """
-        count = min(max(self._countable(watched) - watched.tally.next, 0), len(judged.low))
-        watched.tally.add(judged, count)
-        return count
-
-    def _count_settled(self, requirements: Sequence[Watched]) -> None:
-        """Pass the latest samples to the evaluators of `requirements`, and update the summaries.
-
-        The summary of a requirement covers the instants whose value can no longer change.
-        """
+    def _settle(self, requirements: Sequence[Watched]) -> None:
+        """Count the final instants of `requirements`, and drop the samples that no requirement needs."""
         for watched in requirements:
             if watched.due(self.samples):
                 watched.grow(self._history)
-                start, stop = self._pending(watched)
-                self._count(watched, watched.judged(start, min(stop, self._countable(watched))))
+                starts = watched.pending
+                judged = watched.judged(range(starts.start, min(starts.stop, self._countable(watched))))
+                watched.tally.add(judged, len(judged.low))
+        alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
+        self._history.forget(min((watched.drop() for watched in alive), default=self.samples))
 
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; the sample number if the time step is unknown."""
         dt = self.compiled.grid.dt
         return float(sample) if dt is None else self.how.t0 + sample * float(dt)
-
-    # ------------------------------------------------------------------------- answers
 
     @property
     def requirements(self) -> tuple[str, ...]:
@@ -354,16 +303,13 @@ class Online:
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
         """Return the bounds on the robustness of the requirement `name` that are not final yet.
 
-        There is one triple (sample, least robustness, greatest robustness) for each sample at which the
-        robustness may still change.
+        There is one triple (sample, least robustness, greatest robustness) for each such sample.
         """
         watched = self._find(name)
-        if watched.over or not self.samples:
-            return []
         watched.grow(self._history)
-        start, stop = self._pending(watched)
-        bounds = watched.values.live(start, min(stop, self.samples))
-        return [(start + i, float(a), float(b)) for i, (a, b) in enumerate(zip(*bounds, strict=True))]
+        starts = watched.pending
+        bounds = watched.values.live(starts.start, starts.stop) if starts else ((), ())
+        return [(start, float(a), float(b)) for start, a, b in zip(starts, *bounds, strict=True)]
 
     def standing(self, name: str) -> RequirementSummary:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.
@@ -373,17 +319,12 @@ class Online:
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> RequirementSummary:
-        if watched.over or not self.samples:
-            return watched.tally
         watched.grow(self._history)
-        start, stop = self._pending(watched)
-        return watched.tally.with_more(watched.judged(start, min(stop, self.samples)))
+        return watched.tally.with_more(watched.judged(watched.pending))
 
     @property
     def in_scope(self) -> bool | None:
         """True if the assumptions hold at the first sample, False if they fail, None if that is undecided."""
-        if not self.samples:
-            return None if self._scope else True
         found = {self._standing(watched).status for watched in self._scope}
         if "violated" in found:
             return False
@@ -399,24 +340,22 @@ class Online:
         """
         if not self.samples:
             raise TraceError(Diagnostic("E605", "there are no samples"))
-        found: dict[str, RequirementSummary] = {}
-        refused: list[Diagnostic] = []
-        for watched in self._watched:
-            starts = self._starts(watched)
-            if self.how.end == "strict":
-                finding = check_length(watched.rule, self.samples, starts, self.compiled.grid)
-                refused += [] if finding is None else [finding]
-            found[watched.rule.name] = self._ended(watched, starts)
-        if refused:
-            raise TraceError(*refused)
-        return found
+        if self.how.end == "strict":
+            findings = [
+                check_length(each.rule, self.samples, self._starts(each), self.compiled.grid)
+                for each in self._watched
+            ]
+            if refused := [finding for finding in findings if finding is not None]:
+                raise TraceError(*refused)
+        return {watched.rule.name: self._ended(watched) for watched in self._watched}
 
     def _starts(self, watched: Watched) -> range:
         return starts_of(watched.rule, self.samples, self.compiled.grid.horizon, self.how.at)
 
-    def _ended(self, watched: Watched, starts: range) -> RequirementSummary:
-        """Summary of a requirement at the instants `starts` if the trace ends now."""
+    def _ended(self, watched: Watched) -> RequirementSummary:
+        """Summary of a requirement if the trace ends now."""
         watched.grow(self._history)
+        starts = self._starts(watched)
         rest = range(min(watched.tally.next, starts.stop), starts.stop)
         return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
 
@@ -424,7 +363,7 @@ class Online:
         """Worst violation of a requirement if the trace ended now; None if it would not be violated."""
         if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
             return None
-        tally = self._ended(watched, self._starts(watched))
+        tally = self._ended(watched)
         return Worst(tally.high_at, tally.high) if tally.fails else None
 
     def cause(self, name: str) -> Cause | None:
@@ -436,8 +375,9 @@ class Online:
         samples show.
         """
         watched = self._find(name)
-        worst = None if self._buffer is None else self._worst(watched)
-        return None if self._buffer is None or worst is None else self._buffer.cause(watched.rule, worst)
+        if self._buffer is None or (worst := self._worst(watched)) is None:
+            return None
+        return self._buffer.cause(watched.rule, worst)
 
     def _find(self, name: str) -> Watched:
         for watched in self._watched:
@@ -447,10 +387,7 @@ class Online:
 
 
 def _number(sample: Sample, need: Need) -> float:
-    """Return the value of the signal `need` in a sample.
-
-    If the sample contains a vector `q`, the signal `q[0]` is its first component.
-    """
+    """Return the value of a signal in a sample; `q[0]` is the first component of a vector `q`."""
     value = sample.get(need.column.name)
     if isinstance(value, float):
         return value

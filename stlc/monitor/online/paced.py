@@ -16,7 +16,9 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, reach
 from stlc.compile.ir.traverse import map_children, nodes, operands
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.monitor.online.bounds import Floats, RobustnessBounds, Tracker
+from stlc.monitor.online.bounds import RobustnessBounds, Tracker
+from stlc.monitor.online.history import Floats
+from stlc.monitor.online.streams import unbounded
 from stlc.monitor.prefix_bounds import FAR, own_span
 
 WIDE = 1 << 13
@@ -41,15 +43,8 @@ _FROZEN = 500
 """Overhead of one instant of a `freeze`, in rows, without its body."""
 
 
-# ---------------------------------------------------------------------------- measures
-
-
 def span(formula: ir.Formula) -> Reach:
-    """Return the lookback and the lookahead of a formula in samples.
-
-    The values of nested operators are added. If an operator has several operands, the greatest value counts.
-    An unbounded window `[a, inf)` counts as `a` samples.
-    """
+    """Return the lookback and the lookahead of a formula in samples; `[a, inf)` counts as `a` samples."""
     below = [Reach(0, 0), *map(span, operands(formula))]
     own = own_span(formula)
     return Reach(own.past + max(each.past for each in below), own.future + max(e.future for e in below))
@@ -63,8 +58,7 @@ class PacedWork:
 
     Attributes:
         rows: number of all rows.
-        own: number of rows that only one evaluated instant uses, such as those inside a `freeze`. Several
-            instants share the other rows.
+        own: number of rows that only one evaluated instant uses, such as those inside a `freeze`.
         heaviest: the subformula to which most of the rows in `own` belong.
     """
 
@@ -80,13 +74,10 @@ class PacedWork:
 def work(formula: ir.Formula, instants: int, samples: int = 0) -> PacedWork:
     """Return the work of one evaluation of a formula at several instants.
 
-    Args:
-        formula: the formula to evaluate.
-        instants: number of instants.
-        samples: width in samples that is assumed for an unbounded window.
+    `samples` is the width that is assumed for an unbounded window.
     """
     if isinstance(formula, ir.Freeze):
-        spanned = sum(span(formula.body)) + (samples if _unbounded(formula.body) else 0)
+        spanned = sum(span(formula.body)) + (samples if unbounded(formula.body) else 0)
         own = instants * (_FROZEN + spanned + work(formula.body, 1, samples).rows)
         return PacedWork(own, own, formula)
     rows, instants = 0, 1 if isinstance(formula, ir.AtStart) else instants
@@ -96,14 +87,6 @@ def work(formula: ir.Formula, instants: int, samples: int = 0) -> PacedWork:
         instants += samples if window.hi is None else window.hi - skipped
         rows = instants
     return sum((work(part, instants, samples) for part in operands(formula)), PacedWork(rows))
-
-
-def _unbounded(formula: ir.Formula) -> bool:
-    """True if the formula has an unbounded window, in the future or in the past."""
-    return any(isinstance(node, ir.Windowed) and node.window.hi is None for node in nodes(formula))
-
-
-# ------------------------------------------------------------------------------ cutting
 
 
 def cut(formula: ir.Formula, samples: int) -> ir.Formula:
@@ -117,31 +100,23 @@ def cut(formula: ir.Formula, samples: int) -> ir.Formula:
     windows are shortened. If both are wide, the formula is returned unchanged.
     """
     past, future = span(formula)
-    slack = sum(1 for _ in nodes(formula))
-    if past <= _NARROW:
-        return _cut(formula, Reach(FAR, samples + past + slack))
-    if future <= _NARROW:
-        return _cut(formula, Reach(samples + future + slack, FAR))
-    return formula
-
-
-def _cut(formula: ir.Formula, most: Reach) -> ir.Formula:
-    """Return the formula with windows and shifts of at most `most` (lookback, lookahead) samples.
-
-    Formulas inside a `freeze` are not changed.
-    """
-    if isinstance(formula, (ir.Freeze, ir.AtStart)):
+    if past > _NARROW and future > _NARROW:
         return formula
-    if isinstance(formula, ir.Windowed):
-        longest, window = most.past if formula.back else most.future, formula.window
-        shorter = ir.Window(min(window.lo, longest), None if window.hi is None else min(window.hi, longest))
-        formula = replace(formula, window=shorter)
-    elif isinstance(formula, ir.Shift):
-        formula = replace(formula, steps=max(min(formula.steps, most.future), -most.past))
-    return map_children(formula, formulas=lambda part: _cut(part, most))
+    slack = samples + sum(1 for _ in nodes(formula))
+    most = Reach(FAR, slack + past) if past <= _NARROW else Reach(slack + future, FAR)
 
+    def shorter(part: ir.Formula) -> ir.Formula:
+        if isinstance(part, (ir.Freeze, ir.AtStart)):
+            return part
+        if isinstance(part, ir.Windowed):
+            longest, window = most.past if part.back else most.future, part.window
+            hi = None if window.hi is None else min(window.hi, longest)
+            part = replace(part, window=ir.Window(min(window.lo, longest), hi))
+        elif isinstance(part, ir.Shift):
+            part = replace(part, steps=max(min(part.steps, most.future), -most.past))
+        return map_children(part, formulas=shorter)
 
-# ------------------------------------------------------------------------------- pacing
+    return shorter(formula)
 
 
 @dataclass(slots=True)
@@ -150,8 +125,7 @@ class PacedTracker:
 
     Attributes:
         rule: the requirement.
-        make: function that returns an evaluator of a requirement. Its argument is `rule`, or a copy of `rule`
-            with shorter windows.
+        make: returns an evaluator of `rule`, or of a copy of it with shorter windows.
         everywhere: whether the requirement is evaluated at every instant or only at the first one.
         stores_all: whether the evaluator stores and reads all samples.
         window: number of samples from each instant to the end of its planning window; None if the instants
@@ -166,16 +140,13 @@ class PacedTracker:
     window: int | None = None
     samples: int = 0
     _inner: Tracker = field(init=False)
+    _formula: ir.Formula = field(init=False)
     _most: int | None = 0
     _pace: int = 1
 
     def effort(self, formula: ir.Formula, spanned: int) -> PacedWork:
-        """Return the work of one evaluation of `formula` on a part of the trace.
-
-        The part consists of `spanned` consecutive samples. `formula` is the formula of the requirement, or a
-        copy with shorter windows.
-        """
-        many = self.everywhere or _unbounded(formula)
+        """Return the work of one evaluation on `spanned` samples; `formula` may have shorter windows."""
+        many = self.everywhere or unbounded(formula)
         found = work(formula, spanned if many else 1, spanned if self.stores_all else 0)
         own = (self.window or 0) * (spanned if self.everywhere else 1)
         return found + PacedWork(own, own, formula) if self.window is not None else found
@@ -185,28 +156,23 @@ class PacedTracker:
         return samples - self.samples >= self._pace
 
     def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Add new samples, evaluate, and choose after how many samples to evaluate next.
-
-        `signals` contains the stored samples, from sample `first` to sample `samples` - 1.
-        """
+        """Add new samples, evaluate, and choose after how many samples to evaluate next."""
         if self._most is not None and samples > self._most:
             most = max(samples, _SHORT) * _GROWN
-            formula = cut(self.rule.formula, most)
-            whole = formula == self.rule.formula
+            self._formula = cut(self.rule.formula, most)
+            whole = self._formula == self.rule.formula
             self._most = None if whole else most
-            shorter = replace(self.rule, formula=formula, reach=reach(formula).future)
+            shorter = replace(self.rule, formula=self._formula, reach=reach(self._formula).future)
             self._inner = self.make(self.rule if whole else shorter)
         self._inner.grow(signals, first, samples)
         self.samples = samples
-        formula = self.rule.formula if self._most is None else cut(self.rule.formula, self._most)
         whole_span = sum(span(self.rule.formula)) + (self.window or 0)
         spanned = samples if self.stores_all else min(self._most or samples, whole_span)
-        rows = self.effort(formula, spanned).rows
+        rows = self.effort(self._formula, spanned).rows
         self._pace = max(min(rows // WIDE, min(samples, spanned) // _LATE), 1)
 
     @property
     def settled(self) -> int:
-        """Index of the first instant whose value later samples may still change."""
         return self._inner.settled
 
     def live(self, start: int, stop: int) -> RobustnessBounds:
@@ -216,9 +182,6 @@ class PacedTracker:
         return self._inner.ended(starts)
 
     def drop(self, start: int) -> int:
-        """Free the memory of instants before `start`; returns the index of the first sample still needed.
-
-        While windows are shortened, all samples are needed, since windows may be lengthened later.
-        """
+        """While windows are shortened, all samples are needed, since windows may be lengthened later."""
         needed = self._inner.drop(start)
         return needed if self._most is None else 0

@@ -7,7 +7,6 @@ are bounded.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -24,45 +23,36 @@ class EndlessError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class PredicateColumn:
-    """Column (time series) of the robustness of a predicate, computed from the signals.
+class DerivedColumn:
+    """Column (time series) of robustness values of a predicate or of an unbounded past operator.
+
+    A past operator is computed recursively. With the previous value `last`, `once` is max(body, last), and
+    `since` is min(left, max(right, last)). `historically` and `trigger` are the same with min and max
+    exchanged.
 
     Attributes:
         name: name of the column.
-        formula: a predicate, or a `freeze` around one formula.
-        back: lookback in samples.
-        ahead: lookahead in samples.
+        op: the past operator; None for a predicate, or a `freeze` around one formula.
+        parts: operands of the past operator, as formulas over other columns, or the predicate.
+        back: lookback of `parts` in samples.
+        ahead: lookahead of `parts` in samples.
     """
 
     name: str
-    formula: ir.Formula
-    back: int
-    ahead: int
-
-
-@dataclass(frozen=True, slots=True)
-class RecursiveColumn:
-    """Column (time series) of an unbounded past operator, computed recursively from its previous value.
-
-    With the previous value `last`, `once` is max(body, last), and `since` is min(left, max(right, last)).
-    `historically` and `trigger` are the same with min and max exchanged.
-
-    Attributes:
-        name: name of the column.
-        op: the past operator.
-        parts: operands of the operator, as formulas over other columns.
-        back: lookback of the operands in rows.
-        ahead: lookahead of the operands in rows.
-    """
-
-    name: str
-    op: RecursiveOp
+    op: RecursiveOp | None
     parts: tuple[ir.Formula, ...]
     back: int
     ahead: int
 
+    @property
+    def reads(self) -> frozenset[str]:
+        """Names of the columns from which this one is computed; a predicate is computed from signals."""
+        return frozenset().union(*map(names_of_columns, self.parts if self.op else ()))
 
-DerivedColumn: TypeAlias = PredicateColumn | RecursiveColumn
+    @property
+    def pointwise(self) -> bool:
+        """True for a predicate that reads signals only at the sample at which it is evaluated."""
+        return not (self.op or self.back or self.ahead or isinstance(self.parts[0], ir.Freeze))
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,24 +70,15 @@ class ColumnPlan:
     lag: int
 
 
-def _lag(streams: Sequence[DerivedColumn]) -> int:
-    lags: dict[str, int] = {}
-    for stream in streams:
-        before = max((lags[name] for name in read_by(stream)), default=0)
-        lags[stream.name] = stream.ahead + before
-    return max(lags.values(), default=0)
-
-
-def read_by(stream: DerivedColumn) -> frozenset[str]:
-    """Return the names of the columns (time series) from which a column is computed."""
-    parts = () if isinstance(stream, PredicateColumn) else stream.parts
-    return frozenset().union(*map(names_of_columns, parts))
-
-
 def endless(formula: ir.Formula) -> bool:
     """True if the formula has an unbounded future window."""
     windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
     return any(node.window.hi is None and not node.back for node in windowed)
+
+
+def unbounded(formula: ir.Formula) -> bool:
+    """True if the formula has an unbounded window, in the future or in the past."""
+    return any(isinstance(node, ir.Windowed) and node.window.hi is None for node in nodes(formula))
 
 
 def column(name: str) -> ir.Predicate:
@@ -105,7 +86,9 @@ def column(name: str) -> ir.Predicate:
     return ir.Predicate(ir.Signal(name))
 
 
-# ------------------------------------------------------------------------- planning
+def looks_on(formula: ir.Formula) -> int:
+    """Greatest lookahead of a predicate in samples, from the instant at which it is evaluated."""
+    return max((farthest(num).future for num in numbers(formula)), default=0)
 
 
 def plan(formula: ir.Formula) -> ColumnPlan:
@@ -117,7 +100,10 @@ def plan(formula: ir.Formula) -> ColumnPlan:
     planner = _Planner()
     over_columns = planner.over_columns(formula)
     streams = tuple(planner.streams.values())
-    return ColumnPlan(over_columns, streams, _lag(streams))
+    lags: dict[str, int] = {}
+    for stream in streams:
+        lags[stream.name] = stream.ahead + max((lags[name] for name in stream.reads), default=0)
+    return ColumnPlan(over_columns, streams, max(lags.values(), default=0))
 
 
 @dataclass(slots=True)
@@ -128,38 +114,24 @@ class _Planner:
         """Replace predicates and unbounded past operators by columns, which are added to `streams`."""
         match formula:
             case ir.Predicate():
-                return self._leaf(formula)
+                return self._column(None, (formula,), max(reach(formula).future, looks_on(formula)))
             case ir.Freeze():
-                return self._frozen(formula)
+                if unbounded(formula) or any(isinstance(node, ir.AtStart) for node in nodes(formula)):
+                    raise EndlessError
+                return self._column(None, (formula,), reach(formula).future + looks_on(formula))
             case ir.AtStart():
                 raise EndlessError
-            case ir.PastTemporal() | ir.Since():
+            case ir.PastTemporal(window=ir.Window(hi=None)) | ir.Since(window=ir.Window(hi=None)):
                 return self._past(map_children(formula, formulas=self.over_columns))
             case _:
                 return map_children(formula, formulas=self.over_columns)
 
-    def _leaf(self, formula: ir.Formula) -> ir.Formula:
-        if formula not in self.streams:
-            ahead, reads = reach(formula).future, looks_on(formula)
-            ahead = max(ahead, reads) if isinstance(formula, ir.Predicate) else ahead + reads
-            self.streams[formula] = PredicateColumn(f"#{len(self.streams)}", formula, history(formula), ahead)
-        return column(self.streams[formula].name)
-
-    def _frozen(self, formula: ir.Freeze) -> ir.Formula:
-        for node in nodes(formula):
-            if isinstance(node, ir.AtStart) or (isinstance(node, ir.Windowed) and node.window.hi is None):
-                raise EndlessError
-        return self._leaf(formula)
-
     def _past(self, formula: ir.PastTemporal | ir.Since) -> ir.Formula:
-        """Rewrite a past operator whose operands are formulas over columns.
-
-        An unbounded operator `op[a, inf)` is replaced by the column of `op[0, inf)`, read `a` samples
-        earlier.
-        """
-        if formula.window.hi is not None:
-            return formula
-        value, first = self._recursive(formula.op, operands(formula)), formula.window.lo
+        """Replace `op[a, inf)` over columns by the column of `op[0, inf)`, read `a` samples earlier."""
+        parts, first = operands(formula), formula.window.lo
+        if any(map(endless, parts)):
+            raise EndlessError
+        value = self._column(formula.op, parts, max(reach(part).future for part in parts))
         if not first:
             return value
         dual = formula.op in ("historically", "trigger")
@@ -169,20 +141,8 @@ class _Planner:
         recent = ir.PastTemporal("once" if dual else "historically", ir.Window(0, first - 1), formula.left)
         return ir.BoolOp("or" if dual else "and", (recent, earlier))
 
-    def _recursive(self, op: RecursiveOp, parts: tuple[ir.Formula, ...]) -> ir.Formula:
-        if any(map(endless, parts)):
-            raise EndlessError
-        key = (op, parts)
-        if key not in self.streams:
-            back, ahead = max(map(history, parts)), max(reach(part).future for part in parts)
-            self.streams[key] = RecursiveColumn(f"#{len(self.streams)}", op, parts, back, ahead)
-        return column(self.streams[key].name)
-
-
-def looks_on(formula: ir.Formula) -> int:
-    """Return how far ahead the predicates of a formula read signals, in samples.
-
-    The distance is counted from the instant at which a predicate is evaluated. The result is the greatest
-    distance over all predicates.
-    """
-    return max((farthest(num).future for num in numbers(formula)), default=0)
+    def _column(self, op: RecursiveOp | None, parts: tuple[ir.Formula, ...], ahead: int) -> ir.Predicate:
+        if (op, parts) not in self.streams:
+            name = f"#{len(self.streams)}"
+            self.streams[op, parts] = DerivedColumn(name, op, parts, max(map(history, parts)), ahead)
+        return column(self.streams[op, parts].name)

@@ -10,19 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.monitor.judgement import Status
+from stlc.monitor.online.history import Floats
 
-Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
 class JudgedInstants(NamedTuple):
-    """Bounds and verdicts at consecutive instants, (instants,) each.
+    """Bounds on the robustness and verdicts at consecutive instants, (instants,) each.
 
-    Attributes:
-        low: least robustness over all continuations of the trace.
-        high: greatest robustness over all continuations.
-        holds: whether the requirement is certainly satisfied, that is, for all samples that may follow.
-        fails: whether the requirement is certainly violated.
+    The requirement certainly `holds` or `fails` if it does so for all samples that may follow.
     """
 
     low: Floats
@@ -58,22 +54,16 @@ class RequirementSummary:
 
     def add(self, judged: JudgedInstants, count: int) -> None:
         """Add the first `count` instants of `judged`; they must follow the instants already counted."""
-        if count == 1:
-            self._add_one(float(judged.low[0]), float(judged.high[0]))
-            self.holds += bool(judged.holds[0])
-            self.fails += bool(judged.fails[0])
-        elif count > 1:
-            self.low, self.low_at = _least(judged.low[:count], self.low, self.low_at, self.next)
-            self.high, self.high_at = _least(judged.high[:count], self.high, self.high_at, self.next)
-            self.holds += int(np.count_nonzero(judged.holds[:count]))
-            self.fails += int(np.count_nonzero(judged.fails[:count]))
+        if not count:
+            return
+        low, high = int(np.argmin(judged.low[:count])), int(np.argmin(judged.high[:count]))
+        if judged.low[low] < self.low:
+            self.low, self.low_at = float(judged.low[low]), self.next + low
+        if judged.high[high] < self.high:
+            self.high, self.high_at = float(judged.high[high]), self.next + high
+        self.holds += int(np.count_nonzero(judged.holds[:count]))
+        self.fails += int(np.count_nonzero(judged.fails[:count]))
         self.instants += count
-
-    def _add_one(self, low: float, high: float) -> None:
-        if low < self.low:
-            self.low, self.low_at = low, self.next
-        if high < self.high:
-            self.high, self.high_at = high, self.next
 
     @property
     def next(self) -> int:
@@ -88,11 +78,7 @@ class RequirementSummary:
 
     @property
     def status(self) -> Status:
-        """Status over all counted instants: `violated`, `satisfied` or `inconclusive`.
-
-        It is violated if the requirement is violated at any instant, and satisfied if it is satisfied at all
-        of them.
-        """
+        """Violated if violated at any counted instant, satisfied if satisfied at all, else inconclusive."""
         if self.fails:
             return "violated"
         return "satisfied" if self.instants and self.holds == self.instants else "inconclusive"
@@ -117,9 +103,3 @@ class RequirementSummary:
     def share(self) -> float:
         """Share of the counted instants at which the requirement certainly holds."""
         return self.holds / self.instants if self.instants else math.nan
-
-
-def _least(values: Floats, known: float, at: int, offset: int) -> tuple[float, int]:
-    i = int(np.argmin(values))
-    least = float(values[i])
-    return (least, offset + i) if least < known else (known, at)

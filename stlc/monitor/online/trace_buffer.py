@@ -5,8 +5,9 @@ The cause of a violation is found and stored before the samples that show it are
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,7 @@ from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import Judgement, Prepared, Verdict
-from stlc.monitor.online.bounds import Floats
-from stlc.monitor.online.history import ColumnHistory
+from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.streams import endless, looks_on
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
@@ -28,14 +28,8 @@ _MOST = 1 << 21
 """Fewest numbers stored, at most twice as many; causes are computed before samples are dropped."""
 
 
-@dataclass(frozen=True, slots=True)
-class Worst:
-    """Worst violation of a requirement.
-
-    Attributes:
-        start: sample at which the requirement was evaluated.
-        high: greatest robustness at `start` over all continuations of the trace.
-    """
+class Worst(NamedTuple):
+    """Worst violation: the sample of the evaluation, and the greatest robustness over all continuations."""
 
     start: int
     high: float
@@ -45,11 +39,7 @@ class Worst:
 class TraceBuffer:
     """Buffer of the latest samples of a stream, and of causes of violations.
 
-    The causes are found before the samples that show them are dropped.
-
-    Attributes:
-        compiled: the specification.
-        t0: time of the first sample in seconds.
+    `t0` is the time of the first sample in seconds.
     """
 
     compiled: Compiled
@@ -68,26 +58,18 @@ class TraceBuffer:
         """True if the buffer is full, so that `forget` must be called."""
         return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
-    def forget(self) -> None:
-        """Drop the older half of the samples.
-
-        To keep the cause of a violation that these samples show, call `remember` first.
-        """
+    def forget(self, violations: Iterable[tuple[CompiledRequirement, Worst]]) -> None:
+        """Drop the older half of the samples; the causes of `violations` are found and stored before."""
+        for rule, worst in violations:
+            cause = self.cause(rule, worst)
+            if cause is not None:
+                self._found[rule.name] = worst, cause
         self._history.forget(self._history.samples - _MOST // self._width)
-
-    def remember(self, rule: CompiledRequirement, worst: Worst) -> None:
-        """Find and store the cause of the violation `worst`.
-
-        The samples that show the violation can then be dropped.
-        """
-        cause = self.cause(rule, worst)
-        if cause is not None:
-            self._found[rule.name] = worst, cause
 
     def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
         """Return the cause of the violation `worst` of the requirement `rule`.
 
-        None if the samples that show the violation were dropped before `remember` was called.
+        None if the samples that show the violation were dropped before `forget` stored the cause.
         """
         known = self._found.get(rule.name)
         if known is not None and known[0] == worst:
@@ -113,40 +95,32 @@ class TraceBuffer:
         return replace(cause, start=worst.start, sample=sample, time=time)
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
-        """Return an excerpt of the buffer that suffices to explain the violation `worst` of `rule`.
+        """Return (first sample, instant to explain, signals) of an excerpt that suffices to explain `worst`.
 
-        Returns:
-            Three values: the index in the trace of the first sample of the excerpt; the index in the excerpt
-            of the instant at which to explain the violation; and the signals, name -> array (samples, 1).
-            None if needed samples were dropped.
+        The instant is counted from the first sample. None if needed samples were dropped.
         """
-        history = self._history
-        formula, horizon = rule.lowered, self.compiled.grid.horizon
+        history, horizon = self._history, self.compiled.grid.horizon
+        formula = rule.lowered
         reads = _around(rule, formula, horizon)
         if reads is None and history.first:
             formula = rule.formula
             reads = _around(rule, formula, horizon)
-        if reads is None or _endless_always(rule, formula):
-            if history.first == 0:
-                return 0, worst.start, history.columns()
-            if reads is None or self.compiled.grid.dt is None:
-                return None
-            start = max(history.first + reads[0], worst.start)
-            return (
-                (history.first, start - history.first, history.columns()) if start < history.samples else None
-            )
-        first = max(worst.start - reads[0], 0)
-        if first < history.first or (first and self.compiled.grid.dt is None):
+        lasting = _endless_always(rule, formula)
+        if not history.first and (reads is None or lasting):
+            return 0, worst.start, history.columns()
+        if reads is None:
             return None
-        return first, worst.start - first, history.columns(first, worst.start + reads[1] + 1)
+        start, first, stop = worst.start, max(worst.start - reads[0], 0), worst.start + reads[1] + 1
+        if lasting:
+            first, stop = history.first, history.samples
+            start = max(start, first + reads[0])
+        if first < history.first or start >= history.samples or (first and self.compiled.grid.dt is None):
+            return None
+        return first, start - first, history.columns(first, stop)
 
 
 def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
-    """True if `formula` is an `always` over an unbounded window, and its body has only bounded windows.
-
-    `formula` is the formula of the requirement `rule`. The result is False if the requirement is evaluated
-    for every planning window.
-    """
+    """True if `formula` is an unbounded `always` of bounded windows, outside of planning windows."""
     return (
         isinstance(formula, ir.Temporal)
         and formula.op == "always"
@@ -157,11 +131,7 @@ def _endless_always(rule: CompiledRequirement, formula: ir.Formula) -> bool:
 
 
 def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None) -> tuple[int, int] | None:
-    """Return how many samples before and after an instant determine the value of `formula` there.
-
-    `formula` is the formula of the requirement `rule`. `horizon` is the length of a planning window in steps.
-    None is returned if either number is unbounded.
-    """
+    """Numbers of samples before and after an instant that determine a value; None if they are unbounded."""
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
         return None

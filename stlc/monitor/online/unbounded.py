@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,8 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history, reach
 from stlc.compile.ir.traverse import map_children
 from stlc.monitor.online.columns import NOTHING, ColumnReader, Side
+from stlc.monitor.online.history import Floats
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, column, endless
-
-Floats: TypeAlias = NDArray[np.float64]
 
 _MOST = 6
 """Greatest number n of unbounded operators; there are 2^n coefficients."""
@@ -36,8 +35,7 @@ _MOST = 6
 _FOREVER = ir.Window(0, None)
 
 
-@dataclass(frozen=True, slots=True)
-class DelayedFormula:
+class DelayedFormula(NamedTuple):
     """A formula that is evaluated `steps` samples after an instant."""
 
     formula: ir.Formula
@@ -59,38 +57,85 @@ class UnboundedOperators:
 
     Attributes:
         root: the formula over columns.
-        parts: column `$k` -> the subformula that it replaces.
-        origins: column `!k` -> its operator in the formula, with the original window.
+        parts: subformula -> the column `$k` that replaces it.
+        origins: operator of the formula, with the original window -> its column `!k`. Two operators share a
+            column only if they are written in the same way: `next (always p)` and `always (next p)` read the
+            same samples, but their values differ at the end of the trace.
         operators: column `!k` -> formula for the value of its operator. The formula combines the columns
             `$0`, `$1`, … (samples received) with the column `!k` (later samples).
     """
 
     root: ir.Formula
-    parts: dict[str, DelayedFormula] = field(default_factory=dict)
-    origins: dict[str, DelayedFormula] = field(default_factory=dict)
+    parts: dict[DelayedFormula, str] = field(default_factory=dict)
+    origins: dict[DelayedFormula, str] = field(default_factory=dict)
     operators: dict[str, ir.Formula] = field(default_factory=dict)
 
     @property
     def reach(self) -> int:
-        """Greatest number of samples that a subformula or an operator reads ahead.
-
-        Unbounded windows are not counted.
-        """
-        return max((part.reach for part in (*self.parts.values(), *self.origins.values())), default=0)
-
-    def unsure(self, plan: ColumnPlan) -> int:
-        """Number of unknown samples to append to the received samples before bounds are computed.
-
-        With more unknown samples, the bounds would be the same. `plan` contains the columns (time series of
-        subformulas).
-        """
-        streams = sum(stream.back + stream.ahead for stream in plan.streams)
-        return self.reach + self.back + streams + 1
+        """Lookahead in samples of the subformulas and operators, without their unbounded windows."""
+        return max((part.reach for part in (*self.parts, *self.origins)), default=0)
 
     @property
     def back(self) -> int:
-        """Greatest number of rows that a subformula without unbounded windows reads back."""
-        return max((history(part.formula) for part in self.parts.values()), default=0)
+        """Lookback in rows of the subformulas without unbounded windows."""
+        return max((history(part.formula) for part in self.parts), default=0)
+
+    def unsure(self, plan: ColumnPlan) -> int:
+        """Number of unknown samples to append before bounds are computed; more would not change them."""
+        return self.reach + self.back + sum(stream.back + stream.ahead for stream in plan.streams) + 1
+
+    def over_columns(self, formula: ir.Formula, steps: int) -> ir.Formula:
+        """Return `formula`, evaluated `steps` samples after an instant, as a formula over columns.
+
+        Missing columns are added. Raises EndlessError if an unbounded operator is inside a bounded one.
+        """
+        if not endless(formula):
+            return self.part(formula, steps)
+        match formula:
+            case ir.BoolOp(op, items):
+                return ir.BoolOp(op, tuple(self.over_columns(item, steps) for item in items))
+            case ir.Shift(later, body, None) if later >= 0:
+                return self.over_columns(body, steps + later)
+            case ir.Temporal(op, ir.Window(lo, None), body):
+                seen = ir.Temporal(op, _FOREVER, self.over_columns(body, steps + lo))
+                name = self._rest(formula, steps)
+                self.operators[name] = ir.BoolOp("and" if op == "always" else "or", (seen, column(name)))
+                return self.operators[name]
+            case ir.Until(op, ir.Window(lo, None), left, right):
+                if lo and endless(left):
+                    raise EndlessError
+                # An `until` is true if the samples received satisfy it, or if its left side is true on all of
+                # these and the later samples satisfy it. For `release`, exchange `and` and `or`.
+                until, node = op == "until", ir.Until(op, _FOREVER, left, right)
+                first, last = self.over_columns(left, steps + lo), self.over_columns(right, steps + lo)
+                name = self._rest(node, steps + lo)
+                throughout = ir.Temporal("always" if until else "eventually", _FOREVER, first)
+                rest = ir.BoolOp("and" if until else "or", (throughout, column(name)))
+                met = ir.BoolOp("or" if until else "and", (replace(node, left=first, right=last), rest))
+                self.operators[name] = met
+                if not lo:
+                    return met
+                before = self.part(replace(throughout, window=ir.Window(0, lo - 1), body=left), steps)
+                return replace(rest, items=(before, met))
+            case _:
+                raise EndlessError
+
+    def _rest(self, operator: ir.Formula, steps: int) -> str:
+        return self.origins.setdefault(DelayedFormula(operator, steps), f"!{len(self.origins)}")
+
+    def part(self, formula: ir.Formula, steps: int) -> ir.Formula:
+        """Return the column of a subformula without unbounded operators."""
+        if isinstance(formula, ir.Truth):
+            return formula
+        return column(self.parts.setdefault(DelayedFormula(formula, steps), f"${len(self.parts)}"))
+
+    def outlined(self, formula: ir.Formula) -> ir.Formula:
+        """Replace all subformulas without unbounded operators by columns; unbounded operators stay."""
+        if not endless(formula):
+            return self.part(formula, 0)
+        if isinstance(formula, (ir.BoolOp, ir.Shift, ir.Temporal, ir.Until)):
+            return map_children(formula, formulas=self.outlined)
+        raise EndlessError
 
 
 def skeleton(formula: ir.Formula) -> UnboundedOperators:
@@ -101,106 +146,23 @@ def skeleton(formula: ir.Formula) -> UnboundedOperators:
             operators.
     """
     found = UnboundedOperators(formula)
-    found.root = _taken(formula, 0, found)
+    found.root = found.over_columns(formula, 0)
     if len(found.origins) > _MOST:
         raise EndlessError
     return found
-
-
-def _taken(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """Return `formula`, evaluated `steps` samples after an instant, as a formula over columns.
-
-    A column is the time series of a subformula. Columns that are missing in `found` are added to it.
-    """
-    if not endless(formula):
-        return _part(formula, steps, found)
-    match formula:
-        case ir.BoolOp(op, items):
-            return ir.BoolOp(op, tuple(_taken(item, steps, found) for item in items))
-        case ir.Shift(later, body, None) if later >= 0:
-            return _taken(body, steps + later, found)
-        case ir.Temporal(op, ir.Window(lo, None), body):
-            seen = ir.Temporal(op, _FOREVER, _taken(body, steps + lo, found))
-            rest = _rest(DelayedFormula(formula, steps), found)
-            found.operators[rest] = ir.BoolOp("and" if op == "always" else "or", (seen, column(rest)))
-            return found.operators[rest]
-        case ir.Until(op, ir.Window(lo, None), left, right):
-            met = _met(ir.Until(op, _FOREVER, left, right), steps + lo, found)
-            if not lo:
-                return met
-            if endless(left):
-                raise EndlessError
-            before = ir.Temporal("always" if op == "until" else "eventually", ir.Window(0, lo - 1), left)
-            return ir.BoolOp("and" if op == "until" else "or", (_part(before, steps, found), met))
-        case _:
-            raise EndlessError
-
-
-def _rest(origin: DelayedFormula, found: UnboundedOperators) -> str:
-    """Return the name of the column that stands for the unknown value of `origin` on future samples.
-
-    `origin` is an unbounded operator. The column is added to `found` if it is missing. Two operators share a
-    column only if they are written in the same way: `next (always p)` and `always (next p)` get two columns.
-    Both operators read the same samples, but their values differ at the end of the trace.
-    """
-    return _column_of(origin, found.origins, "!")
-
-
-def _column_of(formula: DelayedFormula, columns: dict[str, DelayedFormula], prefix: str) -> str:
-    """Return the name of the column of `formula`; a missing column is added to `columns`.
-
-    The name of a new column begins with `prefix`.
-    """
-    for name, known in columns.items():
-        if known == formula:
-            return name
-    columns[f"{prefix}{len(columns)}"] = formula
-    return f"{prefix}{len(columns) - 1}"
-
-
-def _met(node: ir.Until, steps: int, found: UnboundedOperators) -> ir.Formula:
-    """Rewrite an unbounded `until` or `release`, so that received and later samples are separated.
-
-    An `until` is true in two cases. In the first case, the samples received satisfy it. In the second case,
-    its left side is true on all of these samples, and the later samples satisfy the `until`. The value of the
-    `until` on later samples is unknown. A new column (time series) stands for it. For `release`, exchange
-    `and` and `or`.
-    """
-    left, right = _taken(node.left, steps, found), _taken(node.right, steps, found)
-    name = _rest(DelayedFormula(node, steps), found)
-    until = node.op == "until"
-    throughout = ir.Temporal("always" if until else "eventually", _FOREVER, left)
-    later = ir.BoolOp("and" if until else "or", (throughout, column(name)))
-    seen = ir.Until(node.op, _FOREVER, left, right)
-    found.operators[name] = ir.BoolOp("or" if until else "and", (seen, later))
-    return found.operators[name]
-
-
-def _part(formula: ir.Formula, steps: int, found: UnboundedOperators) -> ir.Formula:
-    if isinstance(formula, ir.Truth):
-        return formula
-    return column(_column_of(DelayedFormula(formula, steps), found.parts, "$"))
-
-
-def _neutral(origin: DelayedFormula) -> float:
-    """Value of an unbounded operator on an empty window: +inf for `always` and `release`, else -inf."""
-    assert isinstance(origin.formula, (ir.Temporal, ir.Until))
-    return math.inf if origin.formula.op in ("always", "release") else -math.inf
 
 
 @dataclass(slots=True)
 class UnboundedState:
     """Lower or upper bound on a formula with unbounded windows, computed incrementally.
 
-    The samples before the frontier `at` are summarized in coefficients, as the docstring of the module
-    explains. The bound is computed from these coefficients and from the values that the unbounded operators
-    have from the frontier on.
+    The samples before the frontier `at` are summarized in coefficients, as the module explains.
 
     Attributes:
         bones: the decomposition of the formula into its unbounded operators and its other subformulas.
         side: columns (time series) of the predicates and past operators, evaluated for the bound.
-        begin: the sample at which the formula is evaluated.
-        at: the frontier, a sample. The coefficients summarize all samples before it.
+        at: the frontier, a sample. The coefficients summarize all samples before it. At first, this is the
+            sample at which the formula is evaluated.
         coefficients: one row per subset of the operators, (subsets, traces). A coefficient is the value of
             the formula if the operators of the subset are +inf from `at` on, and the others -inf. None before
             the first `advance`.
@@ -208,7 +170,6 @@ class UnboundedState:
 
     bones: UnboundedOperators
     side: Side
-    begin: int = 0
     at: int = 0
     coefficients: Floats | None = None
     _parts: dict[int, tuple[list[str], ColumnReader]] = field(default_factory=dict, init=False)
@@ -218,8 +179,8 @@ class UnboundedState:
     _unsure: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        for steps in dict.fromkeys(part.steps for part in self.bones.parts.values()):
-            alike = {name: part.formula for name, part in self.bones.parts.items() if part.steps == steps}
+        for steps in dict.fromkeys(part.steps for part in self.bones.parts):
+            alike = {name: part.formula for part, name in self.bones.parts.items() if part.steps == steps}
             self._parts[steps] = (list(alike), ColumnReader(list(alike.values()), self.side.end))
         self._root = ColumnReader([self.bones.root], "truncate")
         self._operators = ColumnReader(list(self.bones.operators.values()), "truncate")
@@ -230,9 +191,7 @@ class UnboundedState:
     def advance(self, settled: int) -> None:
         """Move the frontier `at` to sample `settled`, and update `coefficients`.
 
-        The coefficients then summarize all samples before `settled`, so that these can be dropped. They
-        describe how the value of the formula depends on the still unknown values of the unbounded operators
-        from `settled` on.
+        The samples before `settled` can then be dropped.
         """
         count = settled - self.at
         if count <= 0:
@@ -253,37 +212,34 @@ class UnboundedState:
         Unknown samples are appended to the received ones, and the formula is evaluated on all of them.
         """
         env = self._columns(samples - self.at + self._unsure)
-        for name, origin in self.bones.origins.items():
-            env[name] = np.full(env[NOTHING].shape, _neutral(origin))
+        for origin, name in self.bones.origins.items():
+            assert isinstance(origin.formula, ir.Windowed)
+            empty = math.inf if origin.formula.op in ("always", "release") else -math.inf
+            env[name] = np.full(env[NOTHING].shape, empty)
         found = self._first(env)
         return found if self.coefficients is None else self._at(found[:, None])
 
     def ended(self, formula: ir.Formula, samples: int) -> Floats:
         """Value (traces,) of `formula` if the trace ends after `samples` samples."""
         if self.coefficients is None:
-            return self._plain(formula, self.begin, samples)
-        origins = self.bones.origins.values()
-        rests = [self._plain(origin.formula, self.at + origin.steps, samples) for origin in origins]
+            return self._plain(formula, self.at, samples)
+        rests = [self._plain(each.formula, self.at + each.steps, samples) for each in self.bones.origins]
         return self._at(np.stack(rests))
 
     def _first(self, env: Mapping[str, Floats]) -> Floats:
-        """Values at sample `at` of all unbounded operators, one row each.
-
-        `env` contains the columns. Before the first `advance`, there is only one row: the value of the whole
-        formula.
-        """
+        """Values at sample `at` of all unbounded operators, or, before `advance`, of the whole formula."""
         reader = self._root if self.coefficients is None else self._operators
         return np.concatenate(reader(env, 0, 1))
 
     def _plain(self, formula: ir.Formula, at: int, samples: int) -> Floats:
         """Value (traces,) of a formula at sample `at`, with unbounded windows clipped at the last sample."""
-        parts: dict[str, DelayedFormula] = {}
-        plain = _outlined(formula, parts)
-        first = min(self.at, at)
-        reader = ColumnReader([part.formula for part in parts.values()], self.side.end)
-        found = self.side.values(reader, first, samples - first) if parts else []
-        env = dict(zip(parts, found, strict=True))
-        env[NOTHING] = np.zeros((samples - first, self.side.rows[NOTHING].shape[1]))
+        found = UnboundedOperators(formula)
+        plain, first = found.outlined(formula), min(self.at, at)
+        env = {NOTHING: np.zeros((samples - first, self.side.rows[NOTHING].shape[1]))}
+        if found.parts:
+            reader = ColumnReader([part.formula for part in found.parts], self.side.end)
+            values = self.side.values(reader, first, samples - first)
+            env |= zip(found.parts.values(), values, strict=True)
         return ColumnReader([plain], self.side.end)(env, at - first, 1)[0]
 
     def _columns(self, count: int) -> dict[str, Floats]:
@@ -294,26 +250,10 @@ class UnboundedState:
         return env
 
     def _at(self, rests: Floats) -> Floats:
-        """Return the values (points, traces) of the formula at several points.
+        """Return the values (points, traces) of the formula for values `rests` of the unbounded operators.
 
-        A point consists of one value for each unbounded operator: its value from the frontier on. `rests`
-        contains the points, (operators, points, traces). The values of the formula follow from these and
-        `coefficients`.
+        `rests`, (operators, points, traces), are the values from the frontier on.
         """
         assert self.coefficients is not None
         worth = np.where(self._chosen[:, :, None, None], rests, math.inf).min(axis=1, initial=math.inf)
         return np.asarray(np.minimum(worth, self.coefficients[:, None]).max(axis=0))
-
-
-def _outlined(formula: ir.Formula, parts: dict[str, DelayedFormula]) -> ir.Formula:
-    """Replace all subformulas without unbounded windows by columns (time series of their values).
-
-    The replaced subformulas are added to `parts`.
-    """
-    if not endless(formula):
-        return _part(formula, 0, UnboundedOperators(formula, parts))
-    match formula:
-        case ir.BoolOp() | ir.Shift() | ir.Temporal() | ir.Until():
-            return map_children(formula, formulas=lambda part: _outlined(part, parts))
-        case _:
-            raise EndlessError
