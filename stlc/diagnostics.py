@@ -210,6 +210,7 @@ CODES: dict[str, str] = {
     "E303": "an interval bound that is not a constant",
     "W304": "an interval bound that is not a whole number of steps",
     "E305": "an interval without a sample",
+    "W305": "a recording that was read in part",
     "E306": "more signal is needed than there is",
     "E307": "an absolute interval under another temporal operator",
     "E309": "a past operator that asks for too much memory",
@@ -232,7 +233,7 @@ CODES: dict[str, str] = {
     "E601": "a trace that lacks a signal",
     "E602": "a trace whose time is not uniform",
     "E603": "a trace file that cannot be read, or is not safe to read",
-    "E604": "a trace that holds infinite values",
+    "E604": "a trace whose times are not finite",
     "E605": "a trace whose arrays do not fit together",
     # system files
     "S100": "not a YAML document",

@@ -140,8 +140,7 @@ def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]
     moment, cause = verdict.subject.moment, causes.get(judgement.name)
     if cause is None:
         return f"from {moment(judgement.worst[1])}" if judgement.instants > 1 else ""
-    start = cause.start if judgement.instants > 1 else cause.sample
-    return beside(moment(cause.sample), moment(start))
+    return beside(cause.moment, cause.started if judgement.instants > 1 else cause.moment)
 
 
 _KINDS = {"satisfied": "good", "violated": "bad"}

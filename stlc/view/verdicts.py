@@ -233,6 +233,9 @@ def _events(verdict: Verdict, judgement: Judgement, agent: int, most: int) -> li
     while len(starts) and len(found) < most:
         start = int(starts[0])
         cause = explain_at(verdict, judgement.name, agent, start)
+        if cause is None:
+            starts = starts[1:]
+            continue
         if found and cause.sample <= found[-1].until + 1:
             found[-1] = replace(found[-1], until=max(cause.sample, found[-1].until))
         else:

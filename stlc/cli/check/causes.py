@@ -31,7 +31,8 @@ def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> A
     from stlc.cli.check.judge import judge
     from stlc.cli.check.outcome import EXIT_CODES, SATISFIED
 
-    result = judge(name, question, runs)
+    results = judge(name, question, runs)
+    result = next((each for each in results if each.causes), results[0])  # the first object that violates
     if talk:
         for line in result.remarks:
             say(line)
@@ -43,7 +44,7 @@ def explain_trace(name: str, question: Question, runs: Path, *, talk: bool) -> A
         {
             "trace": result.trace.name,
             "verdict": result.verdict.overall,
-            "causes": [_record(cause, result) for cause in causes],
+            "causes": [_record(cause) for cause in causes],
         },
         lambda: emit(text or nothing, styled=True),
         EXIT_CODES.get(result.verdict.overall, SATISFIED),
@@ -60,14 +61,14 @@ def _lines(cause: Cause, result: Checked) -> Iterator[str]:
 
     judged = cause.judgement
     of = f" in trace {cause.trace}" if result.verdict.traces > 1 else ""
-    started = result.verdict.subject.moment(cause.start)
+    started = cause.started
     margin = in_unit(f"{cause.tree.rho:+.6g}", judged.unit or cause.unit)
     yield f"{visible(judged.name)} is violated{of}, judged from {started}: robustness {margin}"
     advice = [("because", cause.because)]
     yield render_place(cause.place, cause.labels, advice, color=wants_color(sys.stdout)).rstrip("\n")
     yield ""
     for depth, node in _walk(cause.tree):
-        yield f"  {'  ' * depth}{visible(_line(node, cause, result))}"
+        yield f"  {'  ' * depth}{visible(_line(node, cause))}"
 
 
 def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
@@ -85,7 +86,7 @@ def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
         stack.extend((depth + 1, part) for part in reversed([*main, *others]))
 
 
-def _line(node: CauseNode, cause: Cause, result: Checked) -> str:
+def _line(node: CauseNode, cause: Cause) -> str:
     """Line of output about one sub-formula, `node`, in the tree of causes of a violation.
 
     It shows the text of the sub-formula, its truth value and instant, the values of its signals, and its
@@ -93,37 +94,37 @@ def _line(node: CauseNode, cause: Cause, result: Checked) -> str:
     """
     text = " ".join(node.span.text.split())
     short = text if len(text) <= _WIDTH else f"{text[: _WIDTH - 1]}…"
-    subject = result.verdict.subject
+    subject = cause.subject
     when = subject.moment(node.sample)
     if node.until is not None and node.until > node.sample:
         when = f"from {when} to {subject.moment(node.until)}".replace("to t = ", "to ")
-    values = _readings(node, cause, result)
+    values = _readings(node, cause)
     shown = f", {', '.join(values)}" if values else ""
     margin = in_unit(f"{node.rho:+.6g}", margin_unit(node.formula))
     return f"{short}    is {str(node.holds).lower()} at {when}{shown}, robustness {margin}"
 
 
-def _readings(node: CauseNode, cause: Cause, result: Checked) -> list[str]:
+def _readings(node: CauseNode, cause: Cause) -> list[str]:
     from stlc.monitor.explain.report import shown
 
-    subject = result.verdict.subject
+    subject = cause.subject
     found = []
     for name, later in node.reads:
         if not 0 <= node.sample + later < subject.record.samples:
             continue
-        value = float(subject.record.env[name][node.sample + later, cause.trace])
+        value = float(subject.record.env[name][node.sample + later, 0])
         when = f" at {subject.moment(node.sample + later)}" if later else ""
         found.append(f"{name} = {shown(value, subject.compiled.signature[name])}{when}")
     return found
 
 
-def _record(cause: Cause, result: Checked) -> ViolationCause:
-    """JSON record of the cause of a violation in the judged trace `result`.
+def _record(cause: Cause) -> ViolationCause:
+    """JSON record of the cause of a violation.
 
     The tree of causes becomes a list of nodes, parents before their children, each with its depth in the
     tree.
     """
-    subject = result.verdict.subject
+    subject = cause.subject
     nodes: list[CauseNodeRecord] = [
         {
             "depth": depth,
@@ -134,14 +135,14 @@ def _record(cause: Cause, result: Checked) -> ViolationCause:
             "time": subject.time(node.sample),
             "robustness": node.rho,
             "unit": margin_unit(node.formula),
-            "readings": _readings(node, cause, result),
+            "readings": _readings(node, cause),
         }
         for depth, node in _walk(cause.tree)
     ]
     return {
         "requirement": cause.judgement.name,
         "trace": cause.trace,
-        "start": subject.time(cause.start),
+        "start": subject.time(cause.start - cause.first),
         "because": cause.because,
         "tree": nodes,
     }

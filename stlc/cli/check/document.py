@@ -69,6 +69,9 @@ def result_record(result: Checked, end: str) -> documents.CheckedTrace:
         satisfied_traces=verdict.satisfied_traces,
         satisfied_share=verdict.share,
         requirements=[_requirement(judged, result) for judged in verdict],
+        clocks=[
+            record(documents.ClockRecord, clock, others=list(clock.others)) for clock in result.trace.clocks
+        ],
     )
 
 
@@ -120,7 +123,17 @@ def _requirement(judged: Judgement, result: Checked) -> documents.CheckedRequire
         starts=judged.instants,
         satisfied_share=judged.share,
         violated_traces=judged.statuses.count("violated"),
+        judged=_part(judged, result),
     )
+
+
+def _part(judged: Judgement, result: Checked) -> documents.JudgedPart | None:
+    """The part of the recording on which a requirement is judged, in mission time; None for all of it."""
+    seen, whole = None if judged.part is None else judged.part.seen, result.verdict.subject.whole
+    if seen is None or whole is None:
+        return None
+    first, last = seen.first - whole.first, seen.last - whole.first
+    return {"first": first, "last": last, "of": whole.last - whole.first}
 
 
 def requirement_record(

@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from stlc.monitor.instants import At
     from stlc.monitor.uncertain import Uncertainty
     from stlc.monitor.verdict import Monitor
-    from stlc.trace import Reading
+    from stlc.trace import Reading, Trace
+    from stlc.trace.clocks import ClockSetting
     from stlc.trace.meta import Carried
+    from stlc.trace.resample import Between
 
 End = Literal["open", "strict", "truncate"]
 
@@ -54,6 +56,11 @@ class Question:
         dt: seconds between samples of a trace without times.
         max_gap: longest time between two samples, in seconds, over which signals count as known.
         uncertain: signal -> greatest error of its samples.
+        between: signal -> its values between samples, when traces are resampled.
+        clock: the clock of a trace, if the user names it.
+        group: name of the column that tells the objects in a table apart.
+        columns: names of the columns of a table without a header.
+        strict: whether times at which signals of a requirement were not seen are unknown, not left out.
     """
 
     spec: Path | None = None
@@ -69,6 +76,11 @@ class Question:
     dt: float | None = None
     max_gap: float | None = None
     uncertain: Mapping[str, Uncertainty] = field(default_factory=dict)
+    between: Mapping[str, Between] = field(default_factory=dict)
+    clock: ClockSetting | None = None
+    group: str = ""
+    columns: tuple[str, ...] = ()
+    strict: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,26 +124,61 @@ def found(name: str, runs: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def judge(name: str, question: Question, runs: Path) -> Checked:
+def judge(name: str, question: Question, runs: Path) -> list[Checked]:
     """Load the trace called `name`, judge it with the options in `question`, and explain its violations.
 
-    If there is no file at the path `name`, the file is looked for in the newest run below `runs`.
+    If there is no file at the path `name`, the file is looked for in the newest run below `runs`. There are
+    several results if the file holds objects of different times.
 
     Raises:
         StlcError: the trace or the specification is invalid, or the two do not fit together.
     """
+    path = found(name, runs)
+    loaded = load(path, question)
+    remarks = (*_newest_remark(name, path), *([loaded.note] if loaded.note else ()))
+    return [_judged(trace, loaded, question, remarks) for trace in loaded.traces]
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """Traces of a file, and the specification that judges them.
+
+    Attributes:
+        traces: one, or one for each object with times of its own.
+        source: text of the specification.
+        monitor: its monitor.
+        note: remark to print; "" if there is none.
+    """
+
+    traces: tuple[Trace, ...]
+    source: Source
+    monitor: Monitor
+    note: str
+
+
+def load(path: Path, question: Question, *, planned: bool = False) -> Loaded:
+    """Read what a specification needs of a trace file.
+
+    If the trace has two specifications of its own, `planned` takes the one that plans were made for.
+
+    Raises:
+        StlcError: the trace or the specification is invalid.
+    """
+    from stlc.trace import read_recording, traces_of
+
+    known = None if question.spec is None else monitor_of(read_source(find_spec(question.spec)), question)
+    recording = read_recording(path, reading_options(known, question).wanted)
+    carried = recording.meta.planned if planned else recording.meta.carried
+    source, note = specification(recording.name, question.spec, carried)
+    monitor = known or monitor_of(source, question, carried)
+    return Loaded(traces_of(recording, reading_options(monitor, question)), source, monitor, note)
+
+
+def _judged(trace: Trace, loaded: Loaded, question: Question, remarks: tuple[str, ...]) -> Checked:
     from stlc.cli.check.outcome import Checked
     from stlc.monitor.explain.report import explain_all
-    from stlc.trace import read_recording, trace_of
 
-    path = found(name, runs)
-    recording = read_recording(path)
-    carried = recording.meta.carried
-    source, note = specification(recording.name, question.spec, carried)
-    monitor = monitor_of(source, question, carried)
-    trace = trace_of(recording, reading_options(monitor, question))
-    del recording  # do not keep converted signals twice
-    verdict = monitor.check(
+    verdict = loaded.monitor.check(
         trace,
         at=instant_of(question.at, trace.name, trace.dt, trace.t0, trace.samples),
         end=question.end,
@@ -139,10 +186,10 @@ def judge(name: str, question: Question, runs: Path) -> Checked:
         require=question.require,
         semantics=question.semantics,
         uncertain=question.uncertain,
+        strict=question.strict,
     )
-    remarks = (*_newest_remark(name, path), *([note] if note else ()))
     causes, options = explain_all(verdict), _options(question)
-    return Checked(trace, source, verdict, causes, options, remarks, question.uncertain)
+    return Checked(trace, loaded.source, verdict, causes, options, remarks, question.uncertain)
 
 
 def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
@@ -162,6 +209,15 @@ def _options(question: Question) -> tuple[str, ...]:
     times = {"--resample": question.resample, "--dt": question.dt, "--max-gap": question.max_gap}
     for option, seconds in times.items():
         words += [] if seconds is None else [option, f"{seconds:.10g}s"]
+    for signal, each in question.between.items():
+        words += ["--between", f"{signal}={each.how}" + ("" if each.age is None else f":{each.age:.10g}s")]
+    if question.clock is not None and question.clock.name:
+        unit = f":{question.clock.unit}" if question.clock.unit else ""
+        words += ["--clock", f"{question.clock.name}{unit}"]
+    if question.clock is not None and question.clock.step is not None:
+        words += ["--fps", f"{1.0 / question.clock.step:.10g}"]
+    words += ["--group", question.group] if question.group == "none" else []
+    words += ["--columns", ",".join(question.columns)] if question.columns else []
     for signal, error in question.uncertain.items():
         words += ["--uncertain", f"{signal}={str(error).replace(' ', '')}"]
     return tuple(words)
@@ -170,13 +226,23 @@ def _options(question: Question) -> tuple[str, ...]:
 def reading_options(monitor: Monitor | None, question: Question) -> Reading:
     """Options for reading trace files: names of signals, time steps, and the longest gap between samples.
 
-    If `monitor` is given, the options also include the types of the signals that its specification declares.
+    If `monitor` is given, the options also include the signals that its requirements read, and their types.
     """
     from stlc.monitor.signals import reading_of
     from stlc.trace import Reading
+    from stlc.trace.clocks import ClockSetting
 
-    options = Reading(question.names, question.resample, question.dt, question.max_gap)
-    return options if monitor is None else reading_of(monitor.spec, options)
+    options = Reading(
+        question.names,
+        question.resample,
+        question.dt,
+        question.max_gap,
+        clock=question.clock or ClockSetting(),
+        group=question.group,
+        columns=question.columns,
+        between=question.between,
+    )
+    return options if monitor is None else reading_of(monitor.spec, options, monitor.reads(question.require))
 
 
 def specification(name: str, spec: Path | None, carried: Carried) -> tuple[Source, str]:
@@ -281,6 +347,43 @@ def uncertainties(pairs: Mapping[str, str]) -> dict[str, Uncertainty]:
         except ValueError as error:
             raise usage(f"`--uncertain {name}={text}`: {error}", "write --uncertain x=0.1m") from None
     return found
+
+
+def betweens(pairs: Mapping[str, str]) -> dict[str, Between]:
+    """Parse the values of `--between`: signal -> text such as `hold`, `hold:0.5s`, `linear` or `angle`.
+
+    Raises:
+        UsageError: U101, a text is none of these.
+    """
+    from stlc.trace.resample import Between
+
+    found = {}
+    for name, text in pairs.items():
+        how, colon, age = (part.strip() for part in text.partition(":"))
+        if how not in ("hold", "linear", "angle") or (colon and how != "hold"):
+            help_ = "write hold, hold:0.5s, linear or angle"
+            raise usage(f"`--between {name}={text}` is no way to continue a signal", help_)
+        found[name] = Between(how, time_step("--between", age) if colon else None)  # type: ignore[arg-type]
+    return found
+
+
+def clock_setting(text: str | None, fps: float | None) -> ClockSetting | None:
+    """Parse the values of `--clock` and `--fps`; None if neither is given.
+
+    Raises:
+        UsageError: U101, a value is malformed.
+    """
+    from stlc.trace.clocks import ClockSetting
+
+    if fps is not None and not 0.0 < fps < math.inf:
+        raise usage(f"`--fps {fps}` is not a number above 0")
+    step = None if fps is None else 1.0 / fps
+    if text is None:
+        return None if step is None else ClockSetting(step=step)
+    try:
+        return ClockSetting.parse(text.strip(), step)
+    except ValueError as error:
+        raise usage(f"`--clock {text}`: {error}", "write --clock NAME  or  --clock NAME:us") from None
 
 
 def time_step(option: str, text: str | None) -> float | None:

@@ -63,21 +63,23 @@ def all_outcomes(
         MissingError: R301, R302, R406: the cluster cannot be used.
     """
     if places.cluster is None and len(works) == 1:
-        return [outcome_of(works[0])]
-    outcomes: list[Outcome | None] = [None] * len(works)
+        return outcomes_of(works[0])
+    outcomes: list[list[Outcome]] = [[]] * len(works)
     known: dict[Diagnostic, Diagnostic] = {}
-    for done, (index, outcome) in enumerate(_judged(works, places), start=1):
-        warnings = tuple(known.setdefault(each, each) for each in outcome.warnings)
-        shown = outcome.text if outcome.status != "satisfied" or len(works) == 1 else ""
-        outcomes[index] = replace(outcome, warnings=warnings, text=shown)
+    for done, (index, found_) in enumerate(_judged(works, places), start=1):
+        outcomes[index] = []
+        for outcome in found_:
+            warnings = tuple(known.setdefault(each, each) for each in outcome.warnings)
+            shown = outcome.text if outcome.status != "satisfied" or len(works) == 1 else ""
+            outcomes[index].append(replace(outcome, warnings=warnings, text=shown))
         progress(f"{done:,} of {len(works):,} files judged")
-    return [outcome for outcome in outcomes if outcome is not None]
+    return [outcome for each in outcomes for outcome in each]
 
 
-def _judged(works: Sequence[Work], places: Places) -> Iterator[tuple[int, Outcome]]:
-    """Yield the position and the outcome of each file when it is judged."""
+def _judged(works: Sequence[Work], places: Places) -> Iterator[tuple[int, list[Outcome]]]:
+    """Yield the position of each file and the outcomes of its objects when it is judged."""
     if places.cluster is None and places.processes(len(works)) == 1:
-        yield from enumerate(map(safe_outcome, works))
+        yield from enumerate(map(safe_outcomes, works))
         return
     from stlc.controller.parallel import workers_of
     from stlc.controller.parallel.workers import LostCall, results
@@ -88,9 +90,9 @@ def _judged(works: Sequence[Work], places: Places) -> Iterator[tuple[int, Outcom
         sent = [replace(work, name=_seen(work)) for work in works]
         read = _files_of(works[0].question)
     with workers_of(places.processes(len(works)), places.cluster) as workers:
-        for ended in results(workers, safe_outcome, sent, files=read):
+        for ended in results(workers, safe_outcomes, sent, files=read):
             value = ended.value
-            yield ended.index, _lost(works[ended.index], value) if isinstance(value, LostCall) else value
+            yield ended.index, [_lost(works[ended.index], value)] if isinstance(value, LostCall) else value
 
 
 def _lost(work: Work, lost: LostCall) -> Outcome:
@@ -132,20 +134,17 @@ def _files_of(question: Question) -> Callable[[Work], CallFiles]:
     return of
 
 
-def safe_outcome(work: Work) -> Outcome:
-    """Judge one file and return its outcome; errors are not raised, but stored in the outcome."""
+def safe_outcomes(work: Work) -> list[Outcome]:
+    """Judge one file and return its outcomes; errors are not raised, but stored in an outcome."""
     try:
-        return outcome_of(work)
+        return outcomes_of(work)
     except StlcError as error:
         entry: InvalidTrace = {"trace": work.name, "verdict": "invalid"}
-        return Outcome(work.name, entry, errors=error.diagnostics, exit_code=error.exit_code)
+        return [Outcome(work.name, entry, errors=error.diagnostics, exit_code=error.exit_code)]
 
 
-def outcome_of(work: Work) -> Outcome:
-    """Judge one file and return its outcome. Raises StlcError if that fails."""
-    from stlc.cli.check.document import result_record
-    from stlc.cli.check.text import result_text, rows_of
-
+def outcomes_of(work: Work) -> list[Outcome]:
+    """Judge one file and return the outcomes of its objects, usually one. Raises StlcError if that fails."""
     COLOR.set(work.mode)
     begun = time.perf_counter()
     path = found(work.name, work.runs)
@@ -154,15 +153,27 @@ def outcome_of(work: Work) -> Outcome:
             raise usage(f"`--uncertain` needs the whole trace, and {path} does not fit into memory")
         from stlc.cli.check.online import outcome_in_chunks
 
-        return with_sample(outcome_in_chunks(path, work)) if work.certify else outcome_in_chunks(path, work)
-    result = judge(work.name, work.question, work.runs)
+        outcome = outcome_in_chunks(path, work)
+        return [with_sample(outcome) if work.certify else outcome]
+    results = judge(work.name, work.question, work.runs)
     if work.out is not None:
         from stlc.cli.check.document import write_robustness
 
-        write_robustness(work.out, result, work.question)
+        if len(results) > 1:
+            raise usage(f"`--out` writes one trace, and `{path}` holds {len(results)} of different times")
+        write_robustness(work.out, results[0], work.question)
+    each = (time.perf_counter() - begun) / len(results)
+    return [_outcome(result, work, each) for result in results]
+
+
+def _outcome(result: Checked, work: Work, seconds: float) -> Outcome:
+    from stlc.cli.check.document import result_record
+    from stlc.cli.check.text import result_text, rows_of
+
     rows = rows_of(result, violated_at=_violated_at(result, work.question) if work.table else {})
     return Outcome(
-        name=str(path),
+        name=result.trace.name,
+        track=result.trace.track,
         entry=result_record(result, work.question.end),
         status=result.verdict.overall if result.verdict.in_scope else "out of scope",
         rows=rows,
@@ -170,7 +181,7 @@ def outcome_of(work: Work) -> Outcome:
         traces=result.verdict.in_scope,
         holds=result.verdict.share,
         fails=result.verdict.failed_share,
-        seconds=time.perf_counter() - begun,
+        seconds=seconds,
         warnings=result.warnings,
         remarks=result.remarks,
         sample=_sample(result) if work.certify else None,
@@ -224,17 +235,18 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     head = ("trace", "verdict", "least robustness", "requirement", "where")
     lines = [_line(outcome) for outcome in outcomes]
     satisfied = sum(outcome.status == "satisfied" for outcome in outcomes)
-    parts = [f"{satisfied} of {len(outcomes)} files satisfy every requirement"]
+    each = "files" if len({outcome.file for outcome in outcomes}) == len(outcomes) else "objects"
+    parts = [f"{satisfied} of {len(outcomes)} {each} satisfy every requirement"]
     lost = sum(outcome.entry["verdict"] == "not judged" for outcome in outcomes)
     broken = sum(bool(outcome.errors) for outcome in outcomes) - lost
     outside = sum(outcome.status == "out of scope" for outcome in outcomes)
     parts += [f"{broken} cannot be judged"] if broken else []
     parts += [f"{lost} not judged"] if lost else []
     parts += [f"{outside} out of scope"] if outside else []
-    each = [_per_requirement(name, outcomes) for name in names]
+    rows = [_per_requirement(name, outcomes) for name in names]
     tables = [
         table(lines, header=head),
-        table(each, header=("requirement", "violated in", "inconclusive in")),
+        table(rows, header=("requirement", "violated in", "inconclusive in")),
     ]
     return "\n\n".join([*tables, f"{overall(outcomes)}; {', '.join(parts)}"])
 

@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -166,6 +167,7 @@ def _requirement(
         starts=tally.instants,
         satisfied_share=tally.share,
         violated_traces=int(tally.status == "violated"),
+        judged=None,
     )
 
 
@@ -205,7 +207,12 @@ def outcome_of_stream(question: Question, *, talk: bool) -> Outcome:
             for decision in decisions:
                 _tell(decision, online)
     step, color = float(online.compiled.grid.dt or 0), wants_color(sys.stdout)
-    return _outcome(online, NAME, source, step, color=color, remarks=(), begun=begun)
+    outcome = _outcome(online, NAME, source, step, color=color, remarks=(), begun=begun)
+    if not (aside := uniform.aside()):
+        return outcome
+    message = f"samples of the {NAME} between the instants of the grid are not judged: {aside:,}"
+    finding = Diagnostic("W305", message, help=("stlc check SPEC FILE  judges every sample of a recording",))
+    return replace(outcome, warnings=(finding, *outcome.warnings))
 
 
 def _online(monitor: Monitor, question: Question, uniform: Uniform) -> Online:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stlc.cli.check.judge import Question, time_step
+from stlc.cli.check.judge import Question, betweens, clock_setting, time_step
 from stlc.cli.framework.options import (
     RequireOption,
     RunsOption,
@@ -35,8 +35,13 @@ class Traces:
     ] = None
     resample: Annotated[
         str | None,
+        typer.Option(metavar="TIME", help="Judge on a grid of this step; every recorded sample counts."),
+    ] = None
+    between: Annotated[
+        list[str] | None,
         typer.Option(
-            metavar="TIME", help="Resample to this time step: bool, int and enum are held, real is linear."
+            metavar="SIGNAL=HOW",
+            help="Values between samples: hold, hold:0.5s (older is unknown), linear or angle.",
         ),
     ] = None
     max_gap: Annotated[
@@ -48,6 +53,22 @@ class Traces:
     ] = None
     dt: Annotated[
         str | None, typer.Option(metavar="TIME", help="Time between samples that have no clock, as 10ms.")
+    ] = None
+    clock: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[:UNIT]", help="The clock and its unit: timestamp:us, header.stamp, frame:frames."
+        ),
+    ] = None
+    fps: Annotated[
+        float | None, typer.Option(metavar="N", help="Frames per second, for a clock that counts frames.")
+    ] = None
+    group: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Column that tells objects apart, a trace each; none: one trace."),
+    ] = None
+    columns: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Names of the columns of a table without a header.")
     ] = None
     runs: RunsOption = Path("runs")
 
@@ -65,6 +86,10 @@ class Traces:
             "resample": time_step("--resample", self.resample),
             "overrides": parse_overrides(self.set_),
             "dt": time_step("--dt", self.dt),
+            "between": betweens(parse_pairs(self.between, "--between", "SIGNAL=HOW", "v_lead=hold")),
+            "clock": clock_setting(self.clock, self.fps),
+            "group": self.group or "",
+            "columns": tuple(name.strip() for name in (self.columns or "").split(",") if name.strip()),
             "max_gap": time_step("--max-gap", self.max_gap),
         }
         return Question(**{**asked, **more})

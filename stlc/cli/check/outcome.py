@@ -47,6 +47,7 @@ class VerdictRow:
         why: reason in one line, if the requirement is not satisfied.
         least: least robustness as a number, or its lower bound if inconclusive; 0 if there is none.
         unit: unit of the robustness.
+        judged: the part of the recording on which the requirement is judged, in words; "" for all of it.
         violated_at: time in seconds from which the requirement is certainly violated, whatever follows; None
             if it is not violated, or if the time was not looked for.
     """
@@ -60,6 +61,7 @@ class VerdictRow:
     least: float = 0.0
     unit: str = ""
     violated_at: float | None = None
+    judged: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +69,7 @@ class Outcome:
     """Result of one trace file; it contains errors if the file could not be judged.
 
     Attributes:
-        name: name of the file.
+        name: name of the file, and of the object in it.
         entry: JSON record of the result.
         status: verdict over all traces and requirements.
         rows: results of the requirements.
@@ -81,6 +83,7 @@ class Outcome:
         errors: reasons for which the file could not be judged.
         exit_code: exit code of the command for these errors; 0 without errors.
         sample: its traces as observations, with `--certify`; None if no trace is in scope.
+        track: the object in the file, such as `agent=2`; "" if the file holds one.
     """
 
     name: str
@@ -97,6 +100,12 @@ class Outcome:
     errors: tuple[Diagnostic, ...] = ()
     exit_code: int = 0
     sample: Sample | None = None
+    track: str = ""
+
+    @property
+    def file(self) -> str:
+        """Name of the file."""
+        return self.name.removesuffix(f" ({self.track})")
 
 
 def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
@@ -156,5 +165,5 @@ class Checked:
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """Warnings of the compiler."""
-        return self.verdict.subject.compiled.warnings
+        """Warnings of the compiler, and about the file."""
+        return (*self.trace.remarks, *self.verdict.subject.compiled.warnings)

@@ -16,7 +16,7 @@ from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import operand, shell, visible
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.judgement import Judgement, Verdict, beside
+from stlc.monitor.judgement import Judgement, Part, Verdict, beside
 from stlc.monitor.signals import gap_text
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> 
     ending, folder = [_summary(verdict)], Path(trace.name).parent
     if (folder / "run.json").is_file():
         ending.append(f"next: {shell(('stlc', 'report', str(folder)))}")
-    gaps = (*_error_texts(result), *_gap_texts(result).values())
+    gaps = (*_clock_texts(result), *_error_texts(result), *_gap_texts(result).values())
     return text_of(title, rows, gaps, reasons, ending, several=verdict.traces > 1)
 
 
@@ -70,7 +70,16 @@ def text_of(
         several: whether the file has several traces.
     """
     least = "robustness (min over traces)" if several else "robustness"
-    cells = [(row.name, WORDS[row.status], row.robustness, row.share, row.where) for row in rows]
+    cells = [
+        (
+            row.name,
+            WORDS[row.status],
+            row.robustness,
+            row.share,
+            "; ".join(filter(None, (row.where, row.judged))),
+        )
+        for row in rows
+    ]
     lines = [title, "", table(cells, header=("requirement", "verdict", least, "starts", "where"))]
     lines += [f"  {text}" for text in gaps]
     for reason in reasons:
@@ -114,9 +123,7 @@ def _where(judged: Judgement, result: Checked) -> str:
     cause = result.causes.get(judged.name)
     words = [f"trace {trace}"] if result.verdict.traces > 1 else []
     if cause is not None:
-        moment = result.verdict.subject.moment
-        start = cause.start if judged.instants > 1 else cause.sample
-        words.append(beside(moment(cause.sample), moment(start)))
+        words.append(beside(cause.moment, cause.started if judged.instants > 1 else cause.moment))
     elif judged.instants > 1:
         words.append(f"from {result.verdict.subject.moment(sample)}")
     return ", ".join(words)
@@ -141,8 +148,22 @@ def rows_of(result: Checked, violated_at: Mapping[str, float]) -> tuple[VerdictR
         why = _inconclusive(judged, result) if status == "inconclusive" else ""
         why, where = why if cause is None else cause.because, _where(judged, result)
         at = violated_at.get(judged.name)
-        rows.append(VerdictRow(judged.name, status, robustness, share, where, why, least, unit, at))
+        rows.append(
+            VerdictRow(
+                *(judged.name, status, robustness, share, where, why, least, unit, at),
+                judged_text(judged, result),
+            )
+        )
     return tuple(rows)
+
+
+def judged_text(judged: Judgement, result: Checked) -> str:
+    """Text on the part of a recording on which a requirement is judged, in mission time; "" for all of it."""
+    seen, whole = None if judged.part is None else judged.part.seen, result.verdict.subject.whole
+    if seen is None or whole is None:
+        return ""
+    ends = [f"{time - whole.first:.6g} s" for time in (seen.first, seen.last, whole.first, whole.last)]
+    return f"judged {ends[0]} to {ends[1]} of {ends[2]} to {ends[3]}"
 
 
 # ------------------------------------------------------------------------ reasons
@@ -151,7 +172,8 @@ def rows_of(result: Checked, violated_at: Mapping[str, float]) -> tuple[VerdictR
 def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) -> str:
     verdict = result.verdict
     start = f"{verdict.subject.time(cause.start):.10g}s"
-    words = (*result.options, operand(result.trace.name), "--require", judged.name, "--at", start)
+    track = ("--group", result.trace.track) if result.trace.track else ()
+    words = (*result.options, operand(result.trace.file), *track, "--require", judged.name, "--at", start)
     advice = [("because", cause.because), ("replay", shell(("stlc", "check", *words)))]
     headline = f"{visible(judged.name)} is violated"
     if verdict.traces > 1:
@@ -176,14 +198,20 @@ def _gap_texts(result: Checked) -> dict[str, str]:
     }
 
 
+def _clock_texts(result: Checked) -> list[str]:
+    """Lines on the clocks that were chosen, unless there was nothing to choose."""
+    return [f"clock {visible(str(clock))}" for clock in result.trace.clocks if not clock.plain]
+
+
 def _error_texts(result: Checked) -> list[str]:
     return [f"`{visible(name)}` may be off by {error}" for name, error in result.uncertain.items()]
 
 
 def _inconclusive(judged: Judgement, result: Checked) -> str:
     name = visible(judged.name)
-    last = judged.start + judged.instants - 1 + judged.rule.reach
-    needed, length = last * result.trace.dt, (result.trace.samples - 1) * result.trace.dt
+    part = judged.part or Part(0, result.trace.samples)
+    last = judged.start - part.first + judged.instants - 1 + judged.rule.reach
+    needed, length = last * result.trace.dt, (part.stop - part.first - 1) * result.trace.dt
     gaps = [text for signal, text in _gap_texts(result).items() if signal in columns(judged.rule.formula)]
     if gaps and needed <= length:
         return f"{name} is inconclusive: {', '.join(gaps)}."
@@ -194,6 +222,12 @@ def _inconclusive(judged: Judgement, result: Checked) -> str:
         )
     if result.uncertain:
         return f"{name} is inconclusive: the errors of the signals decide it."
+    cells = result.verdict.subject.record.cells
+    if cells is not None:
+        return (
+            f"{name} is inconclusive: values between the instants of the grid leave it open.\n"
+            "A shorter step (--resample), or --between SIGNAL=hold or =linear, may decide it."
+        )
     return f"{name} is inconclusive: it has no value where it was judged."
 
 

@@ -77,6 +77,12 @@ def check(
         list[str] | None,
         typer.Option(metavar="SIGNAL=ERROR", help="Greatest error of each sample, as x=0.1m or v=2%."),
     ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="What was left out, as signals were not seen there, counts as unknown."
+        ),
+    ] = False,
     fail_under: FailUnderOption = None,
     certify: CertifyOption = None,
     out: Annotated[
@@ -138,7 +144,7 @@ def check(
     if errors and out is not None:
         raise usage("`--out` writes the robustness of the samples as they are: leave `--uncertain` out")
     question = reading.question(
-        spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics, uncertain=errors
+        spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics, uncertain=errors, strict=strict
     )
     paths = out_paths(out, traces)
     written = [("--table", table), ("--junit", junit), *(("--out", path) for path in paths)]

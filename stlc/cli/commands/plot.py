@@ -48,8 +48,7 @@ def plot(
     selects one. With --places all paths are drawn over the regions of the requirements, such as `dock` in
     `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
-    from stlc.cli.check.judge import monitor_of, reading_options, specification
-    from stlc.trace import read_recording, trace_of
+    from stlc.cli.check.judge import load
     from stlc.view import require_drawing
     from stlc.view.signals import draw_signals
     from stlc.view.verdicts import margins_of, units_of
@@ -59,11 +58,10 @@ def plot(
     target = _target(output, path)
     require_separate([("--output", target)], (path, reading.spec, reading.system))
     question = reading.question(require=())
-    recording = read_recording(path)
-    planned = recording.meta.planned  # margins over time are those of windows
-    source, note = specification(recording.name, question.spec, planned)
-    monitor = monitor_of(source, question, planned)
-    recorded = trace_of(recording, reading_options(monitor, question))
+    loaded = load(path, question, planned=True)  # margins over time are those of windows
+    if len(loaded.traces) > 1:
+        raise usage(f"`{path}` holds {len(loaded.traces)} objects of different times: which one is drawn?")
+    recorded, monitor, note = loaded.traces[0], loaded.monitor, loaded.note
     if places:
         shown = list(range(recorded.traces)) if trace is None else [trace]
         picture = _map(monitor, _one(recorded, trace), reading.require or [])

@@ -109,6 +109,18 @@ class CauseRecord(TypedDict):
     because: str
 
 
+class JudgedPart(TypedDict):
+    first: Num
+    last: Num
+    of: Num
+
+
+class ClockRecord(TypedDict):
+    name: str
+    unit: str
+    others: list[str]
+
+
 class CheckedRequirement(TypedDict):
     name: str
     doc: str
@@ -118,6 +130,7 @@ class CheckedRequirement(TypedDict):
     starts: int
     satisfied_share: Num
     violated_traces: int
+    judged: NotRequired[JudgedPart | None]
     cause: CauseRecord | None
 
 
@@ -131,6 +144,7 @@ class CheckedTrace(TypedDict):
     end: Literal["open", "strict", "truncate"]
     traces: int
     samples: int
+    clocks: NotRequired[list[ClockRecord]]
     unknown: dict[str, UnknownSamples]
     uncertain: NotRequired[dict[str, UncertainSignal]]
     in_scope: int

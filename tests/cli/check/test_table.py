@@ -17,7 +17,7 @@ import pytest
 from helpers.documents import misfits
 
 from stlc.cli.check.judge import Question, Work
-from stlc.cli.check.many import _files_of, safe_outcome
+from stlc.cli.check.many import _files_of, safe_outcomes
 from stlc.cli.check.table import COLUMNS
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
@@ -176,8 +176,8 @@ def test_torch_is_not_imported() -> None:
 
 
 def killing(name: str, times: int) -> Any:
-    """`outcome_of`, which ends its process the first times that a file is judged."""
-    from stlc.cli.check.many import outcome_of
+    """`outcomes_of`, which ends its process the first times that a file is judged."""
+    from stlc.cli.check.many import outcomes_of
 
     def judged(work: Work) -> Any:
         marks = Path("tried")
@@ -185,7 +185,7 @@ def killing(name: str, times: int) -> Any:
         if work.name == name and tried < times:
             (marks / str(tried)).touch()
             os._exit(9)
-        return outcome_of(work)
+        return outcomes_of(work)
 
     return judged
 
@@ -199,7 +199,7 @@ def test_a_lost_process_costs_only_its_file(
     assert check("logs/**/*.csv", "--json") == 1
     whole = json.loads(capsys.readouterr().out)["result"]
     Path("tried").mkdir()
-    monkeypatch.setattr("stlc.cli.check.many.outcome_of", killing("logs/1/high.csv", times))
+    monkeypatch.setattr("stlc.cli.check.many.outcomes_of", killing("logs/1/high.csv", times))
     words = ["logs/**/*.csv", "--jobs", "2", "--json", "--table", "t.csv", "--junit", "j.xml"]
     code = check(*words)
     document = json.loads(capsys.readouterr().out)
@@ -231,10 +231,10 @@ def test_a_machine_that_does_not_see_the_files_gives_the_same(tmp_path: Path) ->
     question = Question(spec=tmp_path / "s.stl")
     for name in ("logs/1/high.csv", str(tmp_path / "logs/2/broken.csv")):
         work = Work(name, question, Path("runs"), Path("out") / f"{Path(name).stem}.npz", table=True)
-        here = safe_outcome(work)
-        call = RemoteCall.of(safe_outcome, work, _files_of(question)(work)).with_files()
+        here = safe_outcomes(work)[0]
+        call = RemoteCall.of(safe_outcomes, work, _files_of(question)(work)).with_files()
         far = answer(_unseen(call))
-        assert replace(far.delivered(), seconds=0.0) == replace(here, seconds=0.0)
+        assert replace(far.delivered()[0], seconds=0.0) == replace(here, seconds=0.0)
         assert (far.outputs == {}) == bool(here.errors)
     assert load_trace("out/high.npz").data["low"].min() == -2.0
 
