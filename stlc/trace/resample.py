@@ -114,15 +114,10 @@ class Track:
         exact = since <= slack
         found = self.values[index]
         how, last = self.between.how, len(self.times) - 1
-        if how == "hold":
-            if self.between.age is not None:
-                unknown = since > self.between.age * _SAME + slack
-            else:
-                unknown = (np.append(np.diff(self.times), self.end - self.times[-1]) > self.limit)[
-                    index
-                ] & ~exact
-        else:
-            unknown = (np.append(np.diff(self.times), math.inf) > self.limit)[index] & ~exact
+        rest = self.end - self.times[-1] if how == "hold" else math.inf
+        unknown = (np.append(np.diff(self.times), rest) > self.limit)[index] & ~exact
+        if how == "hold" and self.between.age is not None:
+            unknown = since > self.between.age * _SAME + slack
         unknown |= there < 0
         following = found
         if how == "either":
@@ -130,17 +125,15 @@ class Track:
             following[unknown] = math.nan
         elif how != "hold":
             width = np.append(np.diff(self.times), 1.0)[index]
-            share = np.where(exact, 0.0, since / np.where(width > 0, width, 1.0))
-            change = self.values[np.minimum(index + 1, last)] - found
-            if how == "angle":
-                turn = self.between.period
-                change -= turn * np.round(change / turn)
-                low = -turn / 2 if (self.values < 0).any() else 0.0
+            share = since / np.where(width > 0, width, 1.0)
+            with np.errstate(all="ignore"):  # behind an infinite sample the line is unknown
+                change = self.values[np.minimum(index + 1, last)] - found
                 moved = found + share * change
-                found = np.where(exact, found, (moved - low) % turn + low)
-            else:
-                found = found + share * change
-            following = found
+                if how == "angle":
+                    turn = self.between.period
+                    low = -turn / 2 if (self.values < 0).any() else 0.0
+                    moved = (moved - share * turn * np.round(change / turn) - low) % turn + low
+            following = found = np.where(exact, found, moved)
         found = np.where(unknown, math.nan, found)
         return found, following if how == "either" else found
 

@@ -166,3 +166,10 @@ def test_samples_of_one_stamp_all_count() -> None:
 def test_freeze_compares_all_recorded_values() -> None:
     monitor = Monitor("signal v\nrequire still: freeze v0 = v in always (v - v0 < 5)")
     assert monitor.check(trace_of(spiked(), Reading(resample=0.01)))["still"].status != "satisfied"
+
+
+def test_an_infinite_sample_on_the_grid_keeps_its_value() -> None:
+    arrays = {"t": np.array([0.0, 0.1, 0.2]), "x": np.array([1.0, np.inf, 2.0])}
+    recording = Recording("gap", (ClockGroup(arrays, None),))
+    trace = trace_of(recording, Reading(resample=0.1, between={"x": Between("linear")}))
+    assert trace.data["x"].tolist() == [[1.0, np.inf, 2.0]]
