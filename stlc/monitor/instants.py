@@ -70,7 +70,7 @@ def rule_bounds(
 def rule_known(
     rule: CompiledRequirement, samples: int, starts: range, horizon: int | None
 ) -> NDArray[np.bool_]:
-    """Whether the value at each instant depends on no sample after the `samples` ones of the trace, (count,).
+    """Instants whose value depends on no sample after the `samples` ones of the trace, (count,).
 
     `horizon` is the length of a planning window in steps.
     """

@@ -72,7 +72,7 @@ MAX_COMPONENTS = 4096
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What is asked of a trace file; a reader may leave out everything else.
+    """Request to the reader of a trace file; the reader may leave out everything else.
 
     Attributes:
         names: names in the file of the signals that are read, such as `v`, `q[0]`, `scan.ranges`,

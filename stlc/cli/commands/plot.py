@@ -60,7 +60,8 @@ def plot(
     question = reading.question(require=())
     loaded = load(path, question, planned=True)  # margins over time are those of windows
     if len(loaded.traces) > 1:
-        raise usage(f"`{path}` holds {len(loaded.traces)} objects of different times: which one is drawn?")
+        objects = f"{len(loaded.traces)} objects of different times"
+        raise usage(f"`{path}` holds {objects}: choose one by --group NAME=VALUE")
     recorded, monitor, note = loaded.traces[0], loaded.monitor, loaded.note
     if places:
         shown = list(range(recorded.traces)) if trace is None else [trace]

@@ -274,7 +274,7 @@ class _Words:
 
 
 def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
-    """What a predicate reads, in the order in which its text names the signals; those of definitions last."""
+    """Reads of a predicate, in the order in which its text names the signals; those of definitions last."""
     words = re.findall(r"\w+(?:\[\d+\])?", leaf.span.text)
     places = {word: place for place, word in reversed(list(enumerate(words)))}
     return sorted(

@@ -86,7 +86,7 @@ def lines_of(text: str, begin: int) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a table is written.
+    """Layout of a table.
 
     Attributes:
         delimiter: character between two cells, or `BLANKS`.

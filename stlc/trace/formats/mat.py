@@ -52,7 +52,7 @@ _CONVERTED = {
     "function_handle": "v = {0}(t)",
     _OTHER: "v = {0}",
 }
-"""What has no plain values -> MATLAB's line that makes plain arrays of it; `{0}` is its name there."""
+"""Kind of value that is not plain -> MATLAB's line that makes plain arrays of it; `{0}` is its name there."""
 
 
 def read(path: Path, wanted: Wanted = ALL) -> Recording:
@@ -264,7 +264,7 @@ class _Hdf5:
         return Node(shape, partial(self._values, item, logical=kind == "logical"), text=kind == "char")
 
     def _elements(self, group: Any, field: str) -> list[tuple[Any, Any]]:
-        """Where the values of a field are: one in the group, or those of a structure array by references."""
+        """Values of a field: one in the group, or those of a structure array by references."""
         child = group[field]
         if self._refers(child) and "MATLAB_class" not in child.attrs:
             return [(self.file, each) for each in self._values(child).ravel("F")]

@@ -72,7 +72,7 @@ def _flat(table: Any) -> Any:
 
 
 def _kind(kind: Any) -> str:
-    """What a column of a type of Arrow holds: `numbers`, `words`, `lists` of numbers, or ""."""
+    """Kind of values in a column of an Arrow type: `numbers`, `words`, `lists` of numbers, or ""."""
     types = needed("pyarrow").types
     plain = kind.value_type if types.is_dictionary(kind) else kind
     if types.is_string(plain) or types.is_large_string(plain):

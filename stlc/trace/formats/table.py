@@ -1,4 +1,4 @@
-"""What readers of tables with one line per sample share: bytes and lines of text files, and their columns."""
+"""Parts of readers of tables with one line per sample: bytes and lines of text files, and their columns."""
 
 from __future__ import annotations
 
