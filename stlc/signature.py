@@ -10,6 +10,9 @@ from stlc.units import DIMENSIONLESS, Unit
 Kind = Literal["real", "int", "bool", "enum"]
 Role = Literal["input", "output", "state", "env", "timer"]
 
+MAX_COMPONENTS = 4096
+"""Most components of a vector."""
+
 
 @dataclass(frozen=True, slots=True)
 class Column:

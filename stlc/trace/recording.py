@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.registry import closest
-from stlc.signature import Column
+from stlc.signature import MAX_COMPONENTS, Column
 from stlc.source import Span
 from stlc.trace.meta import TraceMeta
 from stlc.units import CELSIUS, DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_unit, same_dims
@@ -66,8 +66,6 @@ _LONGEST = 80
 """Letters of the name of a clock or of a group."""
 _SHOWN = 40
 """Names that a message lists."""
-MAX_COMPONENTS = 4096
-"""Most components of a vector."""
 
 
 @dataclass(frozen=True, slots=True)

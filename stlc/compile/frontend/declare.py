@@ -30,7 +30,7 @@ from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.grammar.words import BUILT_IN
 from stlc.registry import closest
-from stlc.signature import Column, Kind, Role
+from stlc.signature import MAX_COMPONENTS, Column, Kind, Role
 from stlc.source import Span
 from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit, same_dims
 
@@ -137,7 +137,6 @@ def _absent_function(item: ast.Extern, interface: Interface) -> Diagnostic:
 
 Labels = tuple[tuple[str, float], ...]
 
-MAX_COMPONENTS = 4096
 _KINDS: Mapping[str, Kind] = {"real": "real", "int": "int", "bool": "bool"}
 
 

@@ -11,7 +11,6 @@ from typing import Protocol, get_args
 
 from stlc.compile.analysis.ranges import usual_range
 from stlc.compile.frontend.arithmetic import absolute
-from stlc.compile.frontend.declare import MAX_COMPONENTS
 from stlc.compile.frontend.scope import Definition, Known, column_entries, constant_value, member_entries
 from stlc.compile.frontend.values import VectorValue
 from stlc.compile.ir import nodes as ir
@@ -39,7 +38,7 @@ from stlc.dynamics.schema.record import (
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
-from stlc.signature import Column, Role
+from stlc.signature import MAX_COMPONENTS, Column, Role
 from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
 
 Ranges = tuple[tuple[float, float], ...]

@@ -18,10 +18,11 @@ import numpy as np
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import encodable
+from stlc.signature import MAX_COMPONENTS
 from stlc.trace.formats.cells import Array, bare, is_missing, value_of
 from stlc.trace.formats.registry import MAX_LETTERS, require_room, unreadable
 from stlc.trace.formats.table import MAX_LINE, place, size, text_lines, unpacked, utf8
-from stlc.trace.recording import ALL, MAX_COMPONENTS, ClockGroup, Recording, Wanted
+from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
 
 __all__ = ["chunks", "read", "size"]
 

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, StlcError, TraceError
-from stlc.signature import Column
+from stlc.signature import MAX_COMPONENTS, Column
 from stlc.trace.formats.paths import ARRAYS, HEADER, Enclosing, Path, RefusedError, Selection, element_names
 from stlc.trace.formats.registry import MAX_LETTERS, needed, opened, unreadable
-from stlc.trace.recording import ALL, MAX_COMPONENTS, Array, ClockGroup, Recording, Wanted
+from stlc.trace.recording import ALL, Array, ClockGroup, Recording, Wanted
 
 MAX_BYTES = 2_000_000_000
 MAX_VALUES = 100_000_000
