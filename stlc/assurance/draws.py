@@ -206,7 +206,7 @@ def _chosen(rules: Sequence[CompiledRequirement], require: Sequence[str]) -> tup
 
 
 def _sample(rules: Sequence[CompiledRequirement], judged: Sequence[Judged]) -> Sample:
-    weights = {rule.name: rule.weight / rule.scale for rule in rules}
+    weights = {rule.name: rule.factor for rule in rules}
     units = np.arange(len(judged[0].satisfied))
     return Sample(together(judged, weights), tuple(judged), units, "simulation")
 

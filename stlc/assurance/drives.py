@@ -96,7 +96,7 @@ def _judged_by_plans(task: Task, recording: DeploymentRecording) -> _Verdicts:
         for rule, (low, high) in ((rule, found[rule.name]) for rule in task.rules)
     )
     columns = dict(zip(task.system.names, np.moveaxis(recording.states, -1, 0).swapaxes(1, 2), strict=True))
-    weights = {rule.name: rule.weight / rule.scale for rule in task.rules}
+    weights = {rule.name: rule.factor for rule in task.rules}
     return _Verdicts(judged, weights, in_scope(task, columns))
 
 
@@ -115,7 +115,7 @@ def _judged_by_rules(task: Task, recording: DeploymentRecording, rules: Rules) -
         Judged(rule.name, rule.unit, statuses == "satisfied", statuses == "violated", least)
         for rule, statuses, least in found
     )
-    weights = {rule.name: rule.weight / rule.scale for rule, _, _ in found}
+    weights = {rule.name: rule.factor for rule, _, _ in found}
     inside = np.ones(len(recording.states), dtype=np.bool_) if scope is None else np.asarray(scope)
     return _Verdicts(judged, weights, np.broadcast_to(inside, (len(recording.states),)))
 

@@ -99,6 +99,11 @@ class CompiledRequirement:
         """Unit of the robustness; "" if its predicates have different units."""
         return margin_unit(self.typed.formula)
 
+    @property
+    def factor(self) -> float:
+        """Factor of its robustness in the overall minimum: weight / scale."""
+        return self.weight / self.scale
+
     def under(self, semantics: Semantics) -> ir.Formula:
         """Return the formula, simplified by the rules that are valid under `semantics`.
 

@@ -466,7 +466,7 @@ def _overall(rules: Sequence[CompiledRequirement], among: Sequence[CompiledRequi
     """
     names = [rule.name for rule in among]
     return [
-        f"least = MIN(least, each[{names.index(rule.name)}] * {literal(rule.weight / rule.scale)});"
+        f"least = MIN(least, weighed(each[{names.index(rule.name)}], {literal(rule.factor)}));"
         for rule in rules
     ]
 

@@ -17,6 +17,7 @@ from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numb
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import weighed
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor
 from stlc.controller.problem.task import TIE, Task
@@ -355,11 +356,7 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
     """
     if not rules:
         return like.sheet.constant([[math.inf]]).expand(1, BATCH, like=like)
-    weighed = [
-        each[rule.name] if rule.weight == rule.scale else each[rule.name] * (rule.weight / rule.scale)
-        for rule in rules
-    ]
-    least: Value = ONNX_OPS.join(weighed, "min")
+    least: Value = ONNX_OPS.join([weighed(each[rule.name], rule.factor, ONNX) for rule in rules], "min")
     return least
 
 

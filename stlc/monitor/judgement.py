@@ -14,6 +14,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.support import columns
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics
+from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.signals import Gap, Signals
 from stlc.monitor.values import Record
@@ -142,6 +143,7 @@ class Judgement:
             affect verdicts over all traces.
         reported: `low` and `high` in the requested semantics (definition of min and max); None: the exact.
         part: the samples on which the requirement is judged; None for all.
+        tolerance: a requirement is satisfied if its robustness is at least minus this value.
     """
 
     rule: CompiledRequirement
@@ -154,6 +156,7 @@ class Judgement:
     scope: Bools | None = field(default=None, repr=False)
     reported: tuple[Floats, Floats] | None = field(default=None, repr=False)
     part: Part | None = None
+    tolerance: float = TOLERANCE
 
     @property
     def margins(self) -> tuple[Floats, Floats]:
@@ -319,7 +322,7 @@ class Verdict:
     @property
     def robustness(self) -> Any:
         """The least `weight * robustness / scale` of all requirements: a float, or an array for a batch."""
-        rows = [j.least[None] * (j.rule.weight / j.rule.scale) for j in self.requirements]
+        rows = [weighed(j.least[None], j.rule.factor, NUMPY) for j in self.requirements]
         return _shaped(self.subject.record.semantics.join(rows, "min", NUMPY)[0], self.shape)
 
     @property

@@ -17,10 +17,12 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.support import columns_of, history
 from stlc.compile.ir.traverse import map_children, nodes, subexpressions
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.cells import Cells
 from stlc.monitor.holes import holes_in, partial, unsure, without_holes
+from stlc.signature import Signature
 
 Ends: TypeAlias = Literal["open", "truncate"]
 """`open`: the trace may continue, values are bounds over all continuations; `truncate`: windows are cut."""
@@ -212,8 +214,31 @@ def _read(num: ir.Num) -> set[str]:
     return {*columns_of(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
 
 
-def by_truth(formula: ir.Formula) -> ir.Formula:
-    """Return the formula with +inf for true and -inf for false predicates; `a >= b` is true at margin 0."""
+def decisive(rule: CompiledRequirement, tolerance: float, signature: Signature) -> CompiledRequirement:
+    """Return the requirement whose robustness decides the verdict with a tolerance; mostly `rule` itself.
+
+    With the tolerance 0, the robustness of every predicate is +inf or -inf, by its truth: then `<` and `<=`
+    differ. A truth value or a member of an enum has the margin 1/2. With a tolerance of at least that, the
+    predicates on these alone are +inf or -inf, since what is false is never nearly true.
+
+    Args:
+        rule: the requirement.
+        tolerance: a requirement is satisfied if its robustness is at least minus this value.
+        signature: the signals of the specification.
+    """
+    if 0.0 < tolerance < 0.5:
+        return rule
+    discrete = {column.name for column in signature.columns if column.kind in ("bool", "enum")}
+    formula = by_truth(rule.formula, discrete if tolerance else None)
+    return rule if formula == rule.formula else replace(rule, formula=formula)
+
+
+def by_truth(formula: ir.Formula, signals: Collection[str] | None = None) -> ir.Formula:
+    """Return the formula with +inf for true and -inf for false predicates; `a >= b` is true at margin 0.
+
+    `signals`: only the predicates that read nothing else than these; None: all predicates.
+    """
     if isinstance(formula, ir.Predicate):
-        return replace(formula, guard=True)
-    return map_children(formula, formulas=by_truth)
+        exact = signals is None or _read(formula.num) <= set(signals)
+        return replace(formula, guard=True) if exact else formula
+    return map_children(formula, formulas=lambda part: by_truth(part, signals))

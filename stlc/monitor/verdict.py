@@ -18,6 +18,7 @@ from stlc.compile.ir.traverse import numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import TOLERANCE, Semantics, semantics_of
+from stlc.compile.semantics.tolerance import weighed
 from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
@@ -38,7 +39,7 @@ from stlc.monitor.instants import (
 from stlc.monitor.judgement import Bools, Judgement, Part, Prepared, Status, Verdict, unknown_requirement
 from stlc.monitor.signals import Need, arrange, needs_of, reading_of
 from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
-from stlc.monitor.values import Ends, Record, by_truth
+from stlc.monitor.values import Ends, Record, decisive
 from stlc.source import Source
 from stlc.trace import Trace, load_trace
 
@@ -340,11 +341,9 @@ def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
 
 def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
     """The least `weight * robustness / scale` over the requirements, in the shape of the signals."""
-    weighed = [
-        row if rule.weight == rule.scale else row * (rule.weight / rule.scale)
-        for rule, row in zip(ready.rules, _rows(ready, end, at), strict=True)
-    ]
-    whole = ready.record.semantics.join(weighed, "min", ready.signals.ops)
+    ops = ready.signals.ops
+    rows = zip(ready.rules, _rows(ready, end, at), strict=True)
+    whole = ready.record.semantics.join([weighed(row, rule.factor, ops) for rule, row in rows], "min", ops)
     return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
 
 
@@ -380,14 +379,14 @@ def _judge(
     rule: CompiledRequirement, ready: Prepared, starts: range, ends: Ends, tolerance: float, part: Part
 ) -> Judgement:
     low, high = outer(*rule_bounds(rule, record_of(rule, ready, part), starts, ready.horizon, ends))
-    if tolerance > 0:
-        holds, fails = low >= -tolerance, high < -tolerance
-    else:
-        plain = replace(rule, formula=by_truth(rule.formula))
-        least, most = outer(*rule_bounds(plain, record_of(plain, ready, part), starts, ready.horizon, ends))
-        holds, fails = least > 0, most < 0
+    least, most, deciding = low, high, decisive(rule, tolerance, ready.compiled.signature)
+    if deciding is not rule:
+        record = record_of(deciding, ready, part)
+        least, most = outer(*rule_bounds(deciding, record, starts, ready.horizon, ends))
+    holds, fails = least >= -tolerance, most < -tolerance
     start = part.first + starts.start
-    return Judgement(rule, start, low, high, holds, fails, ready.signals.shape, part=part)
+    shape = ready.signals.shape
+    return Judgement(rule, start, low, high, holds, fails, shape, part=part, tolerance=tolerance)
 
 
 def first_violation(judgement: Judgement, subject: Prepared, tolerance: float = TOLERANCE) -> int:

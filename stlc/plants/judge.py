@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.modules import library_of, spec_sha256
+from stlc.compile.semantics.tolerance import weighed
 from stlc.files import find_spec, read_source
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.signals import arrange, needs_of
@@ -49,7 +51,7 @@ class JudgedRequirement:
     @property
     def share(self) -> float:
         """Robustness in units of the requirement's scale, by which requirements are compared."""
-        return self.low * self.rule.weight / self.rule.scale
+        return float(weighed(np.float64(self.low), self.rule.factor, NUMPY))
 
 
 @dataclass(frozen=True, slots=True)

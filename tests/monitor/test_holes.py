@@ -76,17 +76,17 @@ def test_bounds_hold_for_every_filling(written, trace, ends, window, seed, share
 )
 def test_a_stream_with_holes_says_what_the_whole_trace_says(written, trace, ending, truth, seed) -> None:
     formula = simplify(lower(written, random_formulas.GRID, []))
-    rule = random_formulas.a_rule(formula)
+    judged = by_truth(formula) if truth else formula
+    rule = random_formulas.a_rule(judged)
     everywhere, samples = not rule.uses_end, len(trace["x"])
     unknown = holed(trace, seed, 0.2)
-    tracker = Trackers(None).of(rule, TrackingOptions(ending, truth), everywhere=everywhere)
+    tracker = Trackers(None).of(rule, TrackingOptions(ending), everywhere=everywhere)
     seen = [(-np.inf, np.inf)]
     for now in range(1, samples + 1):
         tracker.grow({name: x[:now] for name, x in unknown.items()}, 0, now)
         low, high = tracker.live(0, 1)
         seen.append((max(low[0], seen[-1][0]), min(high[0], seen[-1][1])))
     starts = range(samples if everywhere else 1)
-    judged = by_truth(formula) if truth else formula
     wanted = [end[:, 0] for end in bounds(judged, Record.of(unknown, NUMPY), starts, ending)]
     found = tracker.ended(starts)
     np.testing.assert_array_equal(found, wanted)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import stlc
 from stlc.diagnostics import SpecError, StlcError, TraceError, UsageError
+from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta, save_trace
@@ -171,6 +172,21 @@ def test_ties(value: float, relation: str, tolerance: float, status: str) -> Non
     assert verdict.status == status
 
 
+def test_what_is_false_is_never_within_a_tolerance() -> None:
+    text = "signal a\nsignal b: bool\nenum M { lo, hi }\nsignal m: M\nrequire r: a > 0 until[0 s, 2 s] b\n"
+    monitor = Monitor(f"{text}require s: m == hi\nrequire v: a > 0\n", dt=1)
+    given_signals = {"a": [-1.5] * 3, "b": [0.0] * 3, "m": [0.0] * 3}
+    for tolerance, violated in ((1e-6, "rsv"), (0.4, "rsv"), (0.5, "rsv"), (2.0, "rs")):
+        verdict = monitor.check(given_signals, tolerance=tolerance)
+        assert "".join(each.name for each in verdict if each.overall == "violated") == violated
+        online = monitor.online(How(tolerance=tolerance))
+        for row in zip(*given_signals.values(), strict=True):
+            online.push(dict(zip(given_signals, row, strict=True)))
+        statuses = {name: each.status for name, each in online.finish().items()}
+        assert "".join(name for name, status in statuses.items() if status == "violated") == violated
+    assert monitor.check(given_signals | {"b": [0.0, 1.0, 0.0]}, tolerance=2.0)["r"].overall == "satisfied"
+
+
 def test_strictness_under_negation_and_windows() -> None:
     monitor = Monitor("signal a\nrequire r: not eventually[0 s, 2 s] a > 0\n", dt=1)
     assert monitor.check({"a": [0.0, 0.0, 0.0]}, tolerance=0).satisfied is True
@@ -194,7 +210,7 @@ def test_weights_and_scales_count_in_the_whole_alone() -> None:
     verdict = Monitor(text, dt=1).check({"a": [[1.0, 9.0], [-0.5, 9.0]]})
     assert verdict["r"].robustness.tolist() == [1.0, -0.5]
     assert verdict["s"].robustness.tolist() == [2.0, 0.5]
-    assert verdict.robustness.tolist() == [0.5, -1.0]
+    assert verdict.robustness.tolist() == [0.5, pytest.approx(-1.0)]
     assert Monitor(text, dt=1).robustness({"a": [1.0]}, at=0) == 0.5
 
 

@@ -29,7 +29,7 @@ def sample_of_verdict(checked: Checked) -> Sample | None:
     for each in verdict:
         statuses, least = np.array(each.statuses)[inside], each.low.min(axis=0)[inside]
         least = np.nan_to_num(least, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
-        weights[each.name] = each.rule.weight / each.rule.scale
+        weights[each.name] = each.rule.factor
         judged.append(Judged(each.name, each.unit, statuses == "satisfied", statuses == "violated", least))
     seeds = checked.trace.extras.get("seed")
     units, noun = np.arange(int(inside.sum())), "trace"

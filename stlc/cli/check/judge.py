@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from stlc.cli.framework.output import ColorMode
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import usage
 from stlc.escape import operand
 from stlc.files import find_spec, read_source
@@ -69,7 +70,7 @@ class Question:
     require: tuple[str, ...] = ()
     at: str | None = None
     end: End = "open"
-    tolerance: float = 1e-6
+    tolerance: float = TOLERANCE
     resample: float | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     semantics: str = "exact"

@@ -126,7 +126,7 @@ def _row(
     rule = online.rule(name)
     where = f"from {_moment(online, tally.worst)}" if tally.instants > 1 else ""
     unit = rule.unit or ("" if cause is None else cause.unit)
-    value = robustness_text(tally.status, tally.low, tally.high, tally.robustness, unit)
+    value = robustness_text(tally.status, tally.low, tally.high, tally.robustness, unit, online.how.tolerance)
     share = "" if tally.instants == 1 else percent(tally.share)
     why = ""
     if cause is not None:

@@ -87,15 +87,21 @@ def text_of(
     return "\n".join([*lines, "", *ending])
 
 
-def robustness_text(status: Status, low: float, high: float, least: float, unit: str) -> str:
+def robustness_text(
+    status: Status, low: float, high: float, least: float, unit: str, tolerance: float = TOLERANCE
+) -> str:
     """Text of the robustness of a requirement, with its unit.
 
     If the verdict `status` is inconclusive, the text shows the bounds `low` and `high`. Otherwise it shows
-    the least robustness, `least`, or the word "boundary" if `least` is zero up to rounding.
+    the least robustness, `least`, and the word "boundary" if only the tolerance of the verdict decides; the
+    word alone if `least` is zero up to rounding.
     """
     if status == "inconclusive":
         return in_unit(f"[{signed(low)}, {signed(high)}]", unit)
-    return "boundary" if abs(least) <= TOLERANCE else in_unit(signed(least), unit)
+    if abs(least) <= min(tolerance, TOLERANCE):
+        return "boundary"
+    value = in_unit(signed(least), unit)
+    return f"{value} (boundary)" if -tolerance <= least < 0.0 else value
 
 
 def in_unit(value: str, unit: str) -> str:
@@ -143,7 +149,7 @@ def rows_of(result: Checked, violated_at: Mapping[str, float]) -> tuple[VerdictR
         if judged.counted(judged.least).size:
             least = low if status == "inconclusive" else float(judged.counted(judged.least).min())
             shown = "inconclusive" if result.uncertain else status
-            robustness = robustness_text(shown, low, high, least, unit)
+            robustness = robustness_text(shown, low, high, least, unit, judged.tolerance)
         share = "" if judged.holds.size == 1 else percent(judged.share)
         why = _inconclusive(judged, result) if status == "inconclusive" else ""
         why, where = why if cause is None else cause.because, _where(judged, result)

@@ -28,6 +28,7 @@ from stlc.cli.framework.options import (
 )
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.files import has_wildcard, matching_traces, real, write_atomic
 from stlc.registry import SEMANTICS
@@ -72,7 +73,7 @@ def check(
     ] = "exact",
     tolerance: Annotated[
         float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
-    ] = 1e-6,
+    ] = TOLERANCE,
     uncertain: Annotated[
         list[str] | None,
         typer.Option(metavar="SIGNAL=ERROR", help="Greatest error of each sample, as x=0.1m or v=2%."),

@@ -21,6 +21,7 @@ from stlc.compile.semantics.kinds.dgmsr import GeneralizedMean
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 from stlc.compile.semantics.protocol import Parts, Semantics
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import SEMANTICS
 
@@ -36,12 +37,6 @@ __all__ = [
     "Semantics",
     "semantics_of",
 ]
-
-TOLERANCE = 1e-6
-"""A requirement counts as satisfied if its robustness is >= -TOLERANCE, in float64.
-
-Times and start states lie on grids, so that exact ties occur.
-"""
 
 
 def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = None) -> Semantics:

@@ -86,7 +86,7 @@ class NativeJudge:
         turns = torch.tensor([control.squash == "angle" for control in controls])
         low, high = system.control_low, system.control_high
         self._bounds = torch.stack((low, high, turns.to(low.dtype))).double().numpy()
-        self._factors = np.array([rule.weight / rule.scale for rule in rules])
+        self._factors = np.array([rule.factor for rule in rules])
 
     @classmethod
     def of(

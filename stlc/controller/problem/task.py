@@ -19,8 +19,8 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import is_state, nodes
 from stlc.compile.pipeline import compile_spec
-from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import Hard, Switch
+from stlc.compile.semantics.tolerance import tolerance_of
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.native import check_plans
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 HARD = Hard()
 MOST_VALUES = 32_000_000
 """Maximum number of values that torch holds while it judges plans: 256 MB in float64."""
-FLOAT32_SLACK = 1e-5
-"""Float32 rounding tolerated in a margin that is 0 by construction."""
 TIE = 1e-4
 """Weight of the cost among violating plans, whose robustness is the same where a deadline cannot be met."""
 GUIDANCE = 0.1
@@ -97,8 +95,7 @@ def satisfied(rho: Tensor) -> Tensor:
     Returns:
         A boolean tensor of the same shape.
     """
-    slack = TOLERANCE if rho.dtype == torch.float64 else FLOAT32_SLACK
-    return rho >= -slack
+    return rho >= -tolerance_of(rho)
 
 
 def _on_starts(compiled: Compiled, system: System) -> dict[str, ir.Formula]:

@@ -18,12 +18,10 @@ class TrackingOptions:
     Attributes:
         ending: treatment of windows that extend beyond the end of the trace: "open" leaves missing samples
             unknown, "truncate" clips the windows.
-        truth: whether the value of a predicate is its truth value, +inf or -inf, instead of its margin.
         begin: the first sample at which the requirement is evaluated.
     """
 
     ending: Ending = "open"
-    truth: bool = False
     begin: int = 0
 
 

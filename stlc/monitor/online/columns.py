@@ -27,7 +27,6 @@ from stlc.monitor.holes import holes_in, partial, unsure, without_holes
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.streams import ColumnPlan, DerivedColumn, RecursiveOp, column
 from stlc.monitor.prefix_bounds import FAR, SEEN, with_seen
-from stlc.monitor.values import by_truth
 
 Beyond: TypeAlias = Literal["lower", "upper", "truncate", "both"]
 ColumnPlans: TypeAlias = Mapping[Beyond, ColumnPlan]
@@ -128,7 +127,6 @@ class Side:
         plan: the columns to compute.
         end: value of a predicate after the last sample, as in `ColumnReader`; if "both", rows have two parts.
         beyond: number of instants after the last sample at which the formula reads its columns.
-        truth: whether the value of a predicate is its truth value, +inf or -inf, instead of its margin.
         least: bound that is computed for a predicate that reads unknown samples (NaN). True: the lower bound;
             False: the upper bound; None: both.
         rows: column name -> view of its stored rows, the first of which is sample `history.first`.
@@ -138,7 +136,6 @@ class Side:
     plan: ColumnPlan
     end: Beyond
     beyond: int
-    truth: bool = False
     least: bool | None = True
     rows: dict[str, Floats] = field(default_factory=dict, init=False)
     history: ColumnHistory = field(init=False)
@@ -164,7 +161,7 @@ class Side:
             else:
                 self._recursive.append((stream, ColumnReader(stream.parts, self.end)))
         for (back, _, pointwise), group in groups.items():
-            formulas = [by_truth(each.parts[0]) if self.truth else each.parts[0] for each in group]
+            formulas = [each.parts[0] for each in group]
             end: Beyond = "truncate" if pointwise else self.end
             going_on = end != "truncate" and not self._over
             self._predicates.append((group, ColumnReader(formulas, end, going_on=going_on, back=back)))

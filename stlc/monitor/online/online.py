@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
@@ -22,6 +22,7 @@ from stlc.monitor.online.tally import Flags, JudgedInstants, RequirementSummary
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
 from stlc.monitor.online.trackers import Trackers
 from stlc.monitor.signals import Gap, Need, arrange, needs_of
+from stlc.monitor.values import decisive
 from stlc.trace import Trace
 
 Sample: TypeAlias = Mapping[str, Any]
@@ -84,7 +85,7 @@ class Watched:
         rule: the requirement.
         everywhere: whether the requirement is evaluated at every sample or only at one.
         values: evaluator of the robustness.
-        truths: evaluator of truth values, +inf or -inf; None if the tolerance is not 0.
+        truths: evaluator of the robustness that decides, if it is another one (`stlc.monitor.values`).
         tolerance: the tolerance, as in `How`.
         tally: summary of the instants whose verdict is final; these instants are called counted.
         decided: whether an instant already has a verdict, (instants,). The first entry belongs to the first
@@ -101,7 +102,7 @@ class Watched:
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
-        """The evaluator of robustness and, if the tolerance is 0, the evaluator of truth values."""
+        """The evaluator of robustness and, if it is another, that of the robustness that decides."""
         return (self.values,) if self.truths is None else (self.values, self.truths)
 
     @property
@@ -138,10 +139,8 @@ class Watched:
         return self._judged(*(tracker.ended(starts) for tracker in self.trackers))
 
     def _judged(self, bounds: RobustnessBounds, truths: RobustnessBounds | None = None) -> JudgedInstants:
-        low, high = bounds
-        if truths is None:
-            return JudgedInstants(low, high, low >= -self.tolerance, high < -self.tolerance)
-        return JudgedInstants(low, high, truths.low > 0, truths.high < 0)
+        least, most = truths or bounds
+        return JudgedInstants(*bounds, least >= -self.tolerance, most < -self.tolerance)
 
     def drop(self) -> int:
         """Free the memory of final instants; return the index of the first sample that is still needed."""
@@ -182,8 +181,8 @@ class Online:
         ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
         options = TrackingOptions(ending, begin=begin)
         values, truths = self._trackers.of(rule, options, everywhere=everywhere), None
-        if self.how.tolerance == 0:
-            truths = self._trackers.of(rule, replace(options, truth=True), everywhere=everywhere)
+        if (deciding := decisive(rule, self.how.tolerance, self.compiled.signature)) is not rule:
+            truths = self._trackers.of(deciding, options, everywhere=everywhere)
         tally = RequirementSummary(low_at=begin, high_at=begin, first=begin)
         return Watched(rule, everywhere, values, truths, self.how.tolerance, tally)
 

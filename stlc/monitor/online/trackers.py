@@ -23,7 +23,7 @@ from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, span
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, endless, looks_on, plan
 from stlc.monitor.online.unbounded import UnboundedState, skeleton
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
-from stlc.monitor.values import Record, by_truth, window_bounds
+from stlc.monitor.values import Record, window_bounds
 
 
 def prefix_bounds(formula: ir.Formula, ending: Ending, window: int | None) -> tuple[ir.Formula, ir.Formula]:
@@ -46,12 +46,12 @@ def sides_of(plans: ColumnPlans, beyond: int, options: TrackingOptions) -> list[
     number of instants after the last sample at which the formulas read columns.
     """
     sides = [
-        Side(plans["lower"], "lower", beyond, options.truth),
-        Side(plans["upper"], "upper", beyond, options.truth, least=False),
+        Side(plans["lower"], "lower", beyond),
+        Side(plans["upper"], "upper", beyond, least=False),
     ]
     if options.ending == "truncate":
         cut = plans["truncate"]
-        sides += [Side(cut, "truncate", 0, options.truth, least=least) for least in (True, False)]
+        sides += [Side(cut, "truncate", 0, least=least) for least in (True, False)]
     return sides
 
 
@@ -245,11 +245,9 @@ class IntervalColumns:
     all formulas.
 
     Attributes:
-        truth: whether the value of a predicate is its truth value, +inf or -inf, instead of its margin.
         samples: number of samples received.
     """
 
-    truth: bool
     samples: int = 0
     side: Side = field(init=False)
     _formulas: list[ir.Formula] = field(default_factory=list)
@@ -273,7 +271,7 @@ class IntervalColumns:
             assert isinstance(whole.formula, ir.BoolOp)
             formulas = whole.formula.items
             beyond = max(reach(formula).future for formula in formulas)
-            self.side = Side(whole, "both", beyond, self.truth, least=None)
+            self.side = Side(whole, "both", beyond, least=None)
             self._reader, self._back = ColumnReader(formulas, "both"), max(map(history, formulas))
         self.side.grow(signals, first, samples)
         self.samples, self._found = samples, None
@@ -374,7 +372,6 @@ class RecomputeTracker(_CutTracker):
     rule: CompiledRequirement
     horizon: int | None
     ending: Ending
-    truth: bool = False
     samples: int = 0
     window: int | None = field(init=False)
     _signals: Mapping[str, Floats] = field(default_factory=dict)
@@ -382,8 +379,6 @@ class RecomputeTracker(_CutTracker):
     _long: tuple[int, ir.Formula, ir.Formula] = (-1, ir.Truth(True), ir.Truth(True))
 
     def __post_init__(self) -> None:
-        if self.truth:
-            self.rule = replace(self.rule, formula=by_truth(self.rule.formula))
         self.window = window_of(self.rule, self.horizon)
         self._ends = prefix_bounds(self.rule.formula, self.ending, self.window)
 
@@ -435,7 +430,7 @@ class Trackers:
     """
 
     horizon: int | None
-    _pairs: dict[tuple[bool, bool, int, int], IntervalColumns] = field(default_factory=dict)
+    _pairs: dict[tuple[bool, int, int], IntervalColumns] = field(default_factory=dict)
 
     def of(self, rule: CompiledRequirement, options: TrackingOptions, *, everywhere: bool) -> Tracker:
         """Return the evaluator that needs the least memory for a requirement.
@@ -483,11 +478,11 @@ class Trackers:
             if options.ending == "truncate" or not shareable(plans):
                 return BoundedTracker(plans, options)
         except EndlessError:
-            return RecomputeTracker(rule, self.horizon, options.ending, options.truth)
+            return RecomputeTracker(rule, self.horizon, options.ending)
         counted = (self.horizon if rule.windowed else rule.reach) if everywhere else 0
         later = max(counted or 0, reach(formula).future)
-        alike = everywhere, options.truth, options.begin, later
-        return self._pairs.setdefault(alike, IntervalColumns(options.truth)).add(formula)
+        alike = everywhere, options.begin, later
+        return self._pairs.setdefault(alike, IntervalColumns()).add(formula)
 
 
 def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:

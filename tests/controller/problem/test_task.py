@@ -10,7 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stlc
+from stlc.controller.planning.planner import PlanBudget, plan
+from stlc.controller.problem.load import load_task
+from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task, rank, satisfied
+from stlc.monitor.verdict import Monitor
 
 
 def _plans(task: Task, n: int, seed: int) -> torch.Tensor:
@@ -28,6 +32,39 @@ def test_judging_equals_robustness_of_the_rollout(car_task: Task) -> None:
     assert torch.allclose(judged.safe, car_task.safety.robustness(x), atol=1e-12)
     assert torch.equal(judged.rho, judged.requirements.amin(1))
     assert (judged.safe >= judged.rho).all()
+
+
+SCALED = {
+    "a large number": ("@scale(1000000)\nrequire r: always[0, T] x >= 0.9 m\n", 0.5),
+    "a truth value": ("@scale(auto)\nrequire r: f <= 500 kN until[0, T] go\n", 0.0),
+    "a weight": ("@weight(1000)\nrequire r: always[0, T] x >= 0.9 m\n", 0.9 - 1e-8),
+}
+
+
+@pytest.mark.parametrize("name", SCALED)
+def test_plans_and_recordings_have_one_verdict_whatever_the_scale(name: str, tmp_path: Path) -> None:
+    formula, start = SCALED[name]
+    spec, system = tmp_path / "s.stl", tmp_path / "s.yaml"
+    spec.write_text(f"signal x: real [m]\nsignal f: real [N] in [0, 1e6]\nsignal go: bool\n{formula}")
+    system.write_text(
+        "stlc: 1\nname: s\ntime: {dt: 1 s, horizon: 3 steps}\n"
+        "state: {x: {unit: m, range: [-1, 1]}, f: {unit: N, range: [0, 1e6]}, go: {bool: true}}\n"
+        "control: {u: {range: [-1, 1]}}\nflow: {f: 0 N/s * u}\n"
+        f"init: {{mixture: [{{draw: {{x: {start}, f: 0, go: 0}}}}]}}\n"
+    )
+    task = load_task(spec, str(system))
+    x0 = task.sample(4, seed=1, dtype=torch.float64)
+    u = torch.zeros(4, task.horizon, 1, dtype=torch.float64)
+    judged = task.judge(x0, u)
+    columns = dict(zip(task.system.names, task.rollout(x0, u)[0].T.numpy(), strict=True))
+    recorded = Monitor(spec, dt=1, horizon=3).check({key: columns[key] for key in ("x", "f", "go")})
+    wanted = name == "a weight"
+    assert recorded.satisfied is wanted
+    assert satisfied(judged.rho).tolist() == satisfied(judged.requirements).all(1).tolist() == [wanted] * 4
+    assert task.native is not None
+    _, rho = task.native.climb(x0, u, u[:0], Effort(1, 0.0, 1))
+    assert satisfied(rho).tolist() == [wanted] * 4
+    assert bool((plan(task, x0, budget=PlanBudget(evaluations=100)).rho >= -1e-6).all()) is wanted
 
 
 def test_a_plan_with_nan_is_violated_and_never_preferred(car_task: Task) -> None:

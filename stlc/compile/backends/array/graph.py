@@ -22,6 +22,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.schedule.schedule import Boundary, End, IndexRange, TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
+from stlc.compile.semantics.tolerance import weighed
 from stlc.signature import Signature
 
 
@@ -161,12 +162,8 @@ class Weighed(Protocol):
         """
 
     @property
-    def weight(self) -> float:
-        """Factor of the robustness in the minimum over all requirements."""
-
-    @property
-    def scale(self) -> float:
-        """Divisor of the robustness in the minimum over all requirements."""
+    def factor(self) -> float:
+        """Factor of the robustness in the minimum over all requirements: weight / scale."""
 
 
 class RobustnessGraph:
@@ -202,8 +199,7 @@ class RobustnessGraph:
     def robustness(self, x: Array, smoothing: float | None = None) -> Array:
         """Overall robustness of trajectories `x`, `(batch,)`.
 
-        It is the minimum over the requirements of `weight * rho / scale`, where rho is the robustness of a
-        requirement.
+        It is the minimum over the requirements of their weighed robustness, `weight * rho / scale`.
         """
         env, ops = self._columns(x)
         return self.columns(env, ops=ops, smoothing=smoothing)
@@ -228,11 +224,8 @@ class RobustnessGraph:
         ops, rows = ops_of(each), each.T
         if not self.rules:
             return ops.full((each.shape[0],), math.inf, each)
-        weighed = [
-            rows[i : i + 1] if rule.weight == rule.scale else rows[i : i + 1] * (rule.weight / rule.scale)
-            for i, rule in enumerate(self.rules)
-        ]
-        return semantics_of(self.semantics, smoothing).join(weighed, "min", ops)[0]
+        items = [weighed(rows[i : i + 1], rule.factor, ops) for i, rule in enumerate(self.rules)]
+        return semantics_of(self.semantics, smoothing).join(items, "min", ops)[0]
 
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None

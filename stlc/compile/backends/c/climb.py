@@ -90,7 +90,7 @@ int climb(int64_t first, int64_t last, const double *x0, double *plans, double *
       int which = -1;
       for (int j = 0; j < LANES; ++j) {{
         double value = INFINITY;
-        for (int i = 0; i < R; ++i) value = MIN(value, out[i][j] * factors[i]);
+        for (int i = 0; i < R; ++i) value = MIN(value, weighed(out[i][j], factors[i]));
         if (!(bad[j] > 0.0) && value > best) {{ best = value; which = j; }}
         if (g == 0 && best >= enough) break; /* the plan itself */
       }}

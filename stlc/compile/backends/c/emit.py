@@ -18,6 +18,7 @@ from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import leaves
 from stlc.compile.schedule.schedule import End
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 LANES = 16
 
@@ -46,6 +47,14 @@ VECTOR(sin) VECTOR(cos) VECTOR(exp) VECTOR(log)
 #define LEAST(a, b) (MIN(a, b) + ((b) != (b) ? (b) : 0.0)) /* NaN where either is; loops vectorise */
 #define MOST(a, b) (MAX(a, b) + ((b) != (b) ? (b) : 0.0))
 #define NAN_IN(a) ((double)((a) != (a)))
+#define STLC_TOLERANCE {TOLERANCE!r}
+
+/* Robustness times weight / scale, at least -STLC_TOLERANCE where it is itself: `weighed` in Python. */
+static inline double weighed(double rho, double factor) {{
+  if (factor == 1.0) return rho;
+  return rho >= -STLC_TOLERANCE ? MAX(rho * factor, -STLC_TOLERANCE)
+                                : (rho + STLC_TOLERANCE) * factor - STLC_TOLERANCE;
+}}
 
 static inline double floored_mod(double a, double b) {{
   const double r = fmod(a, b); /* exact, unlike a - b * floor(a / b) where a / b rounds up */

@@ -20,9 +20,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import StraightThrough
+from stlc.compile.semantics.tolerance import weighed
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.feasibility import extremes
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
@@ -77,7 +79,7 @@ class GradientAscent:
         )
         self._span = self._high - self._low
         self._turns = np.array([control.squash == "angle" for control in system.decl.controls])
-        self._factors = np.array([rule.weight / rule.scale for rule in task.rules])
+        self._factors = np.array([rule.factor for rule in task.rules])
         safe = {rule.name for rule in task.compiled.safety}
         self._safe = [at for at, rule in enumerate(task.rules) if rule.name in safe]
         self._changes = self._drawn(NEAR, generator)
@@ -201,9 +203,9 @@ class GradientAscent:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
         else:
             each, pull = self._natively(self._native, x, u)
-        each *= self._factors
-        each[np.isnan(each)] = -np.inf
-        return each, pull
+        found = np.stack([weighed(row, f, NUMPY) for row, f in zip(each.T, self._factors, strict=True)], 1)
+        found[np.isnan(found)] = -np.inf
+        return found, pull
 
     def _natively(self, native: NativeGradient, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
         threads = torch.get_num_threads()

@@ -244,7 +244,7 @@ def _encoded(
     try:
         x0 = dict(zip(task.system.names, state.tolist(), strict=True))
         rho = encoding.model.variable(known, MOST_RHO) if maximise else constant(target)
-        factors = [rule.weight / rule.scale for rule in task.rules]
+        factors = [rule.factor for rule in task.rules]
         wanted = [
             Demand(rule.formula, rho.times(1.0 / factor))
             for rule, factor in zip(task.rules, factors, strict=True)

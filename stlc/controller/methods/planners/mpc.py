@@ -104,7 +104,7 @@ class Mpc:
         step = {**free.next, **{timer.name: timer.update for timer in system.timers}}
         named = dict(zip(system.control_names, bounds, strict=True))
         motion = ShootingDynamics(free.lets, step, system.decl.clamps, named, system.horizon)
-        rules = [ScaledFormula(rule.under(LogSumExp()), rule.weight / rule.scale) for rule in task.rules]
+        rules = [ScaledFormula(rule.under(LogSumExp()), rule.factor) for rule in task.rules]
         try:
             return Shooting(motion, rules, smoothing=self.smoothing, sharpness=self.sharpness)
         except NotSmoothError as what:
