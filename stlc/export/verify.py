@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -17,6 +18,8 @@ from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import rank
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import without_deprecations
+from stlc.runtime.backup import search
+from stlc.runtime.graphs import joined
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
@@ -29,8 +32,30 @@ RHO = 1e-6
 """Greatest distance of a robustness from the exact monitor's on the same plan."""
 BUILT = ("-std=c99", "-O1", "-fno-math-errno")
 
-Answer: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
-"""plan (B, T, m), rho and safe (B,), requirements (B, R)."""
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Decisions of an export.
+
+    Attributes:
+        plan: plans, (B, T, m).
+        rho: robustness of the specification, (B,).
+        safe: robustness of the safety requirements, (B,).
+        each: robustness of each requirement, (B, R).
+        source: rule that chose each plan (`stlc.runtime.backup`), (B,); None if the policy did.
+        t0: length of the prefix that the backup policy took from its list, (B,); None if the policy chose.
+    """
+
+    plan: Tensor
+    rho: Tensor
+    safe: Tensor
+    each: Tensor
+    source: Tensor | None = None
+    t0: Tensor | None = None
+
+
+Decide: TypeAlias = Callable[[Tensor], Answer]
+"""Decisions of an export, a function of states (B, n) float64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +64,7 @@ class Agreement:
 
     Attributes:
         states: number of random states.
+        guarded: number of those in which the backup policy was compared too.
         plan: greatest difference of a control, as a share of its range, over the states in which export and
             run chose the same plan.
         rho: greatest difference of a robustness from that of the exact monitor.
@@ -49,6 +75,7 @@ class Agreement:
     plan: float
     rho: float
     ties: int
+    guarded: int = 0
 
     def worst(self, other: Agreement, *distances: float) -> Agreement:
         """Combine two agreements: take the greater differences, and add the ties.
@@ -56,15 +83,16 @@ class Agreement:
         `distances` are further differences of robustness.
         """
         rho = max(self.rho, other.rho, *distances)
-        return Agreement(self.states, max(self.plan, other.plan), rho, self.ties + other.ties)
+        ties, guarded = self.ties + other.ties, self.guarded + other.guarded
+        return Agreement(self.states, max(self.plan, other.plan), rho, ties, guarded)
 
 
-def agreement(policy: Policy, decide: Callable[[Tensor], Answer], *, states: int, seed: int = 7) -> Agreement:
+def agreement(policy: Policy, decide: Decide, *, states: int, seed: int = 7) -> Agreement:
     """Compare an export with its policy in random states.
 
     Args:
         policy: the policy that was exported.
-        decide: decisions of the export, a function of states (B, n) float64.
+        decide: decisions of the export.
         states: number of random states.
         seed: seed of the random states.
 
@@ -82,15 +110,23 @@ def _compared(task: Task, x: Tensor, plan: Tensor, answer: Answer) -> Agreement:
     Raises:
         RunError: R105, they disagree.
     """
-    exported, rho, safe, each = answer
-    judged = task.judge(x, plan)
+    exported, judged = answer.plan, task.judge(x, plan)
     width = (task.system.control_high - task.system.control_low).double()
     far = ((exported - plan).abs() / width).amax((1, 2))
     again = task.judge(x, exported)
     score = [rank(one.rho, task.cost(one), one.safe) for one in (judged, again)]
     same = far <= PLAN
     ties = ~same & ((score[0] - score[1]).abs() <= PLAN)
-    off = max(_distance(rho, again.rho), _distance(safe, again.safe), _distance(each, again.requirements))
+    off = max(
+        *(
+            _distance(told, known)
+            for told, known in (
+                (answer.rho, again.rho),
+                (answer.safe, again.safe),
+                (answer.each, again.requirements),
+            )
+        )
+    )
     found = Agreement(len(x), float(far[same].amax()) if bool(same.any()) else 0.0, off, int(ties.sum()))
     if not bool((same | ties).all()) or not off <= RHO:
         worst = float(far.nan_to_num(torch.inf).amax())
@@ -114,50 +150,72 @@ def _distance(a: Tensor, b: Tensor) -> float:
     return float(torch.where(same, torch.zeros_like(a), (a - b).abs()).nan_to_num(torch.inf).amax())
 
 
-def by_torch(path: Path) -> Callable[[Tensor], Answer]:
-    """Load an exported torch program; returns its decisions as a function of states."""
+def by_torch(path: Path) -> Decide:
+    """Load an exported torch program; returns its decisions."""
     with without_deprecations():
         module = torch.export.load(path).module()
-
-    def decide(x: Tensor) -> Answer:
-        plan, rho, safe, each = module(x)
-        return plan, rho, safe, each
-
-    return decide
+    return lambda x: Answer(*module(x))
 
 
-def backup_agreement(policy: Policy, path: Path, *, states: int, seed: int = 11) -> Agreement:
-    """Compare the guard with its exported program at `path` in random states.
+def backup_agreement(policy: Policy, decide: Decide, *, states: int, seed: int = 11) -> Agreement:
+    """Compare the backup policy with that of an export in random states.
 
-    The guard is called in every state, even if the policy's plan is satisfying and no guard is needed.
+    It is called in every state, even if the policy's plan is satisfying and no guard is needed.
+
+    Args:
+        policy: the policy that was exported.
+        decide: decisions of the exported backup policy.
+        states: number of random states.
+        seed: seed of the random states.
 
     Raises:
         RunError: R105, they disagree.
     """
     task = policy.task
     x = task.sample(states, seed=seed, dtype=torch.float64)
+    with torch.no_grad():
+        wanted, told = StagedSearch(task, policy, "paper").search(x, policy.plan(x)), decide(x)
+    assert told.source is not None
+    assert told.t0 is not None
+    if not (torch.equal(told.source, wanted.source) and torch.equal(told.t0, wanted.prefix_length)):
+        raise RunError(_disagreement("the backup policy decides by another rule"))
+    return replace(_compared(task, x, wanted.plans, told), guarded=states)
+
+
+def backup_by_torch(path: Path, policy: Policy) -> Decide:
+    """Load the exported torch program of the backup policy; returns its decisions on plans of the policy."""
     with without_deprecations():
         module = torch.export.load(path).module()
-    with torch.no_grad():
-        wanted = StagedSearch(task, policy, "paper").search(x, policy.plan(x))
+
+    def decide(x: Tensor) -> Answer:
         rows = [module(one[None], policy.plan(one[None])) for one in x]
-    plan, rho, safe, each, source, t0 = (torch.cat(column) for column in zip(*rows, strict=True))
-    if not (bool((source == wanted.source).all()) and bool((t0 == wanted.prefix_length).all())):
-        raise RunError(_disagreement("the backup policy decides by another rule"))
-    return _compared(task, x, wanted.plans, (plan, rho, safe, each))
+        return Answer(*(torch.cat(column) for column in zip(*rows, strict=True)))
+
+    return decide
 
 
-def by_onnx(graphs: Graphs) -> Callable[[Tensor], Answer]:
-    """Return the decisions of ONNX graphs as a function of states (B, n).
-
-    The Python runtime `stlc.runtime` evaluates the graphs.
-    """
+def by_onnx(graphs: Graphs) -> Decide:
+    """Return the decisions of ONNX graphs, evaluated by the Python runtime `stlc.runtime`."""
     return lambda x: _answer(graphs.decided(x.numpy())[0])
 
 
+def backup_by_onnx(graphs: Graphs) -> Decide:
+    """Return the decisions of the Python runtime's backup policy on the plans of ONNX graphs."""
+
+    def decide(x: Tensor) -> Answer:
+        states = x.numpy()
+        judged, outputs = graphs.decided(states)
+        plans = outputs.get("policy_plan", judged.plan)
+        found = [search(graphs, state, plan) for state, plan in zip(states, plans, strict=True)]
+        taken = _answer(joined([each.judged for each in found]))
+        source, t0 = (torch.tensor(column) for column in zip(*((f.source, f.t0) for f in found), strict=True))
+        return replace(taken, source=source, t0=t0)
+
+    return decide
+
+
 def _answer(judged: JudgedPlans) -> Answer:
-    plan, rho, safe, each = map(torch.from_numpy, (judged.plan, judged.rho, judged.safe, judged.each))
-    return plan, rho, safe, each
+    return Answer(*map(torch.from_numpy, (judged.plan, judged.rho, judged.safe, judged.each)))
 
 
 def previous_plan_agreement(policy: Policy, graphs: Graphs, *, states: int, seed: int = 9) -> Agreement:
@@ -219,8 +277,8 @@ class Unchecked(Exception):  # noqa: N818 - a result, caught by the caller
         self.why = why
 
 
-def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
-    """Compile the example program of `folder` to `built`; returns its decisions as a function of states.
+def by_c(folder: Path, task: Task, built: Path) -> Callable[[str], Decide]:
+    """Compile the example program of `folder` to `built`; returns mode of the program -> its decisions.
 
     Raises:
         Unchecked: there is no working compiler.
@@ -242,12 +300,12 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[Tensor], Answer]:
         )
     rules, shape = len(task.rules), (task.horizon, len(task.system.decl.controls))
 
-    def decide(x: Tensor) -> Answer:
-        table = torch.tensor(answers([str(built), "policy"], x.tolist()), dtype=torch.float64)
-        plan = table[:, 4 + rules :].view(-1, *shape)
-        return plan, table[:, 2], table[:, 3], table[:, 4 : 4 + rules]
+    def decide(mode: str, x: Tensor) -> Answer:
+        table = torch.tensor(answers([str(built), mode], x.tolist()), dtype=torch.float64)
+        plan, (source, t0) = table[:, 4 + rules :].view(-1, *shape), table[:, :2].long().T
+        return Answer(plan, table[:, 2], table[:, 3], table[:, 4 : 4 + rules], source, t0)
 
-    return decide
+    return lambda mode: partial(decide, mode)
 
 
 def answers(command: Sequence[str], states: Sequence[Sequence[float]]) -> list[list[float]]:

@@ -21,6 +21,8 @@ from stlc.export.verify import (
     Unchecked,
     agreement,
     backup_agreement,
+    backup_by_onnx,
+    backup_by_torch,
     by_c,
     by_onnx,
     by_torch,
@@ -39,6 +41,8 @@ Target: TypeAlias = Literal["torch", "c", "onnx"]
 TARGETS: tuple[Target, ...] = get_args(Target)
 STATES = 64
 """Number of random states for the verification of an export."""
+GUARDED = 16
+"""Number of random states in which its backup policy is verified."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +131,7 @@ def _torch(run: Run, folder: Path) -> Checked:
     torch.export.save(recorded_guard(run.task, run.network), backup)
     (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8")
     fresh = agreement(run.policy, by_torch(path), states=STATES)
-    guarded = backup_agreement(run.policy, backup, states=STATES // 16)
+    guarded = backup_agreement(run.policy, backup_by_torch(backup, run.policy), states=GUARDED)
     return fresh.worst(guarded), None
 
 
@@ -143,8 +147,9 @@ def _onnx(run: Run, folder: Path) -> Checked:
     graphs = Graphs(read_facts(folder))
     fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
     kept = previous_plan_agreement(run.policy, graphs, states=STATES)
+    guarded = backup_agreement(run.policy, backup_by_onnx(graphs), states=GUARDED)
     off = same_verdicts(run.task, graphs, states=STATES // 4)
-    return fresh.worst(kept, off), timed(run.task, folder)
+    return fresh.worst(kept, off).worst(guarded), timed(run.task, folder)
 
 
 def _c(run: Run, folder: Path) -> Checked:
@@ -170,8 +175,9 @@ def _c(run: Run, folder: Path) -> Checked:
     }
     for name, content in texts.items():
         (folder / name).write_text(content, encoding="utf-8")
-    decide = by_c(folder, run.task, folder / BUILT)
-    return agreement(run.policy, decide, states=STATES), None
+    program = by_c(folder, run.task, folder / BUILT)
+    guarded = backup_agreement(run.policy, program("backup"), states=GUARDED)
+    return agreement(run.policy, program("policy"), states=STATES).worst(guarded), None
 
 
 _WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c": _c, "onnx": _onnx}

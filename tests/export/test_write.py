@@ -24,8 +24,9 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
 from stlc.diagnostics import RunError, UsageError
 from stlc.export.programs import without_deprecations
-from stlc.export.verify import agreement, answers
+from stlc.export.verify import Answer, agreement, answers
 from stlc.export.write import export, target_of
+from stlc.runtime import backup
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 from stlc.runtime.prefixes import SAMPLINGS
@@ -53,6 +54,7 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: b
     done = export(run, "c", tmp_path / "out")
     assert done.files == ("Makefile", "main.c", "stlc_controller.h", "stlc_weights.h")
     assert done.agreement is not None
+    assert (done.agreement.states, done.agreement.guarded) == (64, 16)
     assert done.agreement.rho <= 1e-9
     x = run.task.sample(6, seed=5, dtype=torch.float64)
     wanted = Guard(run.task, run.policy, "paper").decide(x)
@@ -178,12 +180,42 @@ def test_every_benchmark_has_a_c_controller(spec: str, system: str, tmp_path: Pa
 def test_what_disagrees_is_not_handed_out(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
 
-    def proud(x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def proud(x: torch.Tensor) -> Answer:
         plan, judged = run.plan_judged(x)
-        return plan, judged.rho + 1e-3, judged.safe, judged.requirements
+        return Answer(plan, judged.rho + 1e-3, judged.safe, judged.requirements)
 
     with pytest.raises(RunError, match="does not do what the run does"):
-        agreement(run.policy, proud, states=8)  # type: ignore[arg-type]
+        agreement(run.policy, proud, states=8)
+
+
+def test_a_backup_policy_with_another_rule_is_not_handed_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_of("traffic", "car", tmp_path)
+    monkeypatch.setattr(backup, "TOLERANCE", 0.5)
+    with pytest.raises(RunError, match="does not do what the run does"):
+        export(run, "onnx", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@compiled
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e308"])
+def test_the_c_controller_says_that_a_number_is_not_finite(value: str, tmp_path: Path) -> None:
+    run = run_of("traffic", "car", tmp_path)
+    folder = export(run, "c", tmp_path / "out").folder
+    text = (folder / "main.c").read_text()
+    for call in ("stlc_policy(&controller", "stlc_decide(&controller"):
+        text = text.replace(call, f'printf("%d ", {call}', 1).replace(
+            "plan, &verdict);", "plan, &verdict));", 1
+        )
+    (folder / "main.c").write_text(text)
+    state = run.task.sample(1, seed=5, dtype=torch.float64)[0].tolist()
+    state[0] = float(value)
+    program = str(build(folder))
+    for mode in (["policy"], []):
+        (row,) = answers([program, *mode], [state])
+        assert row[0] == -1 or (value == "1e308" and not mode and row[0] in (0, 1))
+        assert np.isfinite(row[5 + len(run.task.rules) :]).all()
 
 
 def test_a_robustness_that_both_call_not_a_number_agrees(tmp_path: Path) -> None:

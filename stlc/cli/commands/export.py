@@ -49,8 +49,8 @@ def export(
             say(f"not checked: {done.unchecked}")
         else:
             say(
-                f"checked in {found.states} random states: plans within {found.plan:.1e} of a range, "
-                f"robustness within {found.rho:.1e}"
+                f"checked in {found.states} random states, the backup policy in {found.guarded}: "
+                f"plans within {found.plan:.1e} of a range, robustness within {found.rho:.1e}"
             )
         if taken is not None:
             say(

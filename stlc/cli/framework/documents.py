@@ -312,6 +312,7 @@ class Guarantee(TypedDict):
 
 class ExportCheck(TypedDict):
     states: int
+    guarded: int
     plan: float
     rho: float
 

@@ -28,15 +28,21 @@ def read_onnx(path: Path) -> list[NetworkLayer]:
     """
     try:
         import onnx
-        from onnx import numpy_helper
     except ImportError:
         message = "a network in ONNX needs the package onnx"
         raise MissingError(Diagnostic("R301", message, help=("pip install 'stlc[onnx]'",))) from None
     try:
-        graph = onnx.load(str(path), load_external_data=False).graph
-        constants = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
-    except Exception as error:
+        return _layers(onnx.load(str(path), load_external_data=False).graph, path)
+    except StlcError:
+        raise
+    except Exception as error:  # damage of any kind: libraries raise whatever they meet
         raise usage(f"`{path}` is not a network in ONNX: {str(error)[:200]}") from None
+
+
+def _layers(graph: Any, path: Path) -> list[NetworkLayer]:
+    from onnx import helper, numpy_helper
+
+    constants = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
     chain = _Chain()
     inputs = [each for each in graph.input if each.name not in constants]
     if len(inputs) != 1 or len(graph.output) != 1:
@@ -44,15 +50,19 @@ def read_onnx(path: Path) -> list[NetworkLayer]:
     here = inputs[0].name
     shape = [each.dim_value for each in inputs[0].type.tensor_type.shape.dim]
     chain.size = max([each for each in shape if each > 0], default=0)
+    if chain.size > WIDEST:
+        raise usage(f"`{path}` has an input of {chain.size:,} numbers; at most {WIDEST:,} can be verified")
     for node in graph.node:
         if node.op_type != "Constant" and here not in node.input:
             raise usage(f"`{path}` is not a chain of layers: `{node.op_type}` reads another value")
         try:
-            options = {each.name: onnx.helper.get_attribute_value(each) for each in node.attribute}
+            options = {each.name: helper.get_attribute_value(each) for each in node.attribute}
             if node.op_type == "Constant":
                 constants[node.output[0]] = numpy_helper.to_array(options["value"])
                 continue
             values = [np.asarray(constants[name], dtype=np.float64) for name in node.input if name != here]
+            if not all(np.isfinite(value).all() for value in values):
+                raise ValueError("a weight is not finite")
             chain.add(node.op_type, values, options, first=node.input[0] == here)
         except (KeyError, ValueError, IndexError) as error:
             raise usage(

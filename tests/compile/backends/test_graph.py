@@ -322,9 +322,7 @@ SIGNATURE = Signature(tuple(Column(name) for name in NAMES))
 def test_graph_over_trajectories(dtype: type) -> None:
     x = np.random.default_rng(0).normal(size=(5, 4, 3)).astype(dtype)
     rules = [
-        Requirement(
-            ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x"))), factor=0.5
-        ),
+        Requirement(ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x"))), factor=0.5),
         Requirement(ir.Predicate(ir.Signal("z"), sign=-1)),
     ]
     graph = RobustnessGraph(rules, SIGNATURE)
