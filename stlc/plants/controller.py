@@ -62,7 +62,10 @@ class NetworkController:
         if step % self._declared.period == 0:
             signals = np.concatenate((outputs, inputs, param))[self._read]
             given = signals.astype(self._type).reshape(self._shape)
-            found: Any = self._session.run([self._output], {self._input: given})[0]
+            try:
+                found: Any = self._session.run([self._output], {self._input: given})[0]
+            except Exception as error:  # its errors have no common class
+                raise FaultError("crash", f"the controller fails: {str(error)[:500]}") from error
             self._commands = self._limited(np.asarray(found, dtype=np.float64).reshape(-1))
         return self._commands
 

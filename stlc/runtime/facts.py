@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ FACTS = "controller.json"
 FORMAT = "stlc-controller/1"
 DECIDE, FOLLOW, JUDGE, FALL = "decide.onnx", "follow.onnx", "judge.onnx", "fall.onnx"
 CONTINUE = "continue.onnx"
+MAX_STEPS, MAX_PREFIXES = 100_000, 10_000_000
+"""Largest number of steps of a plan, and of prefixes of one length, that a description may ask for."""
 _NEEDED, _GRAPHS = {DECIDE, FOLLOW, JUDGE}, {DECIDE, FOLLOW, JUDGE, FALL, CONTINUE}
 _DAMAGE = (
     OSError,
@@ -145,37 +148,61 @@ def read_facts(where: Path | str) -> Facts:
 def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
     if read["format"] != FORMAT:
         raise ValueError(f"its format is {read['format']}, not {FORMAT}")
-    digests = read["files"]
+    digests = dict(read["files"])
     if not _NEEDED <= digests.keys() <= _GRAPHS:
         raise ValueError(f"its graphs are {', '.join(digests)}")
+    states, controls = (tuple(map(_quantity, read[key])) for key in ("states", "controls"))
+    requirements, dt, horizon = tuple(read["requirements"]), float(read["dt"]), int(read["horizon"])
+    if not all(isinstance(name, str) for name in requirements):
+        raise ValueError("a requirement without a name")
+    if not (states and controls and 0.0 < dt < math.inf and 0 < horizon <= MAX_STEPS):
+        raise ValueError(f"{len(states)} states, {len(controls)} controls, {horizon} steps of {dt} s")
     return Facts(
-        read["spec"],
-        read["system"],
-        tuple(ControllerQuantity(**each) for each in read["states"]),
-        tuple(ControllerQuantity(**each) for each in read["controls"]),
-        tuple(read["requirements"]),
-        float(read["dt"]),
-        int(read["horizon"]),
-        _grid(read["backup"]),
+        dict(read["spec"]),
+        dict(read["system"]),
+        states,
+        controls,
+        requirements,
+        dt,
+        horizon,
+        _grid(read["backup"], len(controls), horizon),
         {name: _whole(folder / name, digest) for name, digest in digests.items()},
-        _feedback(read.get("feedback"), len(read["controls"])),
+        _feedback(read.get("feedback"), len(controls)),
     )
+
+
+def _quantity(read: Mapping[str, Any]) -> ControllerQuantity:
+    found = ControllerQuantity(**read)
+    numbers = [value for value in (found.low, found.high, found.initial) if value is not None]
+    if not all(isinstance(text, str) for text in (found.name, found.unit, found.added)):
+        raise ValueError("a state or a control whose name or unit is no text")
+    if any(isinstance(value, bool) or not math.isfinite(value) for value in numbers):
+        raise ValueError(f"`{found.name}` has a range that is not finite")
+    return found
 
 
 def _feedback(read: Mapping[str, Any] | None, controls: int) -> FeedbackGains | None:
     if read is None:
         return None
     found = {name: np.array(read[name], dtype=np.float64) for name in FeedbackGains.__annotations__}
-    if found["gain"].shape != (controls, len(found["state"])):
+    shapes = dict.fromkeys(found, (controls,)) | {"gain": (controls, found["state"].size)}
+    if any(
+        found[name].shape != shape for name, shape in (shapes | {"state": (found["state"].size,)}).items()
+    ):
         raise ValueError(f"a gain of shape {found['gain'].shape}")
     return FeedbackGains(**found)
 
 
-def _grid(read: Mapping[str, Any]) -> PrefixGrid:
+def _grid(read: Mapping[str, Any], controls: int, horizon: int) -> PrefixGrid:
     if read["sampling"] not in SAMPLINGS:
         raise ValueError(f"there is no sampling {read['sampling']!r}")
-    values, lengths = tuple(map(tuple, read["values"])), tuple(read["lengths"])
-    return PrefixGrid(values, lengths, int(read["batch"]), int(read["samples"]), read["sampling"])
+    values = tuple(tuple(map(float, each)) for each in read["values"])
+    lengths, batch, samples = tuple(map(int, read["lengths"])), int(read["batch"]), int(read["samples"])
+    if len(values) != controls or not all(values) or not all(0 < length <= horizon for length in lengths):
+        raise ValueError(f"prefixes of {lengths} steps for {len(values)} controls")
+    if not (0 < batch <= MAX_PREFIXES and 0 < samples <= MAX_PREFIXES):
+        raise ValueError(f"{samples} prefixes in batches of {batch}; at most {MAX_PREFIXES}")
+    return PrefixGrid(values, lengths, batch, samples, read["sampling"])
 
 
 def _content(path: Path) -> bytes:

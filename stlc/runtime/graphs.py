@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import Diagnostic, MissingError, RunError
 from stlc.runtime.facts import CONTINUE, DECIDE, FALL, FOLLOW, JUDGE, Facts
 
 Numbers: TypeAlias = NDArray[np.float64]
@@ -71,7 +71,7 @@ class Graphs:
 
         The plans are returned with their verdicts, one per row.
         """
-        found = _run(self._decide, {"state": x})
+        found = self._run(self._decide, state=x)
         return _judged(found["plan"], found), found
 
     def continued(self, x: Numbers) -> Numbers:
@@ -80,7 +80,7 @@ class Graphs:
         A prefix is a sequence of first actions that the backup policy tries. The plans are the best ones of
         the network itself. Changed copies, as `decided` may try, are not among them.
         """
-        return _run(self._continue, {"state": x})["plan"]
+        return self._run(self._continue, state=x)["plan"]
 
     def followed(self, x: Numbers, begun: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
         """Choose, in each state of `x`, between the policy's plan and `begun`, the rest of the previous plan.
@@ -89,7 +89,7 @@ class Graphs:
             The chosen plans with their verdicts, and all outputs of the graph. The output `kept`, (rows,), is
                 true where the previous plan was chosen.
         """
-        found = _run(self._follow, {"state": x, "begun": begun})
+        found = self._run(self._follow, state=x, begun=begun)
         return _judged(found["plan"], found), found
 
     def judged(self, x: Numbers, plans: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
@@ -97,7 +97,7 @@ class Graphs:
 
         The output `states`, (rows, T + 1, n), contains the predicted states.
         """
-        found = _run(self._judge, {"state": x, "plan": plans})
+        found = self._run(self._judge, state=x, plan=plans)
         return _judged(plans, found), found
 
     def falls(self, x: Numbers, plans: Numbers) -> Numbers:
@@ -110,7 +110,7 @@ class Graphs:
         """
         if self._fall is None:
             return np.full((len(x), self.facts.horizon + 1), np.inf)
-        return _run(self._fall, {"state": x, "plan": plans})["falls"]
+        return self._run(self._fall, state=x, plan=plans)["falls"]
 
     @cached_property
     def _judge(self) -> Any:
@@ -137,14 +137,42 @@ class Graphs:
             onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         )  # nothing is left to optimize
         options.log_severity_level = 3
-        graph = self.facts.graphs[name]
-        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+        try:
+            return onnxruntime.InferenceSession(
+                self.facts.graphs[name], options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # its errors have no common class
+            raise _misfit(name, str(error)) from error
+
+    def _run(self, session: Any, **feeds: Numbers) -> dict[str, Numbers]:
+        """Outputs of a graph by name, checked against the description. Raises RunError, R106."""
+        try:
+            names = [each.name for each in session.get_outputs()]
+            found = dict(zip(names, session.run(names, feeds), strict=True))
+        except Exception as error:
+            raise _misfit("a graph", str(error)) from error
+        facts, rows = self.facts, len(feeds["state"])
+        states, controls, steps = len(facts.states), len(facts.controls), facts.horizon
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("rho", "safe", "cost", "kept", "policy_rho"), (rows,)
+        )
+        shapes |= dict.fromkeys(("plan", "policy_plan"), (rows, steps, controls))
+        shapes |= {"requirements": (rows, len(facts.requirements)), "added": (rows, len(facts.added))}
+        shapes |= {"falls": (rows, steps + 1), "states": (rows, steps + 1, states)}
+        for key, value in found.items():
+            if value.shape != shapes.get(key, value.shape):
+                raise _misfit("a graph", f"`{key}` has the shape {value.shape}, not {shapes[key]}")
+        return found
 
 
-def _run(session: Any, feeds: Mapping[str, Numbers]) -> dict[str, Numbers]:
-    names = [each.name for each in session.get_outputs()]
-    return dict(zip(names, session.run(names, dict(feeds)), strict=True))
+def _misfit(what: str, why: str) -> RunError:
+    note = (" ".join(why.split())[:300],)
+    help_ = ("take all files of one `stlc export RUN --to onnx`",)
+    return RunError(Diagnostic("R106", f"{what} does not fit its description", note=note, help=help_))
 
 
 def _judged(plan: Numbers, found: Mapping[str, Numbers]) -> JudgedPlans:
-    return JudgedPlans(plan, found["rho"], found["safe"], found["cost"], found["requirements"])
+    try:
+        return JudgedPlans(plan, found["rho"], found["safe"], found["cost"], found["requirements"])
+    except KeyError as error:
+        raise _misfit("a graph", f"it has no output {error}") from error

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import json
+import operator
+import random
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +23,10 @@ from helpers.exported import ROOT, exported, mission, run_of
 from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.guard import Guard
 from stlc.controller.training.run import Run
-from stlc.diagnostics import MissingError, RunError, UsageError
+from stlc.diagnostics import MissingError, RunError, StlcError, UsageError
 from stlc.export.write import export
 from stlc.runtime import Controller
+from stlc.runtime.facts import read_facts
 
 MANY = [
     ("ship_safe", "ship_safe"),
@@ -222,6 +231,7 @@ class Bare:  # an environment after `pip install numpy onnxruntime` and `pip ins
 sys.meta_path.insert(0, Bare())
 import numpy as np
 from stlc.runtime import Controller
+from stlc.runtime.facts import read_facts
 
 controller = Controller.load(sys.argv[1], guard="paper")
 decision = controller.decide(np.zeros(len(controller.states)))
@@ -249,3 +259,50 @@ def test_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     exec(compile(block.replace('"controller"', repr(folder.name)), "export.md", "exec"), {})
     said = capsys.readouterr().out
     assert all(f"{rule.name}: " in said for rule in run.task.rules)
+
+
+JUNK = (None, -1, 0, 1.5, 1e300, True, "", "x", [], [[]], {}, [0.0], 10**30)
+
+
+def _places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    yield path
+    pairs = value.items() if isinstance(value, dict) else enumerate(value if isinstance(value, list) else ())
+    for key, each in pairs:
+        yield from _places(each, (*path, key))
+
+
+def _damage(folder: Path, rng: random.Random) -> None:
+    """Change a value of the description, or a byte of a graph whose digest is then written anew."""
+    facts = folder / "controller.json"
+    read = json.loads(facts.read_text())
+    if rng.random() < 0.6:
+        *path, last = rng.choice([each for each in _places(read) if each and each[0] != "format"])
+        functools.reduce(operator.getitem, path, read)[last] = rng.choice(JUNK)
+    else:
+        name = rng.choice(sorted(read["files"]))
+        data = bytearray((folder / name).read_bytes())
+        for _ in range(rng.choice((1, 1, 20))):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        cut = rng.randrange(len(data)) if rng.random() < 0.2 else len(data)
+        (folder / name).write_bytes(data[:cut])
+        read["files"][name] = hashlib.sha256(data[:cut]).hexdigest()
+    facts.write_text(json.dumps(read))
+
+
+@pytest.mark.parametrize("count", [25, pytest.param(600, marks=pytest.mark.slow)])
+def test_a_damaged_export_ends_in_a_diagnostic(count: int, tmp_path: Path) -> None:
+    whole = exported("traffic", "car")[1]
+    state = np.zeros(len(read_facts(whole).states))
+    refused = 0
+    for seed in range(count):
+        folder = Path(shutil.copytree(whole, tmp_path / str(seed)))
+        _damage(folder, random.Random(seed))
+        with np.errstate(all="ignore"):
+            try:
+                controller = Controller.load(folder, "paper" if seed % 5 == 0 else "none")
+                for _ in range(2):
+                    controller.decide(state)
+            except StlcError:
+                refused += 1
+        shutil.rmtree(folder)
+    assert refused > count / 4

@@ -80,7 +80,7 @@ def _in_place_of(path: Path, make: Callable[[Path], None]) -> None:
         (lambda folder: (folder / "fall.onnx").unlink(), "fall.onnx"),
         (lambda folder: _in_place_of(folder / "fall.onnx", os.mkfifo), "fall.onnx is not a file"),
         (lambda folder: _in_place_of(folder / "controller.json", os.mkdir), "controller.json is not a file"),
-        (damaged("controller.json", _with("files", ["a"])), "keys"),
+        (damaged("controller.json", _with("files", ["a"])), "dictionary"),
         (damaged("controller.json", _with("files", {})), "its graphs are"),
         (damaged("controller.json", _with("files", {"/etc/passwd": "0"}, add=True)), "/etc/passwd"),
         (damaged("controller.json", _with("files", {"../a.onnx": "0"}, add=True)), "../a.onnx"),

@@ -13,8 +13,10 @@ import numpy as np
 
 from stlc.controller.verification.forms import Floats
 from stlc.controller.verification.network import NetworkLayer
-from stlc.diagnostics import Diagnostic, MissingError, usage
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, usage
 
+WIDEST = 100_000
+"""Largest number of inputs of a network."""
 _REAL = (1, 11)
 """Types of ONNX to which a cast is no operation of the network: float32 and float64."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,24 @@ def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:
         read_onnx(tmp_path / "net.onnx")
     with pytest.raises(UsageError, match="not a network"):
         read_onnx(tmp_path / "absent.onnx")
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(3000, marks=pytest.mark.slow)])
+def test_damaged_networks_are_refused_or_read(count: int, tmp_path: Path) -> None:
+    whole = written(tmp_path / "whole.onnx", random_layers("relu")).read_bytes()
+    path, refused = tmp_path / "net.onnx", 0
+    for seed in range(count):
+        rng, data = random.Random(seed), bytearray(whole)
+        for _ in range(rng.choice((1, 1, 5, 50))):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        path.write_bytes(data[: rng.randrange(len(data))] if rng.random() < 0.2 else data)
+        try:
+            layers = read_onnx(path)
+        except UsageError:
+            refused += 1
+        else:
+            assert all(np.isfinite(each.weight).all() and np.isfinite(each.bias).all() for each in layers)
+    assert refused > count / 10
 
 
 @pytest.mark.parametrize("options", [{"cast": 7}, {"cast": 10}, {"transposed": 1}])
