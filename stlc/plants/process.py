@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import select
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Mapping
@@ -22,8 +20,9 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, MissingError, SystemFileError
 from stlc.plants.declaration import OutputDecl, PlantDecl, PlantInput, VariableDecl
-from stlc.plants.kinds import SCRATCH, Reason
+from stlc.plants.kinds import Reason
 from stlc.plants.messages import Message, MessageError, encoded, received
+from stlc.plants.watchdog import Watchdog
 from stlc.units import parse_unit, same_dims
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -78,13 +77,14 @@ class PlantProcess:
 
     def __init__(self, decl: PlantDecl) -> None:
         self._decl = decl
-        self._scratch = tempfile.mkdtemp(prefix=SCRATCH)
+        self._watchdog = Watchdog()
         try:
-            self._process = _started(decl, self._scratch)
+            self._process = _started(decl, self._watchdog.folder)
+            self._watchdog.watch(self._process.pid)
         except BaseException:
-            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._watchdog.end()
             raise
-        self._tail, self._reading, self._ended = bytearray(), threading.Lock(), False
+        self._tail, self._reading = bytearray(), threading.Lock()
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         assert self._process.stderr is not None
@@ -104,7 +104,7 @@ class PlantProcess:
         decl = self._decl
         limit = max(float(decl.limits.time), OPENING)
         try:
-            layout = {"layout": decl.layout(self._scratch).as_json()}
+            layout = {"layout": decl.layout(self._watchdog.folder).as_json()}
             header = self._answer(layout, None, time.monotonic() + limit, limit).header
         except FaultyError as error:
             raise _refused(
@@ -199,17 +199,13 @@ class PlantProcess:
 
     def end(self) -> None:
         """Kill the process and its children, and remove its temporary files; any thread may call it."""
-        if not self._ended:  # once: the number of the group may be another's later
-            with suppress(OSError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._ended = True
+        self._watchdog.end()  # before the process is waited for: then its number may be another's
         self._process.wait()
         self._listener.join(_LAST_WORDS)
         for stream in (self._process.stdin, self._process.stdout):
             with suppress(OSError):
                 if stream is not None:
                     stream.close()
-        shutil.rmtree(self._scratch, ignore_errors=True)
 
     def _listen(self) -> None:
         """Keep the last bytes of the standard error, until it ends."""

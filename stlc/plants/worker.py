@@ -8,15 +8,10 @@ prints to the standard error.
 from __future__ import annotations
 
 import os
-import shutil
-import signal
 import sys
-import threading
-import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -24,7 +19,6 @@ import numpy as np
 from stlc.plants.controller import NetworkController
 from stlc.plants.kinds import (
     KINDS,
-    SCRATCH,
     AbsentError,
     BlackBox,
     FaultError,
@@ -35,9 +29,6 @@ from stlc.plants.kinds import (
     vector,
 )
 from stlc.plants.messages import Message, encoded, received
-
-ORPHAN = 1.0
-"""Seconds between two checks whether the process that started this one still lives."""
 
 
 class ControlledPlant:
@@ -154,28 +145,6 @@ def _limit_memory(most: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
-def _watch_parent() -> None:
-    """End this process, and those that the plant has started, when the one that started it has ended."""
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(ORPHAN)
-        _leave()
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _leave() -> None:
-    """Remove the folder for temporary files, and end the whole session: nobody else does after the parent."""
-    scratch = Path(os.environ.get("TMPDIR", ""))
-    if scratch.name.startswith(SCRATCH):
-        shutil.rmtree(scratch, ignore_errors=True)
-    if os.getpgrp() == os.getpid():  # not a group that is also the caller's
-        os.killpg(0, signal.SIGKILL)
-    os._exit(1)
-
-
 def _disconnect(*numbers: int) -> None:
     """Replace file descriptors by an empty file, in a process that the plant has forked.
 
@@ -189,18 +158,14 @@ def _disconnect(*numbers: int) -> None:
 
 def main() -> None:
     """Take the standard input and output for messages, and give the plant others."""
-    _watch_parent()
     inbox, outbox = os.dup(0), os.dup(1)
     nowhere = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nowhere, 0)
     os.close(nowhere)
     os.dup2(2, 1)
-    own = os.getpid()
     os.register_at_fork(after_in_child=lambda: _disconnect(inbox, outbox))
     with open(inbox, "rb") as requests, open(outbox, "wb") as replies:  # noqa: PTH123
         serve(requests, replies)
-    if os.getpid() == own:  # else forked by the plant
-        _leave()
 
 
 if __name__ == "__main__":

@@ -219,7 +219,7 @@ from stlc.plants.plant import load_plant
 plant = load_plant("hostile.yaml")
 plant.simulate(numpy.array([[14.0]]))
 process = plant._processes[0]
-print(process._process.pid, process._said().split()[-1], process._scratch, flush=True)
+print(process._process.pid, process._said().split()[-1], process._watchdog.folder, flush=True)
 sys.stdin.read()
 """
     home = str(Path(__file__).parents[2])
@@ -236,4 +236,8 @@ sys.stdin.read()
     parent.send_signal(signal.SIGKILL)
     parent.communicate()
     assert all(gone(int(number)) for number in numbers)
-    assert not Path(scratch).exists()
+    for _ in range(3000):
+        if not Path(scratch).exists():
+            return
+        time.sleep(0.02)
+    raise AssertionError(f"{scratch} is left")
