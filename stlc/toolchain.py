@@ -28,6 +28,8 @@ IDLE = 10.0
 """Seconds without processor use after which a program counts as hung."""
 BUSY = 40.0
 """Limit of a program's processor time in seconds; if that is unknown, of its elapsed time."""
+ELAPSED = 300.0
+"""Limit of a program's elapsed time in seconds, however busy the machine is."""
 MEMORY = 2_000_000_000
 """Limit of a program's memory in bytes, if its use is known."""
 REMEMBERED = 600.0
@@ -230,8 +232,8 @@ def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
         given: text on the standard input.
 
     Raises:
-        HangsError: the program used no processor time for `IDLE` seconds, more processor time than `BUSY`, or
-            more memory than `MEMORY`.
+        HangsError: the program used no processor time for `IDLE` seconds, more processor time than `BUSY`,
+            more memory than `MEMORY`, or took longer than `ELAPSED`.
         OSError: the program cannot be started.
     """
     # files, not pipes: a surviving child process could keep a pipe open
@@ -314,6 +316,8 @@ def _await(process: subprocess.Popen[bytes]) -> None:
             used, since = found.seconds, now
         if now - since >= IDLE:
             raise HangsError(f"did nothing for {IDLE:g} s and was ended")
+        if now - begun >= ELAPSED:
+            raise HangsError(f"did not end within {ELAPSED:g} s and was ended")
         if used >= BUSY:
             raise HangsError(f"did not end within {BUSY:g} s of the processor and was ended", worked=True)
         if found is not None and found.memory > MEMORY:

@@ -86,6 +86,13 @@ def test_one_that_works_is_waited_for_and_not_for_ever(monkeypatch):
     assert ended.value.worked
 
 
+def test_one_that_makes_slow_progress_is_not_waited_for_for_ever(monkeypatch):
+    monkeypatch.setattr(toolchain, "IDLE", 5.0)
+    monkeypatch.setattr(toolchain, "ELAPSED", 1.0)
+    with pytest.raises(HangsError, match=r"did not end within 1 s and was ended"):
+        run(["sh", "-c", "while :; do sleep 0.1; i=0; while [ $i -lt 2000 ]; do i=$((i+1)); done; done"])
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="needs to know the memory")
 def test_one_that_takes_much_memory_is_ended(monkeypatch):
     monkeypatch.setattr(toolchain, "MEMORY", 60_000_000)

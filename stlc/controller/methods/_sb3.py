@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
@@ -192,6 +193,7 @@ class SacLearner(ActorLearner):
         self._random = RandomState(config.seed)
         with self._random.used():
             self.model = self._made()
+            self.model.set_logger(Logger(None, []))  # the default one leaves a folder in the temporary ones
             # a step is an episode, so that none is under way between two steps
             _, self._callback = self.model._setup_learn(total_timesteps=1, callback=None)
 
