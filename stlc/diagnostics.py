@@ -251,6 +251,8 @@ CODES: dict[str, str] = {
     "S209": "a file that a system file extends, and that cannot be read",
     "S210": "a specification of closed-loop runs that cannot be read",
     "S211": "a world that cannot draw the start of one agent again",
+    "S212": "an uncertain number in a place to which no error can be carried",
+    "S213": "an uncertain constant that changes nothing",
     "S301": "initial states that are (nearly) all rejected",
     "S302": "dynamics that give NaN or infinity",
     "S303": "initial states in a file that cannot be used",

@@ -339,7 +339,7 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
         if len(vector.items) != size:
             scope.fail(Diagnostic("E205", f"{need.who}, this has {len(vector.items)} components", arg.span))
         flat += [absolute(item).num for item in vector.items]
-    numbers = [_output(entry, index, tuple(flat)) for index in range(entry.result or 1)]
+    numbers = [_output(entry, index, (*flat, *entry.further)) for index in range(entry.result or 1)]
     if entry.result is None:
         return replace(numbers[0], span=call.span)
     return VectorValue(tuple(numbers), call.span)

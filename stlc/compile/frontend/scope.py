@@ -170,6 +170,7 @@ class External:
         span: source location of its declaration.
         units: unit of each argument, which is checked, and which numbers without a unit take; () if the
             arguments may have any units.
+        further: numbers that every call passes to `function` after its own arguments.
     """
 
     name: str
@@ -181,6 +182,7 @@ class External:
     about: str = ""
     span: Span | None = None
     units: tuple[Unit, ...] = ()
+    further: tuple[ir.Num, ...] = ()
 
 
 Entry: TypeAlias = Known | Definition | External

@@ -166,6 +166,10 @@ def read_constants(node: Node | None, cx: Context) -> None:
         names.place_components(name, called)
         value = VectorValue(numbers) if vector else numbers[0]
         names.entries[name] = Known(value, "constant", entry.key.span)
+        if names.changes is not None:
+            again = replace(cx.moving.here, rewrite=None).numbers(entry.value, where) or numbers
+            changed = Known(VectorValue(again) if vector else again[0], "constant", entry.key.span)
+            names.changes.constants[name] = names.changes.constant(name, changed)
 
 
 def read_definitions(node: Node | None, cx: Context) -> None:

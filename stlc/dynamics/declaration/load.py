@@ -34,7 +34,14 @@ from stlc.dynamics.declaration.deployment import (
     read_scenarios,
 )
 from stlc.dynamics.declaration.functions import FunctionDecl, FunctionKeys, read_functions
-from stlc.dynamics.declaration.held import DelayKeys, HeldKeys, HeldSection, declare_held, read_held
+from stlc.dynamics.declaration.held import (
+    DelayEntry,
+    DelayKeys,
+    HeldKeys,
+    HeldSection,
+    declare_held,
+    read_held,
+)
 from stlc.dynamics.declaration.init import InitDecl, InitKeys, read_init
 from stlc.dynamics.declaration.inputs import InputDecl, InputKeys, read_inputs
 from stlc.dynamics.declaration.learning import ObjectiveDecl, PolicyDecl, TrainDecl
@@ -190,12 +197,10 @@ def _declaration(
 
     Sections that declare names are read first.
     """
-    named = _named(found, reader)
+    named = _named(found, reader, Names())
     names, cx = named.cx.names, named.cx
-    sampled = named.sampled + read_held(named.held, cx)
-    timer_flow, timer_jumps = read_timers(named.states, cx)
-    flow = (*timer_flow, *read_flow(found.flow, cx))
-    jumps = (*read_jumps(found.jump, cx), *timer_jumps)
+    motion = _motion(found, named)
+    sampled, flow, jumps = motion.sampled, motion.flow, motion.jumps
     _report_set((*flow, *(each for jump in jumps for each in jump.resets)), sampled, cx)
     flow += sampled.flow
     _report_idle(found.control, cx, flow, jumps)
@@ -220,9 +225,7 @@ def _declaration(
             {c.name: (c.low, c.high) for c in clamped if c.low is not None and c.high is not None}
         ),
         init=_given_states(
-            read_init(found.init, cx, named.drawn + sampled.drawn, in_order(sampled.initial, cx)),
-            overrides,
-            named,
+            read_init(found.init, cx, named.drawn + sampled.drawn, motion.initial), overrides, named
         ),
         objective=read(ObjectiveDecl, cx, found.objective, "`objective`"),
         policy=_observing(read(PolicyDecl, cx, found.policy, "`policy`"), sampled.hidden, cx),
@@ -236,8 +239,44 @@ def _declaration(
         warnings=tuple(finding for finding in reader.findings if finding.severity == "warning"),
         inputs=named.inputs,
         tables=named.tables,
-        updates=in_order(sampled.updates, cx),
+        updates=motion.updates,
         hidden=sampled.hidden,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What moves the states of a system.
+
+    Attributes:
+        flow: derivatives or next values, without those of columns that are computed at samples.
+        jumps: discrete transitions.
+        sampled: columns that are computed at samples.
+        initial: values of these columns at the start, each after those that it reads.
+        updates: their values at every later sample, likewise.
+        delays: the entries of the section `delay`.
+    """
+
+    flow: tuple[Assign, ...]
+    jumps: tuple[JumpDecl, ...]
+    sampled: Sampled
+    initial: tuple[Assign, ...]
+    updates: tuple[Assign, ...]
+    delays: tuple[DelayEntry, ...]
+
+
+def _motion(found: SystemKeys, named: _Named) -> Motion:
+    """Read the sections `held`, `delay`, `flow` and `jump`, and the motion of timers."""
+    cx = named.cx.moving
+    sampled = named.sampled + read_held(named.held, cx)
+    timer_flow, timer_jumps = read_timers(named.states, replace(cx, here=replace(cx.here, rewrite=None)))
+    return Motion(
+        (*timer_flow, *read_flow(found.flow, cx)),
+        (*read_jumps(found.jump, cx), *timer_jumps),
+        sampled,
+        in_order(sampled.initial, cx),
+        in_order(sampled.updates, cx),
+        named.held.delays,
     )
 
 
@@ -301,9 +340,9 @@ class _Named:
     tables: tuple[TableDecl, ...]
 
 
-def _named(found: SystemKeys, reader: Reader) -> _Named:
-    """Read the sections that declare names, each before the sections that may use its names."""
-    cx = Context.of(reader, Names())
+def _named(found: SystemKeys, reader: Reader, names: Names) -> _Named:
+    """Read the sections that declare `names`, each before the sections that may use its names."""
+    cx = Context.of(reader, names)
     read_constants(found.const, cx)
     clock = read_time(found.time, cx.plain)
     cx = replace(cx, dt=clock.dt, horizon=clock.horizon, discrete=clock.discrete)
@@ -319,24 +358,21 @@ def _named(found: SystemKeys, reader: Reader) -> _Named:
     return _Named(cx.plain, clock, states, drawn, functions, inputs.signals, inputs.sampled, held, tables)
 
 
-@dataclass(frozen=True, slots=True)
-class MovingParts:
-    """YAML nodes of the sections `flow` and `jump` of a valid file.
+def sections_of(decl: SystemDecl) -> SystemKeys:
+    """Return the sections of the file of a system, with the values of `--set`."""
+    return _sections(decl.source, decl.overrides, Reader(decl.source))[0]
 
-    The functions `read_flow` and `read_jumps` can read these nodes again in the context `cx`, for example
-    with changed numbers.
+
+def motion_of(found: SystemKeys, decl: SystemDecl, names: Names) -> Motion:
+    """Read the motion of a valid system again, from its sections, with the numbers that `names` changes.
+
+    Raises:
+        SystemFileError: a changed expression is invalid.
     """
-
-    cx: Context
-    flow: Node | None
-    jump: Node | None
-
-
-def moving_parts(decl: SystemDecl) -> MovingParts:
-    """Return the YAML nodes of `flow` and `jump` of a system, so that these sections can be read again."""
     reader = Reader(decl.source)
-    found, _ = _sections(decl.source, decl.overrides, reader)
-    return MovingParts(_named(found, reader).cx, found.flow, found.jump)
+    motion = _motion(found, _named(found, reader, names))
+    reader.close()
+    return motion
 
 
 # ---------------------------------------------------------------------------------- extends

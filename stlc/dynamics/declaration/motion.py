@@ -210,16 +210,10 @@ class JumpDecl:
 
 def read_jumps(node: Node | None, cx: Context) -> tuple[JumpDecl, ...]:
     """Read the section `jump`: the jumps, in file order."""
-    return tuple(jump for jump in each_jump(node, cx) if jump is not None)
-
-
-def each_jump(node: Node | None, cx: Context) -> tuple[JumpDecl | None, ...]:
-    """Read every item of the section `jump`; None in the place of a jump without a valid guard."""
-    found: list[JumpDecl | None] = []
+    found: list[JumpDecl] = []
     for index, item in enumerate(cx.reader.items(node, "`jump`")):
         values = values_of(JumpDecl, cx, item, "a jump")
         if "guard" not in values:
-            found.append(None)
             continue
         guard = item.get("guard") if isinstance(item, Mapping) else None
         jump = JumpDecl(**{"name": f"jump {index + 1}", "text": written(guard), **values})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,7 +11,7 @@ from typing import Literal, TypeAlias, get_args
 from stlc.compile.frontend.scope import External
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.columns import unit_text
-from stlc.dynamics.model.algebra import multiply, total
+from stlc.dynamics.model.algebra import multiply, names_in, total
 from stlc.dynamics.schema.names import Context
 from stlc.dynamics.schema.reader import first_line
 from stlc.dynamics.schema.record import EXPRESSION, OF, key, raw, read, word
@@ -75,22 +76,15 @@ def read_tables(node: Node | None, cx: Context) -> tuple[TableDecl, ...]:
             table = _table(entry, cx)
             if table is not None:
                 found.append(table)
-                cx.names.entries[table.name] = External(
-                    table.name,
-                    (None,) * len(table.points),
-                    None,
-                    table.unit,
-                    "real",
-                    body(table),
-                    "table",
-                    entry.key.span,
-                    table.units,
-                )
     return tuple(found)
 
 
 def _table(entry: Entry, cx: Context) -> TableDecl | None:
-    """Read the declaration of one table; None if it is invalid."""
+    """Read one table, and declare it as a function; None if it is invalid.
+
+    If numbers are changed while the file is read again, its values may read columns; the function takes these
+    as further arguments, and the values are NaN in the declaration.
+    """
     where = f"the table `{entry.key.text}`"
     keys = read(TableKeys, cx.plain, entry.value, where, OF)
     units = _units(keys.of, where, cx)
@@ -98,12 +92,29 @@ def _table(entry: Entry, cx: Context) -> TableDecl | None:
         return None
     if len(units) == 1:
         points: tuple[Row, ...] = (_row(keys.at, units[0], f"`at` of {where}", cx),)
-        rows: tuple[Row, ...] = (_row(keys.values, keys.unit, f"`values` of {where}", cx),)
+        rows: tuple[Node, ...] = (keys.values,)
     else:
         points = _rows(keys.at, units, f"`at` of {where}", cx)
-        items = cx.reader.items(keys.values, f"`values` of {where}")
-        rows = tuple(_row(item, keys.unit, f"`values` of {where}", cx) for item in items)
-    return _checked(TableDecl(entry.key.text, units, keys.unit, points, rows, keys.extrapolate), keys, cx)
+        rows = cx.reader.items(keys.values, f"`values` of {where}")
+    numbers = tuple(_numbers(row, keys.unit, f"`values` of {where}", cx) for row in rows)
+    values = tuple(tuple(map(_value, row)) for row in numbers)
+    table = TableDecl(entry.key.text, units, keys.unit, points, values, keys.extrapolate)
+    if not _sound(table, keys, cx):
+        return None
+    factors = tuple(sorted({name for row in numbers for number in row for name in names_in(number)}))
+    cx.names.entries[table.name] = External(
+        table.name,
+        (None,) * len(points),
+        None,
+        table.unit,
+        "real",
+        body(table, numbers, factors),
+        "table",
+        entry.key.span,
+        units,
+        tuple(map(ir.Signal, factors)),
+    )
+    return table
 
 
 def _units(node: Node | None, where: str, cx: Context) -> tuple[Unit, ...] | None:
@@ -141,8 +152,21 @@ def _row(node: Node, unit: Unit, where: str, cx: Context) -> Row:
     return tuple(found)
 
 
-def _checked(table: TableDecl, keys: TableKeys, cx: Context) -> TableDecl | None:
-    """Return the table, or None if its points do not increase or its values do not fit them (S204)."""
+def _numbers(node: Node, unit: Unit, where: str, cx: Context) -> tuple[ir.Num, ...]:
+    """Read a list of values in `unit`: constants, unless the numbers of the file are changed."""
+    if cx.names.changes is None or unit.offset:
+        return tuple(map(ir.Const, _row(node, unit, where, cx)))
+    items = cx.reader.items(node, where)
+    found = (cx.moving.here.stored(item, f"a number in {where}", unit) for item in items)
+    return tuple(ir.Const(0.0) if number is None else number for number in found)
+
+
+def _value(number: ir.Num) -> float:
+    return number.value if isinstance(number, ir.Const) else math.nan
+
+
+def _sound(table: TableDecl, keys: TableKeys, cx: Context) -> bool:
+    """True if the points of a table increase and its values fit them; else S204 is reported."""
     assert keys.at is not None
     assert keys.values is not None
     message, place = "", keys.at
@@ -158,14 +182,16 @@ def _checked(table: TableDecl, keys: TableKeys, cx: Context) -> TableDecl | None
             message, place = f"the table `{table.name}` has more than {MAX_VALUES} values", keys.values
     if message:
         cx.reader.report("S204", message, first_line(place.span))
-    return None if message else table
+    return not message
 
 
 # --------------------------------------------------------------------------------- the value
 
 
-def body(table: TableDecl) -> ir.Body:
-    """Return the table as a function of its arguments in SI units; its value is in the table's unit.
+def body(table: TableDecl, values: Sequence[Sequence[ir.Num]], read: Sequence[str] = ()) -> ir.Body:
+    """Return a table as a function of its arguments in SI units; its value is in the table's unit.
+
+    `values` are those of the table as numbers. The columns that they read, `read`, are further arguments.
 
     Along an argument, the value is computed as a sum: the value at the first point, plus for each cell its
     increase times the share of the cell that lies below the argument. The sum is exact, has the derivative of
@@ -190,14 +216,12 @@ def body(table: TableDecl) -> ir.Body:
 
     along = shares(0)
     if len(table.points) == 1:
-        return ir.Body(
-            ("at0",), tuple(lets), (_along([ir.Const(value) for value in table.values[0]], along),)
-        )
-    for index, column in enumerate(zip(*table.values, strict=True)):
-        lets.append((f"column{index}", _along([ir.Const(value) for value in column], along)))
-    columns = [ir.Signal(f"column{index}") for index in range(len(table.values[0]))]
+        return ir.Body(("at0", *read), tuple(lets), (_along(values[0], along),))
+    for index, column in enumerate(zip(*values, strict=True)):
+        lets.append((f"column{index}", _along(column, along)))
+    columns = [ir.Signal(f"column{index}") for index in range(len(values[0]))]
     value = _along(columns, shares(1))
-    return ir.Body(("at0", "at1"), tuple(lets), (value,))
+    return ir.Body(("at0", "at1", *read), tuple(lets), (value,))
 
 
 def _limited(share: ir.Num, cell: int, cells: int, extrapolate: Extrapolate) -> ir.Num:

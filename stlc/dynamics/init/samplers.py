@@ -7,7 +7,7 @@ order from samplers such as `uniform`. States that violate a condition of `where
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
@@ -342,6 +342,10 @@ class InitialStates:
             table[drawing.name] = drawing(table, rows)
         return torch.stack([table[name] for name in self.names], 1)
 
+    def completed(self, states: Tensor, keep: Collection[str] = ()) -> Tensor:
+        """Compute the columns of states (n, dim) that follow from the others, but not those in `keep`."""
+        return completed(states, self.names, [each for each in self._computed if each.name not in keep], {})
+
     def holds(self, states: Tensor) -> Tensor:
         """Mask (n,) of the states (n, dim) that meet every condition of `where`."""
         return self._each_holds(states).all(0)
@@ -385,6 +389,25 @@ class InitialStates:
             return ()
         message = f"only {100 * self.acceptance:.2g} % of the initial states that are drawn meet `where`"
         return (self._finding("W601", message, "sampling is slow"),)
+
+
+def completed(
+    states: Tensor, names: Sequence[str], drawings: Sequence[Drawing], further: Mapping[str, Tensor]
+) -> Tensor:
+    """Compute columns of states again that follow from the others.
+
+    Args:
+        states: the states, (n, dim).
+        names: their names, (dim,).
+        drawings: values of the columns, in order, without random numbers.
+        further: name -> values, (n,), of further columns that they read.
+    """
+    rows = Rows(len(states), torch.Generator())
+    table = {**further, **dict(zip(names, states.double().unbind(1), strict=False))}
+    for drawing in drawings:
+        table[drawing.name] = drawing(table, rows)
+    found = [table[name].to(states) for name in names]
+    return torch.cat((torch.stack(found, 1), states[:, len(names) :]), 1) if drawings else states
 
 
 # ------------------------------------------------------------------------- given states

@@ -86,6 +86,13 @@ class System:
         real = truth(self.decl)
         return self if real is self.decl else System(real)
 
+    def of_agents(self, rows: Tensor) -> System:  # noqa: ARG002
+        """The true system of some of the agents that are stepped in one batch, `rows`, (k,) int64.
+
+        It is this system, unless each agent has its own.
+        """
+        return self
+
     def augmented(self, timers: Sequence[Timer], parameters: Sequence[Parameter] = ()) -> System:
         """Return the same system with the parameters and timers of a specification as its last state columns.
 

@@ -1,37 +1,33 @@
 """Parametric uncertainty: a factor for every uncertain number of the dynamics, and the perturbed system.
 
-`test: {uncertain: […]}` lists the uncertain constants. Without this list, all constants and literals in the
-arithmetic of `flow` and of the resets of jumps are uncertain, with two exceptions. A constant that a
-condition reads is exact: it is a place or a time (where a station is, when a light changes), not a property
-of the plant. A constant or literal in an exponent, an index or an argument of a function is exact, because it
-belongs to the mathematics.
+`stlc.dynamics.scenarios.uncertain` says which numbers these are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, repeat
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from stlc.compile.frontend.scope import Definition, Known
+import torch
+from torch import Tensor
+
+from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
+from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.load import moving_parts
-from stlc.dynamics.declaration.motion import Assign, JumpDecl, each_jump, read_flow
+from stlc.dynamics.declaration.load import Motion, SystemKeys, motion_of, sections_of
+from stlc.dynamics.declaration.motion import Assign
+from stlc.dynamics.init.samplers import Drawing, completed
 from stlc.dynamics.model.algebra import multiply, names_in
 from stlc.dynamics.model.system import System
-from stlc.dynamics.schema.names import Names, base_name, each_number
-from stlc.dynamics.schema.reader import Reader
-from stlc.grammar import ast
-from stlc.grammar.traverse import children, descendants
-from stlc.units import SYMBOLS
+from stlc.dynamics.scenarios.uncertain import NumbersInUse, UncertainNumbers, uncertain_numbers
+from stlc.dynamics.schema.names import Names, NumberChanges, base_name, each_number
+from stlc.dynamics.schema.yaml_nodes import Mapping, Sequence
+from stlc.source import Span
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from stlc.dynamics.model.rollout import Columns
 
 
@@ -42,7 +38,7 @@ class Uncertain:
     Attributes:
         factor: name of the column by which the number is multiplied; it is 1 in the model.
         text: source text of the number, such as `vy` or `0.01 m/rad`.
-        states: names of the states whose equations or resets read the number.
+        states: names of the states whose equations, resets or samples read the number.
     """
 
     factor: str
@@ -58,87 +54,125 @@ class Perturbable:
     """Declaration of a system in which every uncertain number of the dynamics is multiplied by a factor.
 
     Attributes:
-        decl: the declaration; the factors are columns that `flow` and `jumps` read.
+        decl: the declaration; the factors are columns that the dynamics read.
         numbers: the uncertain numbers.
+        started: values at the start of the columns that are computed at samples, in order, if one of them
+            reads a factor.
+        exact: names of constants that the dynamics read and that count as exact.
     """
 
     decl: SystemDecl
     numbers: tuple[Uncertain, ...]
+    started: tuple[Assign, ...] = ()
+    exact: tuple[str, ...] = ()
 
 
 def perturbable(decl: SystemDecl) -> Perturbable:
-    """Multiply each uncertain number of a declaration's dynamics by a factor; return the result."""
-    parts = moving_parts(decl)
-    names = parts.cx.names
-    used, listed = _UsedNumbers(names), decl.test.uncertain
+    """Multiply each uncertain number of a declaration's dynamics by a factor; return the result.
 
-    def read(rewriting: Names) -> tuple[tuple[Assign, ...], tuple[JumpDecl | None, ...]]:
-        cx = replace(parts.cx, reader=Reader(decl.source), names=rewriting).plain  # its findings are dropped
-        return read_flow(parts.flow, cx), each_jump(parts.jump, cx)
-
-    read(replace(names, rewrite=used.record))
-    chosen = used.computed_with - used.compared if listed is None else frozenset(listed)
-    texts = {_factor(name): name for name in sorted(chosen)}
-    if listed is None:
-        texts |= {_place(each): each.span.text for each in used.literals.values()}
-    rewriting = replace(
-        names, entries=dict(names.entries), rewrite=used.rewritten if listed is None else None
-    )
-    for name in chosen:
-        scaled = partial(_scaled, factor=ir.Signal(_factor(name)))
-        rewriting.entries[name] = each_number(names.entries[name], scaled)
-    for factor in texts:
-        rewriting.entries[factor] = Known(Number(ir.Signal(factor), flexible=True, bare=True))
-    factored = _laid_over(decl, *read(rewriting))
-    found = (Uncertain(factor, text, _readers(factored, factor)) for factor, text in texts.items())
-    return Perturbable(factored, tuple(each for each in found if each.states))
-
-
-def _laid_over(decl: SystemDecl, flow: tuple[Assign, ...], jumps: tuple[JumpDecl | None, ...]) -> SystemDecl:
-    """Return the declaration with the guards, equations and resets of `flow` and `jumps`.
-
-    `jumps` are the first ones of the declaration, in its order; those of timers follow them and stay. Bool
-    and enum states keep their equations and resets.
+    Raises:
+        SystemFileError: S212, an error of a number cannot be carried to a place where it stands; S213, a
+            constant that the file lists as uncertain changes nothing.
     """
-    real = {column.name for column in decl.signature.columns if column.kind == "real"}
+    found = sections_of(decl)
+    choice = uncertain_numbers(decl, found)
+    texts = {_factor(name): name for name in choice.constants} | choice.literals
+    listed = decl.test.uncertain is not None
+    motion = _factored_motion(decl, found, choice, texts)
+    factored, started = _with_motion(decl, motion, every=listed)
+    numbers = tuple(
+        Uncertain(factor, text, _readers(factored, started, factor)) for factor, text in texts.items()
+    )
+    if listed:
+        for number in numbers:
+            if not number.states or not any(
+                value for name, (value, _) in decl.constants.items() if base_name(name) == number.text
+            ):
+                raise _without_effect(number, found, decl)
+    read = frozenset[str]().union(*(names_in(each.value) for each in started))
+    return Perturbable(
+        factored,
+        tuple(each for each in numbers if each.states),
+        started if read & texts.keys() else (),
+        choice.exact,
+    )
+
+
+def _factored_motion(
+    decl: SystemDecl, found: SystemKeys, choice: UncertainNumbers, texts: dict[str, str]
+) -> Motion:
+    """Read the motion of a system again, with a factor at every uncertain number."""
+
+    def scaled(name: str, entry: Known) -> Entry:
+        if name not in choice.constants:
+            return entry
+        return each_number(entry, partial(_scaled, factor=ir.Signal(_factor(name))))
+
+    factors: dict[str, Entry] = {
+        factor: Known(Number(ir.Signal(factor), flexible=True, bare=True)) for factor in texts
+    }
+    names = Names()
+    used = NumbersInUse(names, frozenset(map(base_name, decl.constants)))
+    rewrite = used.rewritten if decl.test.uncertain is None else None
+    names.changes = NumberChanges(scaled, rewrite, factors)
+    return motion_of(found, decl, names)
+
+
+def _with_motion(decl: SystemDecl, motion: Motion, *, every: bool) -> tuple[SystemDecl, tuple[Assign, ...]]:
+    """Return the declaration with another motion, and the values at the start that go with it.
+
+    Unless `every`, only the motion of real columns is taken.
+    """
+    taken = {column.name for column in decl.signature.columns if every or column.kind == "real"}
 
     def replaced(assigns: tuple[Assign, ...], others: tuple[Assign, ...]) -> tuple[Assign, ...]:
-        values = {assign.name: assign for assign in others if assign.name in real}
+        values = {assign.name: assign for assign in others if assign.name in taken}
         return tuple(values.get(assign.name, assign) for assign in assigns)
 
-    changed = (
-        jump
-        if other is None
-        else replace(jump, guard=other.guard, resets=replaced(jump.resets, other.resets))
-        for jump, other in zip(decl.jumps, chain(jumps, repeat(None)), strict=False)
+    jumps = tuple(
+        replace(jump, guard=other.guard, resets=replaced(jump.resets, other.resets))
+        for jump, other in zip(decl.jumps, motion.jumps, strict=True)
     )
-    return replace(decl, flow=replaced(decl.flow, flow), jumps=tuple(changed))
+    flow = replaced(decl.flow, (*motion.flow, *motion.sampled.flow))
+    factored = replace(decl, flow=flow, jumps=jumps, updates=replaced(decl.updates, motion.updates))
+    return factored, replaced(decl.init.computed, motion.initial)
 
 
-def _readers(decl: SystemDecl, factor: str) -> tuple[str, ...]:
-    """Return the names of the states whose next value depends on the column `factor`.
+def _readers(decl: SystemDecl, started: tuple[Assign, ...], factor: str) -> tuple[str, ...]:
+    """Return the names of the states whose next value, or value at the start, depends on a factor.
 
-    Either the equation of such a state reads the column, or a jump that sets the state reads it, in its guard
-    or its reset.
+    Either an assignment of such a state reads the column `factor`, or a jump that sets the state reads it, in
+    its guard or its reset.
     """
-    found = [assign.name for assign in decl.flow if factor in names_in(assign.value)]
+    assigns = (*decl.flow, *decl.updates, *started)
+    found = [assign.name for assign in assigns if factor in names_in(assign.value)]
     for jump in decl.jumps:
         guarded = factor in names_in(jump.guard)
         found += [each.name for each in jump.resets if guarded or factor in names_in(each.value)]
     return tuple(dict.fromkeys(map(base_name, found)))
 
 
+def _without_effect(number: Uncertain, found: SystemKeys, decl: SystemDecl) -> SystemFileError:
+    """Return the error S213 about a listed constant that changes nothing."""
+    why, span = f"nothing that moves reads `{number.text}`", _item(found, number.text)
+    if number.states:
+        why = f"`{number.text}` is 0, of which a relative error changes nothing"
+    elif any(unit.offset for name, (_, unit) in decl.constants.items() if base_name(name) == number.text):
+        why = f"`{number.text}` is a temperature on a scale, which has no relative error"
+    message = f"an uncertain constant without effect: {why}"
+    advice = "leave it out of `uncertain`, or list the constants that the dynamics read"
+    return SystemFileError(Diagnostic("S213", message, span, "listed here", help=(advice,)))
+
+
+def _item(found: SystemKeys, name: str) -> Span | None:
+    """Source location of a name in the list `uncertain`."""
+    node = found.test.get("uncertain") if isinstance(found.test, Mapping) else None
+    items = node.items if isinstance(node, Sequence) else ()
+    return next((item.span for item in items if getattr(item, "text", "") == name), None)
+
+
 def _factor(name: str) -> str:
     return f"?{name}"
-
-
-def _is_point(node: ast.Quantity) -> bool:
-    known = SYMBOLS.get(node.unit)
-    return known is not None and bool(known.offset)
-
-
-def _place(node: ast.Quantity) -> str:
-    return f"?{node.span.source.name}:{node.span.start}"
 
 
 def _scaled(number: Number, factor: ir.Num) -> Number:
@@ -146,100 +180,6 @@ def _scaled(number: Number, factor: ir.Num) -> Number:
     if number.unit.offset:
         return number
     return replace(number, num=multiply(number.num, factor), exact=None)
-
-
-# -------------------------------------------------------------------- rewriting of expressions
-
-_COMPUTED: Mapping[type[ast.Node], tuple[str, ...]] = {
-    ast.Neg: ("operand",),
-    ast.Vector: ("items",),
-    ast.Binary: ("left", "right"),
-    ast.Index: ("base",),
-    ast.IfThenElse: ("yes", "no"),
-    ast.Call: ("args",),
-    ast.Arg: ("value",),
-}
-"""Class of an expression -> the fields whose numbers it computes with; those in other fields are exact."""
-
-
-def _computed(node: ast.Node) -> tuple[str, ...]:
-    """Return the names of the fields of a syntax tree node that hold operands of arithmetic.
-
-    Exponents, indices and conditions are not among them.
-    """
-    match node:
-        case ast.Binary(op="%" | "^"):
-            return ("left",)
-        case ast.Call(func=ast.Name(name="ind")) | ast.Arg(name=str()):
-            return ()
-        case _:
-            return _COMPUTED.get(type(node), ())
-
-
-class _UsedNumbers:
-    """Collector of the numbers in the arithmetic of expressions, and of the constants in conditions.
-
-    Attributes:
-        names: declared names of the system file.
-        constants: names of the constants.
-        computed_with: constants found as operands of arithmetic.
-        compared: constants found in conditions, exponents and indices; they count as exact.
-        literals: name of a factor -> the literal (number in the source) that it multiplies.
-    """
-
-    def __init__(self, names: Names) -> None:
-        self.names = names
-        self.constants = frozenset(map(base_name, names.constants))
-        self.computed_with: set[str] = set()
-        self.compared: set[str] = set()
-        self.literals: dict[str, ast.Quantity] = {}
-
-    def record(self, expr: ast.Expr) -> ast.Expr:
-        """Record the numbers of an expression and return it unchanged."""
-        self.rewritten(expr)
-        return expr
-
-    def rewritten(self, node: Any, *, called: bool = False) -> Any:
-        """Return an expression with a factor at each literal: `2 * v` becomes `2 * factor * v`.
-
-        Names of definitions are replaced by their expressions. The literals and the constants are recorded.
-
-        Args:
-            node: an expression, or an argument of a call.
-            called: whether `node` is within a call, where literals are exact and get no factor.
-        """
-        match node:
-            case ast.Quantity(span=span, value=value):
-                if called or not value or _is_point(node):
-                    return node
-                self.literals[_place(node)] = node
-                return ast.Binary(span, "*", node, ast.Name(span, _place(node)))
-            case ast.Name(name=name):
-                found = self.names.entries.get(name)
-                if isinstance(found, Definition):
-                    return self.rewritten(found.body, called=called)
-                self.computed_with |= {name} & self.constants
-                return node
-        inside, done, changed = called or isinstance(node, ast.Call), set(), {}
-        for field in _computed(node):
-            value = getattr(node, field)
-            parts = value if isinstance(value, tuple) else (value,)
-            done |= set(map(id, parts))
-            again = tuple(self.rewritten(part, called=inside) for part in parts)
-            changed[field] = again if isinstance(value, tuple) else again[0]
-        for part in children(node):
-            if id(part) not in done:
-                self._compare(part)
-        return replace(node, **changed)
-
-    def _compare(self, part: ast.Node) -> None:
-        """Record the constants in `part`, a condition, an exponent or an index; they count as exact."""
-        for node in descendants(part):
-            if isinstance(node, ast.Name):
-                found = self.names.entries.get(node.name)
-                self.compared |= {node.name} & self.constants
-                if isinstance(found, Definition):
-                    self._compare(found.body)
 
 
 # -------------------------------------------------------------------------- the perturbed system
@@ -255,7 +195,38 @@ class PerturbedSystem(System):
 
     def __init__(self, factored: Perturbable, factors: Tensor) -> None:
         super().__init__(factored.decl)
+        self._factored, self.values = factored, factors
         self._factors = {each.factor: factors[:, index] for index, each in enumerate(factored.numbers)}
+        self._started = tuple(map(Drawing, factored.started))
+
+    def of_agents(self, rows: Tensor) -> PerturbedSystem:
+        """The true system of the agents `rows`, (k,) int64, alone."""
+        return PerturbedSystem(self._factored, self.values[rows])
+
+    def sample(
+        self,
+        n: int,
+        *,
+        seed: int | None = None,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Draw n initial states of the model, (n, dim); see `System.sample`.
+
+        Columns that follow from the others, such as held values, are computed with the errors of the agents.
+
+        Raises:
+            UsageError: U101, they depend on the errors, and there are not as many states as agents.
+        """
+        drawn = super().sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
+        if not self._started:
+            return drawn
+        if n != len(self.values):
+            names = ", ".join(f"`{each.name}`" for each in self._started)
+            message = f"{names} at the start depends on the errors of the {len(self.values)} agents"
+            raise usage(f"{message}, and the world draws {n} states", "draw one state for each agent")
+        return completed(drawn, self.names, self._started, self._factors)
 
     def _inputs(self, u: Tensor) -> Columns:
         """Return the controls and the factors of the uncertain numbers as columns by name."""

@@ -68,6 +68,21 @@ def component_names(name: str, size: int | None) -> tuple[str, ...]:
     return (name,) if size is None else tuple(f"{name}[{index}]" for index in range(size))
 
 
+@dataclass(frozen=True, slots=True)
+class NumberChanges:
+    """Changes of the numbers that the dynamics compute with, while a file is read again.
+
+    Attributes:
+        constant: function from the name and the entry of a constant to the changed entry.
+        rewrite: function applied to every parsed expression of the dynamics; None changes nothing.
+        constants: the changed entries of the constants, and further ones; filled while the file is read.
+    """
+
+    constant: Callable[[str, Known], Entry]
+    rewrite: Callable[[ast.Expr], ast.Expr] | None = None
+    constants: dict[str, Entry] = field(default_factory=dict)
+
+
 @dataclass
 class Names:
     """Names declared in a system file; filled while its sections are read.
@@ -78,8 +93,7 @@ class Names:
         controls: control inputs, in order.
         entries: everything that a name can stand for in an expression.
         places: name -> source location of its declaration.
-        rewrite: function applied to every parsed expression before its names are resolved; None changes
-            nothing.
+        changes: other numbers for the dynamics; None for those of the file.
     """
 
     constants: dict[str, tuple[float, Unit]] = field(default_factory=dict)
@@ -87,12 +101,12 @@ class Names:
     controls: list[ControlDecl] = field(default_factory=list)
     entries: dict[str, Entry] = field(default_factory=dict)
     places: dict[str, Span] = field(default_factory=dict)
-    rewrite: Callable[[ast.Expr], ast.Expr] | None = None
+    changes: NumberChanges | None = None
 
     def expressions(self, reader: Reader) -> Expressions:
         """Return a compiler of expressions that knows all names declared up to now."""
         scope = Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
-        return Expressions(reader, scope, rewrite=self.rewrite)
+        return Expressions(reader, scope)
 
     def group(self, name: str) -> tuple[Column, ...]:
         """Return the columns of the state `name`: one, or one per component; () for an unknown name."""
@@ -165,6 +179,14 @@ class Context:
         All names declared in the system file up to now can be read.
         """
         return replace(self, here=self.names.expressions(self.reader))
+
+    @property
+    def moving(self) -> Context:
+        """The context `plain` of the dynamics, with the changed numbers."""
+        here, changes = self.names.expressions(self.reader), self.names.changes
+        if changes is None:
+            return replace(self, here=here)
+        return replace(self, here=replace(here.extended(changes.constants), rewrite=changes.rewrite))
 
     @property
     def timed(self) -> Context:

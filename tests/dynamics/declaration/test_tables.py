@@ -44,7 +44,9 @@ def table(points: tuple[tuple[float, ...], ...], extrapolate: str, seed: int = 0
 def program(decl: TableDecl) -> ArrayProgram:
     """The table as a function of signals `at0`, `at1`."""
     signals = tuple(ir.Signal(f"at{i}") for i in range(len(decl.points)))
-    return ArrayProgram({"f": ir.Extern("f", signals, 0, body(decl))})
+    return ArrayProgram(
+        {"f": ir.Extern("f", signals, 0, body(decl, [list(map(ir.Const, row)) for row in decl.values]))}
+    )
 
 
 @settings(max_examples=40, deadline=None)
