@@ -130,7 +130,7 @@ class ModelWorld:
     def reset(self) -> Tensor:
         """Initial states from the training distribution, (agents, n)."""
         self._begin()
-        self._drawn = self._sampled(self._agents)
+        self._drawn = self._sampled(self._system, self._agents)
         return self._happen(self._drawn)
 
     def redraw(self, rows: Tensor) -> Tensor:
@@ -139,7 +139,7 @@ class ModelWorld:
         Returns all states, (agents, n).
         """
         self._begin()
-        self._drawn = self._drawn.index_copy(0, rows, self._sampled(len(rows)))
+        self._drawn = self._drawn.index_copy(0, rows, self._sampled(self._system.of_agents(rows), len(rows)))
         return self._happen(self._drawn)
 
     def advance(self, x: Tensor, action: Tensor) -> Tensor:
@@ -178,8 +178,8 @@ class ModelWorld:
             limit(low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3)
         axes.set(xlabel=str(names[0]), ylabel=str(names[second]))
 
-    def _sampled(self, count: int) -> Tensor:
-        return self._system.sample(count, generator=self._generator, dtype=torch.float64)
+    def _sampled(self, system: System, count: int) -> Tensor:
+        return system.sample(count, generator=self._generator, dtype=torch.float64)
 
     def _happen(self, x: Tensor) -> Tensor:
         self._x, counts = self._events.apply(x, self._step, self._generator)

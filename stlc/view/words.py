@@ -56,6 +56,12 @@ def seconds(value: float | None) -> str:
     return f"{minutes} min {rest} s" if rest else f"{minutes} min"
 
 
+def listing(names: Sequence[str], most: int = 12) -> str:
+    """Join names, of which the first `most` are shown, and the others are counted."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")
+
+
 @dataclass(frozen=True, slots=True)
 class GuardWords:
     """Words that name a guard in texts.

@@ -27,6 +27,8 @@ from stlc.diagnostics import usage
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from stlc.controller.planning.planner import PlanResult
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import PlannerChoice
@@ -86,7 +88,7 @@ def plan(
     plan does not satisfy the specification.
     """
     from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named, prepared
-    from stlc.controller.planning.traces import starts_of, trace_of
+    from stlc.controller.planning.traces import following, starts_of, trace_of
     from stlc.controller.problem.load import load_task
     from stlc.controller.verification.tubes import TubeModel
     from stlc.stopping import leaving
@@ -128,7 +130,7 @@ def plan(
             raise SystemExit(signals[0])
     record = _record(task, result, choice, output)
     if model is not None:
-        record["tube"] = _bounded(model, result, tube)
+        record["tube"] = _bounded(model, result, tube, following(task, from_))
     good = record["tube"]["guaranteed"] if model is not None else record["satisfied"]
     missed = good / record["starts"] < (1.0 if fail_under is None else fail_under)
     return Answer(record, lambda: emit("\n".join(_lines(record))), signals[0] if signals else int(missed))
@@ -166,16 +168,21 @@ def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path)
     }
 
 
-def _bounded(model: TubeModel, result: PlanResult, scenario: str | None) -> PlanTubes:
-    """Bounds on the robustness of the plans for all errors of the scenario."""
+def _bounded(model: TubeModel, result: PlanResult, scenario: str | None, start: Sequence[str]) -> PlanTubes:
+    """Bounds on the robustness of the plans for all errors of the scenario.
+
+    `start`: names of the columns that follow from the others at the start.
+    """
     from stlc.controller.problem.task import satisfied
     from stlc.controller.verification.tubes import DEVIATIONS
 
-    found = model.tube(result.states, result.plans)
+    found, loose = model.tube(result.states, result.plans, start=start), model.uncertain
     low, high = (model.task.graph.overall(each) for each in (found.low, found.high))
     return {
         "scenario": scenario or "",
         "deviations": DEVIATIONS if model.truncated else None,
+        "numbers": [] if loose is None else [str(each) for each in loose.numbers],
+        "exact": [] if loose is None else list(loose.exact),
         "guaranteed": int(satisfied(low).sum()),
         "robustness": [float(low.min()), float(high.max())],
         "requirements": {
@@ -196,7 +203,7 @@ def _lines(plans: Plans) -> list[str]:
 
 def _tube_lines(plans: Plans) -> list[str]:
     """Lines with the bounds of `--tube`; none without it."""
-    from stlc.view.words import number
+    from stlc.view.words import listing, number
 
     found = plans.get("tube")
     if found is None:
@@ -207,6 +214,10 @@ def _tube_lines(plans: Plans) -> list[str]:
     if many == 1:
         said = "the plan is guaranteed to satisfy it" if good else "no guarantee that the plan satisfies it"
     lines = [f"{found['scenario']}: {said}{within}"]
+    if numbers := listing(found["numbers"]):
+        lines.append(f"  numbers that may be wrong: {numbers}")
+    if exact := listing(found["exact"]):
+        lines.append(f"  taken as exact, as conditions or limits read them: {exact}")
     width = max(map(len, found["requirements"]))
     for name, each in found["requirements"].items():
         low, high = (number(float(each[end])) for end in ("low", "high"))

@@ -521,6 +521,7 @@ class ModelErrors(TypedDict):
     actuator_noise: NotRequired[float]
     sensor_noise: NotRequired[float]
     numbers: NotRequired[list[str]]
+    exact: NotRequired[list[str]]
 
 
 class JudgeSpec(TypedDict):

@@ -28,10 +28,16 @@ class GuaranteedRobustness(TypedDict):
 
 
 class PlanTubes(TypedDict):
-    """Bounds for all errors of a scenario; normal noise is bounded at a number of standard deviations."""
+    """Bounds for all errors of a scenario; normal noise is bounded at a number of standard deviations.
+
+    `numbers` are the numbers of the dynamics that may be wrong; constants in `exact` are not, as conditions
+    or limits read them.
+    """
 
     scenario: str
     deviations: float | None
+    numbers: list[str]
+    exact: list[str]
     guaranteed: int
     robustness: list[float | str]
     requirements: dict[str, GuaranteedRobustness]

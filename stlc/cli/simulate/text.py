@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from stlc.escape import operand, shell, visible
-from stlc.view.words import guard_words
+from stlc.view.words import guard_words, listing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -128,10 +128,11 @@ def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
     """Lines on the model errors that the scenario introduces, one line per kind of error."""
     for name, what in ERRORS.items():
         if name in errors:
-            numbers = errors.get("numbers", []) if name == "parameters" else []
-            which = f": {', '.join(numbers)}" if numbers else ""
+            numbers = listing(errors.get("numbers", ())) if name == "parameters" else ""
             if name != "parameters" or numbers:
-                yield f"  {what} by {100 * errors[name]:.3g} %{which}"
+                yield f"  {what} by {100 * errors[name]:.3g} %{numbers and f': {numbers}'}"
+    if errors.get("exact"):
+        yield f"  exact, as conditions or limits read them: {listing(errors['exact'])}"
 
 
 def compared(document: Record) -> Iterator[str]:

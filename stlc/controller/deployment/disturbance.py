@@ -182,14 +182,18 @@ class Disturbance:
 def errors_of(truth: System) -> dict[str, Any]:
     """Nonzero errors (of model, actuators and sensors) in the system's scenario: name -> relative size.
 
-    The entry `parameters` is the error of the constants in the dynamics. If it is present, there is a further
-    entry `numbers`: the list of these constants.
+    The entry `parameters` is the error of the numbers in the dynamics. If it is present, there are further
+    entries: `numbers`, the list of these numbers, and `exact`, the constants that the dynamics read and that
+    count as exact, if there are any.
     """
     scenario = truth.decl.scenario
     shares = {} if scenario is None else asdict(scenario.errors)
     found: dict[str, Any] = {name: share for name, share in shares.items() if share}
     if "parameters" in found:
-        found["numbers"] = [str(each) for each in perturbable(truth.decl).numbers]
+        loose = perturbable(truth.decl)
+        found["numbers"] = list(map(str, loose.numbers))
+        if loose.exact:
+            found["exact"] = list(loose.exact)
     return found
 
 

@@ -50,11 +50,19 @@ def starts_of(task: Task, text: str, count: int | None, seed: int) -> Tensor:
         return task.sample(count or 1, seed=seed, dtype=torch.float64)
     if "=" in text:
         states = task.sample(count or 1, seed=seed, dtype=torch.float64)
-        for part in text.split(","):
-            name, value = _assignment(task, part)
+        given = dict(_assignment(task, part) for part in text.split(","))
+        for name, value in given.items():
             states[:, task.system.names.index(name)] = value
-        return states
+        return task.plain.initial.completed(states, given)
     return _recorded(task, text, count, seed)
+
+
+def following(task: Task, text: str) -> tuple[str, ...]:
+    """Names of the columns of `starts_of` that follow from the others there, such as held values."""
+    if text != RANDOM and "=" not in text:
+        return ()
+    given = {part.partition("=")[0].strip() for part in text.split(",")}
+    return tuple(each.name for each in task.plain.decl.init.computed if each.name not in given)
 
 
 def _assignment(task: Task, part: str) -> tuple[str, float]:

@@ -14,7 +14,7 @@ agents in another way, are outside of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -81,6 +81,7 @@ class TubeModel:
     Raises:
         UsageError: U101, the dynamics or a requirement calls a Python function, or the measurement noise of
             the scenario depends on the state.
+        SystemFileError: S212, S213, the errors of a parameter cannot be carried, or have no effect.
     """
 
     def __init__(self, task: Task, *, deviations: float = DEVIATIONS) -> None:
@@ -89,7 +90,10 @@ class TubeModel:
         decl, scenario = system.decl, system.decl.scenario
         self._sizes = ErrorSizes.of(system)
         loose = perturbable(system.truth.decl) if self._sizes.parameters else None
+        self.uncertain = loose
         self._factors = () if loose is None else tuple(each.factor for each in loose.numbers)
+        wrong = system.truth.decl.init.computed if system.truth is not system else ()
+        self._started = tuple(map(Drawing, (() if loose is None else loose.started) or wrong))
         timers = task.compiled.timers
         self._model = _Motion(decl, timers)
         self._truth = _Motion(system.truth.decl if loose is None else loose.decl, timers)
@@ -124,7 +128,9 @@ class TubeModel:
         drawn = any("normal" in each.samplers for each in (*self._pushes, *self._noises))
         return drawn or bool(self._sizes.push.any() | self._sizes.blur.any())
 
-    def tube(self, x: Tensor, plans: Tensor, *, steps: int | None = None) -> Tube:
+    def tube(
+        self, x: Tensor, plans: Tensor, *, steps: int | None = None, start: Collection[str] = ()
+    ) -> Tube:
         """Bounds on states and robustness under plans.
 
         Args:
@@ -132,13 +138,15 @@ class TubeModel:
             plans: plans in physical units, (B, T, m).
             steps: number of steps with errors. From then on, the states follow the model without errors, from
                 every state that the errors may have led to. None: errors in all steps.
+            start: names of the columns that follow from the others at the start of a deployment, such as held
+                values: they are not as in `x`, but as errors of parameters may have made them.
 
         Returns:
             The bounds. A plan that is not finite has the bounds -inf and +inf.
         """
         steps = self.task.horizon if steps is None else steps
         states, given = (torch.split(each.double(), AT_ONCE) for each in (x, plans))
-        parts = [self._tube(*each, steps) for each in zip(states, given, strict=True)]
+        parts = [self._tube(*each, steps, start) for each in zip(states, given, strict=True)]
         if len(parts) == 1:
             return parts[0]
         names = self.task.system.names
@@ -153,18 +161,18 @@ class TubeModel:
         found: Tensor = self.task.safety.overall(self.tube(x, plans, steps=steps).low[:, self._safe])
         return found
 
-    def _tube(self, x: Tensor, plans: Tensor, steps: int) -> Tube:
+    def _tube(self, x: Tensor, plans: Tensor, steps: int, start: Collection[str]) -> Tube:
         broken = ~torch.isfinite(plans).flatten(1).all(1)
         u = torch.where(torch.isfinite(plans), plans, 0.0).numpy()
         with FORMS.quiet():
-            history = self._history(x.numpy(), u, min(steps, u.shape[1]))
+            history = self._history(x.numpy(), u, min(steps, u.shape[1]), start)
             found = self._judge(history)
         low = torch.from_numpy(np.stack([each.low for each in found], 1))
         high = torch.from_numpy(np.stack([each.high for each in found], 1))
         low[broken], high[broken] = -torch.inf, torch.inf
         return Tube({name: INTERVALS.margin(ranges(forms)) for name, forms in history.items()}, low, high)
 
-    def _history(self, x: Floats, u: Floats, steps: int) -> dict[str, list[Forms]]:
+    def _history(self, x: Floats, u: Floats, steps: int, start: Collection[str]) -> dict[str, list[Forms]]:
         """Forms of the states under plans `u`, (B, T, m): name -> one form (B,) per sample.
 
         The first `steps` steps have errors.
@@ -172,6 +180,10 @@ class TubeModel:
         symbols = _Symbols(len(x), self._deviations)
         errors = _ErrorForms(self._sizes, self._factors, symbols)
         env = self._start(x, symbols, measured=steps > 0)
+        for column in self._started if steps else ():
+            if column.name in start:
+                found = column.value({**env, **errors.factors}, FORMS, symbols.drawn)
+                env[column.name] = _full(found, symbols.batch)
         history = {name: [form] for name, form in env.items()}
         for step in range(u.shape[1]):
             plan = u[:, step].T
@@ -421,7 +433,9 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in sorted(names))
 
 
-def tube(task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS) -> Tube:
+def tube(
+    task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS, start: Collection[str] = ()
+) -> Tube:
     """Bounds on the states and on the robustness of plans, for all errors of the task's scenario.
 
     Args:
@@ -429,6 +443,7 @@ def tube(task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS) -> T
         x: measured states, (B, n) or (n,), in the order of `task.system.names`.
         plans: plans in physical units, (B, T, m) or (T, m).
         deviations: standard deviations at which normal noise is bounded.
+        start: names of the columns that are computed with the errors; see `TubeModel.tube`.
 
     Raises:
         UsageError: U101, there are no bounds; see `TubeModel`.
@@ -440,4 +455,4 @@ def tube(task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS) -> T
     if states.shape[1:] != (len(task.system.names),) or given.shape != wanted:
         shape = f"(B, {len(task.system.names)}) and (B, {wanted[1]}, {wanted[2]})"
         raise usage(f"states {tuple(states.shape)} and plans {tuple(given.shape)} are not {shape}")
-    return TubeModel(task, deviations=deviations).tube(states, given)
+    return TubeModel(task, deviations=deviations).tube(states, given, start=start)
