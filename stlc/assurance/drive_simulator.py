@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.simulation import PARTS, Focus, Simulations
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
 from stlc.controller.deployment.simulator import simulate as run_worlds
@@ -95,13 +96,16 @@ class DriveSimulator:
     def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
         """Simulate `points`, (count, dim), and judge the drives.
 
-        A point is admissible if the assumptions of the specification hold for one of its agents.
+        A point is admissible if the assumptions of the specification hold for one of its agents. It has a
+        verdict if one of them violates the requirement, or all have a verdict.
         """
         verdict = self._verdict(self.drive(points))
         margins = self._margins_of_agents(verdict).min(1)[:, focus.requirement]
         inside = np.broadcast_to(_inside(verdict), (len(points) * self.setting.agents,))
         admissible: NDArray[np.bool_] = np.any(inside.reshape(len(points), -1), axis=1)
-        return Simulations.unscaled(margins, admissible)
+        open_ = np.array(verdict.requirements[focus.requirement].statuses) == "inconclusive"
+        judged = (margins < -TOLERANCE) | ~open_.reshape(len(points), -1).any(1)
+        return Simulations.unscaled(margins, admissible, judged)
 
     def drive(self, points: NDArray[np.float64], watch: Watch | None = None) -> DeploymentRecording:
         """Simulate `points`, (count, dim), side by side, and return the recorded drives.

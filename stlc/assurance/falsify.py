@@ -84,8 +84,10 @@ class Falsification:
         shrunk: the same with fewer pieces and rounder numbers, as far as it still violates the requirement.
         spurious: violations that do not survive half the time step.
         simulations: number of simulations.
-        least: least robustness of all simulations.
-        coverage: share of the cells, over all pairs of coordinates, that simulations fell into.
+        inconclusive: number of those without a verdict, because they ended before it or failed: no evidence.
+        least: least robustness of all simulations with a verdict.
+        coverage: share of the cells, over all pairs of coordinates, that simulations with a verdict fell
+            into.
         rejected: number of points whose initial state does not meet the conditions of `where`.
         seconds: time of the search.
         strategies: number of simulations per strategy.
@@ -96,6 +98,7 @@ class Falsification:
     shrunk: Counterexample | None
     spurious: tuple[Counterexample, ...]
     simulations: int
+    inconclusive: int
     least: float
     coverage: float
     rejected: int
@@ -113,7 +116,8 @@ class ViolationSearch:
         focus: what the next points are judged by.
         found: the counterexample; None until there is one.
         tried: number of simulations.
-        least: least robustness of all simulations.
+        inconclusive: number of those without a verdict.
+        least: least robustness of all simulations with a verdict.
     """
 
     def __init__(self, simulator: Simulator, requirement: int, seed: int, *, random: bool = False) -> None:
@@ -124,7 +128,7 @@ class ViolationSearch:
         self._portfolio = Portfolio(self._part.space, generator, self._gradient, random=random, graded=graded)
         self.focus = Focus(requirement, sized=True)
         self.found: Counterexample | None = None
-        self.tried, self.least = 0, math.inf
+        self.tried, self.inconclusive, self.least = 0, 0, math.inf
         self._open: list[Proposal] = []
         self._first: list[Proposal] = []
         self._sizes: list[NDArray[np.float64]] = []
@@ -185,9 +189,12 @@ class ViolationSearch:
                 continue
             self._row = 0
             self.tried += 1
-            self._points.append(each.point)
             name, margin = each.strategy.name, float(outcome.margins[index])
             self._counts[name] += 1
+            if not outcome.judged[index]:
+                self.inconclusive += 1
+                continue
+            self._points.append(each.point)
             self.least = min(self.least, margin)
             if margin < -TOLERANCE and self.found is None:
                 told[index] = self._examined(points[index], margin, name)
@@ -221,6 +228,7 @@ class ViolationSearch:
             shrunk(simulator, self._requirement, found) if found is not None and shrinks else None,
             tuple(self._spurious),
             self.tried if found is None else found.simulation,
+            self.inconclusive,
             self.least,
             coverage(np.array(self._points).reshape(len(self._points), self._part.space.dim)),
             self._rejected,

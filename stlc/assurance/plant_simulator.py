@@ -67,6 +67,7 @@ class _JudgedTrace:
         decided: last sample that decides the guidance; NaN if it is unknown.
         inside: whether the assumptions of the specification hold.
         failed: whether there is no trace.
+        judged: whether there is a verdict: a simulation that ended early may have none.
     """
 
     margin: float
@@ -75,6 +76,7 @@ class _JudgedTrace:
     decided: float = np.nan
     inside: bool = True
     failed: bool = False
+    judged: bool = True
 
 
 @dataclass(frozen=True)
@@ -92,11 +94,11 @@ class _Judging:
         guide, compiled = self._guides[focus.requirement], self.monitor.compiled
         sizes = np.zeros(len(guide.predicates) if focus.sized else 0)
         if isinstance(run.outcome, PlantFinding):
-            return _JudgedTrace(np.inf, np.inf, sizes, failed=True)
+            return _JudgedTrace(np.inf, np.inf, sizes, failed=True, judged=False)
         rule = compiled.requirements[focus.requirement]
         verdict = self.monitor.check(run.outcome, require=(rule.name,))
         margin = float(verdict.requirements[0].high.min())
-        inside = verdict.statuses[0] != "out of scope"
+        inside, judged = verdict.statuses[0] != "out of scope", verdict.statuses[0] != "inconclusive"
         signals, guidance = arrange(run.outcome, needs_of(compiled, [rule]), plain=True), margin
         if focus.sized:
             (sizes,) = guide.sizes(signals.env)
@@ -108,7 +110,7 @@ class _Judging:
             _, high = rule_bounds(rule, record, starts, compiled.grid.horizon, "open")
             guidance = float(high.min())
         (decided,) = guide.deciding(signals.env, focus.scales, np.array([guidance]))
-        return _JudgedTrace(margin, guidance, sizes, decided, inside)
+        return _JudgedTrace(margin, guidance, sizes, decided, inside, judged=judged)
 
 
 def _together(found: Sequence[_JudgedTrace], step: float) -> Simulations:
@@ -126,6 +128,7 @@ def _together(found: Sequence[_JudgedTrace], step: float) -> Simulations:
         np.array([each.inside for each in found], dtype=np.bool_),
         sizes,
         np.array([each.decided * step for each in found]),
+        np.array([each.judged for each in found], dtype=np.bool_),
     )
 
 
@@ -230,14 +233,15 @@ class PlantSimulator:
 
         None too for a requirement that counts samples, which would mean other times there.
 
-        The margin of a simulation that fails is NaN there: it neither confirms a violation nor refutes it.
+        The margin of a simulation without a verdict is NaN there: it neither confirms a violation nor refutes
+        it.
         """
         rule = self.monitor.compiled.requirements[focus.requirement]
         if self._finer is None or counts_samples(rule.typed.formula):
             return None
         plant = self._finer.plant
         found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]
-        confirmed = [replace(each, margin=np.nan) if each.failed else each for each in found]
+        confirmed = [each if each.judged else replace(each, margin=np.nan) for each in found]
         return _together(confirmed, self._step(plant))
 
     @staticmethod

@@ -190,7 +190,7 @@ def _missing(count: int, sizes: NDArray[np.float64]) -> Simulations:
     typical = np.median(sizes, axis=0) if len(sizes) else np.zeros(sizes.shape[1])
     nothing = np.full(count, np.inf)
     unknown, outside = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
-    return Simulations(nothing, nothing, outside, np.tile(typical, (count, 1)), unknown)
+    return Simulations(nothing, nothing, outside, np.tile(typical, (count, 1)), unknown, outside)
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,6 +46,8 @@ class Simulations:
             wanted, or there is nothing to compare.
         decided: share of the inputs' duration at the sample that decides the guidance, (count,): only inputs
             before it affect the value there. NaN if it is unknown.
+        judged: whether the requirement has a verdict, (count,); not if a simulation ended before it, or
+            failed.
     """
 
     margins: NDArray[np.float64]
@@ -53,12 +55,15 @@ class Simulations:
     admissible: NDArray[np.bool_]
     sizes: NDArray[np.float64]
     decided: NDArray[np.float64]
+    judged: NDArray[np.bool_]
 
     @classmethod
-    def unscaled(cls, margins: NDArray[np.float64], admissible: NDArray[np.bool_]) -> Simulations:
+    def unscaled(
+        cls, margins: NDArray[np.float64], admissible: NDArray[np.bool_], judged: NDArray[np.bool_]
+    ) -> Simulations:
         """Outcomes whose guidance is the exact robustness."""
         unknown = np.full(len(margins), np.nan)
-        return cls(margins, margins, admissible, np.zeros((len(margins), 0)), unknown)
+        return cls(margins, margins, admissible, np.zeros((len(margins), 0)), unknown, judged)
 
     @classmethod
     def joined(cls, parts: Sequence[Simulations]) -> Simulations:
@@ -69,6 +74,7 @@ class Simulations:
             np.concatenate([part.admissible for part in parts]),
             np.concatenate([part.sizes for part in parts]),
             np.concatenate([part.decided for part in parts]),
+            np.concatenate([part.judged for part in parts]),
         )
 
 

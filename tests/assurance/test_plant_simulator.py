@@ -192,3 +192,35 @@ def test_shared_simulations_use_all_processes_of_a_plant(monkeypatch: pytest.Mon
     simulator.close()
     assert sizes == [2, 2, 1, 5]
     assert np.array_equal(shared.margins, alone.margins)
+
+
+@pytest.mark.usefixtures("home")
+def test_simulations_that_end_before_a_verdict_are_counted():
+    Path("long.stl").write_text(
+        "signal big, small\n"
+        "require long: always[0 s, 5 s] big <= 1e6\n"
+        "require part: small > 0.5 -> always[0 s, 5 s] big <= 1e6\n"
+        "require hit: always[0 s, 5 s] (big <= 200 and big >= -200)\n"
+    )
+    Path("long.yaml").write_text(PLANT.replace("small: 0", "small: {range: [0, 1]}"))
+    simulator = load("long.stl", "long.yaml")
+    with simulator.plant:
+        long, part, hit = (
+            falsify(simulator, index, budget=SearchBudget(12), seed=0, shrinks=False) for index in range(3)
+        )
+    assert (long.simulations, long.inconclusive, long.least, long.coverage) == (12, 12, np.inf, 0.0)
+    assert 0 < part.inconclusive < part.simulations == 12
+    assert part.least < np.inf
+    assert part.coverage > 0.0
+    assert hit.found is not None  # a violation needs no end
+
+
+@pytest.mark.usefixtures("home")
+def test_a_half_step_without_verdict_confirms_nothing_and_refutes_nothing():
+    Path("long.stl").write_text("signal big, small\nrequire long: always[0 s, 5 s] big <= 1e6\n")
+    Path("half.yaml").write_text(PLANT.replace("duration: 2 s", "duration: 2 s, halves: true"))
+    simulator = load("long.stl", "half.yaml")
+    found = simulator.at_half_step(np.ones((1, simulator.space.dim)), Focus(0))
+    simulator.close()
+    assert found is not None
+    assert np.isnan(found.margins).all()

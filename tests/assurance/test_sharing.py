@@ -66,7 +66,8 @@ class Bowl:
         away = np.abs(points - 0.5).max(1)
         margins = np.stack([away - 1e-3, 0.499 - away, away + 1.0], 1)[:, focus.requirement]
         sizes = np.stack([away, 100.0 * away], 1) if focus.sized else np.zeros((len(points), 0))
-        return Simulations(margins, margins, np.ones(len(points), dtype=np.bool_), sizes, points.mean(1))
+        every = np.ones(len(points), dtype=np.bool_)
+        return Simulations(margins, margins, every, sizes, points.mean(1), every)
 
     def end(self) -> None:
         """End this process, unless enough have ended."""

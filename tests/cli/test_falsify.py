@@ -167,3 +167,19 @@ def test_a_counterexample_of_another_system_is_refused(capsys, tmp_path):
         (tmp_path / "other.json").write_text(json.dumps({**stored, "point": point}))
         assert main(["falsify", "latest", "--replay", str(tmp_path / "other.json")]) == 2
         assert "does not belong to this system" in capsys.readouterr().err
+
+
+def test_drives_that_end_before_a_verdict_are_no_evidence(capsys):
+    args = ["falsify", "latest", "--simulations", "6", "--steps", "4", "--require", "far"]
+    assert main([*args, "--json"]) == 4
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("falsify")) == []
+    (only,) = document["result"]["requirements"]
+    assert (only["verdict"], only["simulations"], only["inconclusive"]) == ("inconclusive", 6, 6)
+    assert (only["least"], only["coverage"]) == ("inf", 0.0)
+    assert main(args) == 4
+    told = capsys.readouterr().out
+    assert "no violation" not in told
+    assert "far: inconclusive\n  6 simulations ended before a verdict: no evidence" in told
+    assert main([*args[:-4], "--require", "far"]) == 0
+    assert "far: no violation in 6 simulations" in capsys.readouterr().out

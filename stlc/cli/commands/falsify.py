@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
+from stlc.cli.check.outcome import INCONCLUSIVE
 from stlc.cli.falsify import findings
 from stlc.cli.framework.assured import (
     FalsifiedRequirement,
@@ -114,9 +115,10 @@ def falsify(
     turns; the numbers of a world are changed where this has an effect. A violation counts only if it remains
     at half the time step. It is written as a trace, simplified as far as it still violates the requirement,
     with a file for --replay. If nothing is found, that is no proof. The same --seed and --batch give the same
-    simulations, whatever processes there are. Of a plant, simulations that fail are written, too. Exit code:
-    1 if a requirement is violated or a simulation fails; else 5 if simulations were lost with their
-    processes, three times each; else 0.
+    simulations, whatever processes there are. Of a plant, simulations that fail are written, too. A
+    simulation that ends before a requirement can be judged is no evidence. Exit code: 1 if a requirement is
+    violated or a simulation fails; else 5 if simulations were lost with their processes, three times each;
+    else 4 if simulations ended before a verdict; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
     from stlc.files import require_folder
@@ -155,7 +157,8 @@ def falsify(
         "lost": 0 if workers is None else workers.lost,
     }
     lost = () if workers is None or not workers.lost else (_lost(workers),)
-    code = MissingError.exit_code if lost else 0
+    code = INCONCLUSIVE if any(each["inconclusive"] for each in found) else 0
+    code = MissingError.exit_code if lost else code
     if document["failures"] or any(each["verdict"] == "violated" for each in found):
         code = 1
 
@@ -337,7 +340,7 @@ def _written(
     from stlc.jsontext import dumps
     from stlc.trace import save_trace
 
-    best = result.shrunk or result.found
+    best, judged = result.shrunk or result.found, result.simulations > result.inconclusive
     path = folder / f"{file_part(result.requirement, empty='requirement')}.json"
     margin = math.nan if best is None else best.margin
     if best is not None:
@@ -362,8 +365,9 @@ def _written(
         write_atomic(path, dumps(stored) + "\n")
     return {
         "name": result.requirement,
-        "verdict": "open" if best is None else "violated",
+        "verdict": "violated" if best is not None else "open" if judged else "inconclusive",
         "simulations": result.simulations,
+        "inconclusive": result.inconclusive,
         "least": result.least,
         "found": None if result.found is None else _violation(result.found),
         "simpler": None if result.shrunk is None else _violation(result.shrunk),
@@ -422,7 +426,8 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
     point = _point(stored, simulator.space.dim, path)
     outcome = simulator.simulate(point[None], Focus(index))
     margin, inside = float(outcome.margins[0]), bool(outcome.admissible[0])
-    violated = inside and margin < -TOLERANCE
+    violated, judged = inside and margin < -TOLERANCE, not inside or bool(outcome.judged[0])
+    verdict: Any = "violated" if violated else "satisfied" if judged else "inconclusive"
     if getattr(simulator, "findings", ()):
         before = {"reason": f"a violation of {stored['requirement']}"}
         return findings.replayed(_plant_of(simulator, path), point, before)
@@ -431,7 +436,7 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
     )
     document: ReplayedCounterexample = {
         "requirement": stored["requirement"],
-        "verdict": "out of scope" if not inside else "violated" if violated else "satisfied",
+        "verdict": verdict if inside else "out of scope",
         "margin": margin,
         "stored_margin": stored["margin"],
         "identical": not different,
@@ -443,7 +448,7 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
         same = "the trace is the same, bit for bit" if not different else f"different: {', '.join(different)}"
         emit(f"{document['requirement']}: {verdict}, robustness {margin:.6g}; {same}")
 
-    return Answer(document, show, int(violated))
+    return Answer(document, show, int(violated) if judged else INCONCLUSIVE)
 
 
 def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:
@@ -550,14 +555,20 @@ def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:
     lost = len(each["spurious"])
     spurious = f"; {lost} violations vanish at half the time step" if lost else ""
     if found is None:
-        least = float(each["least"])
-        told = "and no trace" if failed and least == math.inf else f"least robustness {least:.4g}"
+        judged, least = each["simulations"] - each["inconclusive"], float(each["least"])
+        ended = "failed, or ended before a verdict" if failed else "ended before a verdict"
+        told = (
+            [f"  {each['inconclusive']:,} simulations {ended}: no evidence"] if each["inconclusive"] else []
+        )
+        if not judged:
+            return [f"{name}: inconclusive{spurious}", *told]
         return [
-            f"{name}: no violation in {each['simulations']:,} simulations, {told}{spurious}",
+            f"{name}: no violation in {judged:,} simulations, least robustness {least:.4g}{spurious}",
             f"  pairwise coverage of the search space {share(each['coverage'])}; this is no proof",
+            *told,
         ]
     half = "" if found["half_step"] is None else f", {float(found['half_step']):.4g} at half the time step"
-    half = half.replace("nan at", "but no trace at")
+    half = half.replace("nan at", "but no verdict at")
     lines = [
         f"{name}: violated, robustness {float(found['margin']):.4g}{half}; simulation "
         f"{found['simulation']:,}, {found['strategy']}{spurious}"

@@ -205,11 +205,15 @@ class Violation(TypedDict):
 
 
 class FalsifiedRequirement(TypedDict):
-    """Search for a violation of one requirement; see `stlc.assurance.falsify.Falsification`."""
+    """Search for a violation of one requirement; see `stlc.assurance.falsify.Falsification`.
+
+    It is inconclusive if no simulation has a verdict.
+    """
 
     name: str
-    verdict: Literal["violated", "open"]
+    verdict: Literal["violated", "open", "inconclusive"]
     simulations: int
+    inconclusive: int
     least: Num
     found: Violation | None
     simpler: Violation | None
@@ -253,7 +257,7 @@ class ReplayedCounterexample(TypedDict):
     """Counterexample that was simulated again, and how it differs from its trace."""
 
     requirement: str
-    verdict: Literal["violated", "satisfied", "out of scope"]
+    verdict: Literal["violated", "satisfied", "inconclusive", "out of scope"]
     margin: Num
     stored_margin: Num
     identical: bool
