@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.diagnostics import SystemFileError
+from stlc.diagnostics import SystemFileError, UsageError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import load_system_decl, parse_system
+from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
+from stlc.dynamics.scenarios.scenario import under
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -148,6 +150,84 @@ def test_a_file_may_say_which_constants_are_uncertain() -> None:
         PerturbedSystem(loose, factors).step(x, u), other.step(x, u), rtol=1e-12, atol=1e-12
     )
     assert perturbable(spring(SYSTEM + "test: {uncertain: []}\n")).numbers == ()
+
+
+ROOM = """\
+stlc: 1
+name: room
+time: {dt: 0.1 s, horizon: 4 steps}
+const: {gain: 0.5, cold: 2, more: 2 * gain, idle: 4, none: 0, wall: 2, mild: 20 degC}
+state: {x: {range: [-wall, wall]}, y: {range: [-5, 5], clamp: true}, warm: {bool: true}}
+table: {heat: {of: [z], at: [0, 1, wall], values: [1.5, gain, 0]}}
+held:
+  sum: {value: "clip(prev(sum) + 0.25 * x, -1, 1)", before: cold}
+  on: {bool: true, value: x > 0.5 * wall}
+delay: {late: {of: 3 * x, by: 5 steps}, pipe: {of: y, by: 0.2 s * gain, at_most: 4 steps, before: 7}}
+flow: {x: "heat(y) - sum", y: "late + pipe * more + none * x"}
+init: {mixture: [{draw: {x: "uniform(-1, 1)", y: 0, warm: true}}]}
+"""
+
+
+def room(end: str = "") -> SystemDecl:
+    return parse_system(Source("room.yaml", ROOM + end), Path("room.yaml"))
+
+
+def test_numbers_of_tables_held_values_and_delays_are_uncertain() -> None:
+    loose = perturbable(room())
+    assert [each.text for each in loose.numbers] == ["cold", "gain", "more", "none", "1.5", "3", "0.2 s", "7"]
+    assert loose.exact == ("wall",)
+    assert [each.name for each in loose.started if "?cold" in names_in(each.value)] == ["sum"]
+
+
+def test_constants_that_are_computed_from_an_uncertain_one_change_with_it() -> None:
+    loose = perturbable(room("test: {uncertain: [gain]}\n"))
+    (gain,) = loose.numbers
+    assert {"x", "y"} <= set(gain.states)
+    factors = torch.full((50, 1), 1.1, dtype=torch.float64)
+    other = parse_system(Source("room.yaml", ROOM.replace("gain: 0.5", "gain: 0.55")), Path("room.yaml"))
+    x, u = System(other).sample(50, seed=0, dtype=torch.float64), torch.zeros(50, 0, dtype=torch.float64)
+    right, wrong = System(other).step(x, u), PerturbedSystem(loose, factors).step(x, u)
+    torch.testing.assert_close(wrong, right, rtol=1e-12, atol=1e-12)
+
+
+def test_the_start_of_held_values_has_the_errors_of_the_agents() -> None:
+    loose = perturbable(room("test: {uncertain: [cold]}\n"))
+    factors = torch.tensor([[1.0], [0.3]], dtype=torch.float64)
+    system = PerturbedSystem(loose, factors)
+    x = system.sample(2, seed=0, dtype=torch.float64)
+    column = system.names.index("sum")
+    torch.testing.assert_close(x[:, column], (2 * factors[:, 0] + 0.25 * x[:, 0]).clamp(-1, 1))
+    second = system.of_agents(torch.tensor([1])).sample(1, seed=0, dtype=torch.float64)
+    assert float(second[0, column]) == pytest.approx(0.6 + 0.25 * float(second[0, 0]))
+    with pytest.raises(UsageError, match="the errors of the 2 agents, and the world draws 3 states"):
+        system.sample(3, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("idle", "nothing that moves reads"), ("none", "is 0"), ("mild", "temperature on a scale")],
+)
+def test_a_listed_constant_that_changes_nothing_is_refused(name: str, why: str) -> None:
+    with pytest.raises(SystemFileError) as caught:
+        perturbable(room(f"test: {{uncertain: [gain, {name}]}}\n"))
+    (found,) = caught.value.diagnostics
+    assert found.code == "S213"
+    assert f"`{name}`" in found.message
+    assert why in found.message
+    assert found.span is not None
+    assert found.span.text == name
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.1, False), (0.2, True)])
+def test_a_fixed_delay_is_refused_if_it_may_be_a_step_longer(share: float, refused: bool) -> None:
+    decl = under(room(f"scenario: {{off: {{errors: {{parameters: {share}}}}}}}\n"), "off")
+    if not refused:
+        assert perturbable(decl).numbers
+        return
+    with pytest.raises(SystemFileError, match="the delay `late` of 5 steps") as caught:
+        perturbable(decl)
+    (found,) = caught.value.diagnostics
+    assert (found.code, found.span and found.span.text) == ("S212", "5 steps")
 
 
 def test_who_is_no_constant_is_not_uncertain() -> None:

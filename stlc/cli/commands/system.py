@@ -112,12 +112,16 @@ def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
 def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
     """Simulate random initial states under random controls for `steps` steps; return the warnings.
 
-    Raises SystemFileError if no initial states can be sampled, or if a simulated state is not finite.
+    Raises SystemFileError if no initial states can be sampled, if a simulated state is not finite, or if the
+    errors of a listed constant cannot be carried (S212) or have no effect (S213).
     """
     import torch
 
     from stlc.dynamics.model.system import System
+    from stlc.dynamics.scenarios.perturbed import perturbable
 
+    if decl.test.uncertain is not None:
+        perturbable(decl)
     system = System(decl)
     warnings = system.probe(_DRAWN, seed=seed)
     low, high = system.control_low, system.control_high

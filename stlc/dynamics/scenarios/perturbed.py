@@ -76,7 +76,7 @@ def perturbable(decl: SystemDecl) -> Perturbable:
     """
     found = sections_of(decl)
     choice = uncertain_numbers(decl, found)
-    texts = {_factor(name): name for name in choice.constants} | choice.literals
+    texts = {**{_factor(name): name for name in choice.constants}, **choice.literals}
     listed = decl.test.uncertain is not None
     motion = _factored_motion(decl, found, choice, texts)
     factored, started = _with_motion(decl, motion, every=listed)
