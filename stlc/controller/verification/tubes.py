@@ -93,7 +93,7 @@ class TubeModel:
         self.uncertain = loose
         self._factors = () if loose is None else tuple(each.factor for each in loose.numbers)
         wrong = system.truth.decl.init.computed if system.truth is not system else ()
-        self._started = tuple(map(Drawing, (() if loose is None else loose.started) or wrong))
+        self._first = tuple(map(Drawing, (() if loose is None else loose.started) or wrong))
         timers = task.compiled.timers
         self._model = _Motion(decl, timers)
         self._truth = _Motion(system.truth.decl if loose is None else loose.decl, timers)
@@ -108,6 +108,11 @@ class TubeModel:
         self._clock = 0.0, (decl.test.steps + decl.horizon) * system.dt
         self._judge = _Judge(task)
         self._safe = [task.rules.index(rule) for rule in task.compiled.safety]
+
+    @property
+    def started(self) -> tuple[str, ...]:
+        """Names of the columns that follow from the others at the start, and depend on the errors there."""
+        return tuple(each.name for each in self._first)
 
     @property
     def exact(self) -> bool:
@@ -180,7 +185,7 @@ class TubeModel:
         symbols = _Symbols(len(x), self._deviations)
         errors = _ErrorForms(self._sizes, self._factors, symbols)
         env = self._start(x, symbols, measured=steps > 0)
-        for column in self._started if steps else ():
+        for column in self._first if steps else ():
             if column.name in start:
                 found = column.value({**env, **errors.factors}, FORMS, symbols.drawn)
                 env[column.name] = _full(found, symbols.batch)
@@ -433,20 +438,21 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in sorted(names))
 
 
-def tube(
-    task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS, start: Collection[str] = ()
-) -> Tube:
+def tube(task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS) -> Tube:
     """Bounds on the states and on the robustness of plans, for all errors of the task's scenario.
+
+    The states may be those at the start of a deployment, or later ones: columns that follow from the others
+    at the start, such as held values, are as given, or as the errors of parameters may have made them.
 
     Args:
         task: specification and system; the system is loaded with a scenario.
         x: measured states, (B, n) or (n,), in the order of `task.system.names`.
         plans: plans in physical units, (B, T, m) or (T, m).
         deviations: standard deviations at which normal noise is bounded.
-        start: names of the columns that are computed with the errors; see `TubeModel.tube`.
 
     Raises:
         UsageError: U101, there are no bounds; see `TubeModel`.
+        SystemFileError: S212, S213; see `TubeModel`.
     """
     states, given = torch.as_tensor(x, dtype=torch.float64), torch.as_tensor(plans, dtype=torch.float64)
     states = states if states.dim() == 2 else states[None]
@@ -455,4 +461,15 @@ def tube(
     if states.shape[1:] != (len(task.system.names),) or given.shape != wanted:
         shape = f"(B, {len(task.system.names)}) and (B, {wanted[1]}, {wanted[2]})"
         raise usage(f"states {tuple(states.shape)} and plans {tuple(given.shape)} are not {shape}")
-    return TubeModel(task, deviations=deviations).tube(states, given, start=start)
+    model = TubeModel(task, deviations=deviations)
+    found = model.tube(states, given)
+    return found if not model.started else _either(found, model.tube(states, given, start=model.started))
+
+
+def _either(one: Tube, other: Tube) -> Tube:
+    """The least tube that contains two others."""
+    states = {
+        name: Intervals(np.minimum(box.low, also.low), np.maximum(box.high, also.high))
+        for (name, box), also in zip(one.states.items(), other.states.values(), strict=True)
+    }
+    return Tube(states, torch.minimum(one.low, other.low), torch.maximum(one.high, other.high))

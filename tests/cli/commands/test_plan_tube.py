@@ -25,7 +25,8 @@ def test_a_guaranteed_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert planned(tmp_path, "--tube", "mismatch-5") == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[2] == "mismatch-5: the plan is guaranteed to satisfy it"
-    assert lines[3].split()[0] == "no_collision"
+    assert lines[3].startswith("  taken as exact, as conditions or limits read them: ")
+    assert lines[4].split()[0] == "no_collision"
     assert lines[-1].startswith("trace ")
 
 

@@ -102,13 +102,13 @@ def differing(seed: int) -> float:
     worlds = Worlds(case.task, ModelWorld, Setting((seed,), agents, case.task.horizon))
     (truth,) = worlds.truths
     assert isinstance(truth, PerturbedSystem)
-    x = worlds.reset()
     numbers = [each.text for each in perturbable(case.task.plain.decl).numbers]
     values = case.plant.values
     ours = [index for index, text in enumerate(numbers) if text in values]
     assert {numbers[index] for index in ours} == set(case.names)
     # literals of the terms that are the same in all plants have no error here
     truth.values[:, [index for index in range(len(numbers)) if index not in ours]] = 1.0
+    x = worlds.reset()
     each = [
         case.plant.rebuilt({numbers[index]: float(truth.values[row, index]) for index in ours})
         for row in range(agents)
