@@ -10,7 +10,7 @@ import torch
 import stlc
 from stlc.controller.options import FINITE, bounds_of
 from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, PlanSearch, plan, planner_named
-from stlc.controller.planning.traces import starts_of, trace_of
+from stlc.controller.planning.traces import following, starts_of, trace_of
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import TraceError, UsageError
 from stlc.monitor.verdict import Monitor
@@ -252,3 +252,27 @@ def test_states_with_other_columns_are_refused() -> None:
     task = stlc.compile(stlc.load("specs/reach_n_avoid.stl"), stlc.System.load("examples/maze.yaml"))
     with pytest.raises(UsageError, match="initial states of"):
         stlc.plan(task, torch.zeros(2))
+
+
+HELD = """\
+stlc: 1
+name: held
+time: {dt: 0.1 s, horizon: 4 steps}
+state: {x: {range: [-5, 5]}}
+control: {u: {range: [-1, 1]}}
+held: {twice: {value: 2 * x}, thrice: {value: twice + x}}
+flow: {x: u - thrice}
+init: {mixture: [{draw: {x: "uniform(-1, 1)"}}]}
+"""
+
+
+def test_columns_that_follow_from_given_states_are_computed_from_them(tmp_path: Path) -> None:
+    path = tmp_path / "held.yaml"
+    path.write_text(HELD)
+    task = stlc.compile(stlc.parse("signal x\nrequire r: always[0, T] x < 4"), stlc.System.load(path))
+    assert task.system.names == ("x", "twice", "thrice")
+    assert starts_of(task, "x=3", 1, 0).tolist() == [[3.0, 6.0, 9.0]]
+    assert starts_of(task, "x=3, twice=1", 1, 0).tolist() == [[3.0, 1.0, 4.0]]
+    assert following(task, "x=3, twice=1") == ("thrice",)
+    assert following(task, "random") == ("twice", "thrice")
+    assert following(task, "recording.npz") == ()

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.guard.certified import Certifier
+from stlc.controller.guard.guard import Guard
 from stlc.controller.planning.traces import RANDOM, following
-from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
+from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.verification.boxes import Box
 from stlc.controller.verification.plans import ProposedPlans
@@ -168,6 +169,37 @@ def unproved(seed: int, count: int) -> list[str]:
         if float(low[row]) > float(task.robustness(torch.stack(whole, 2))[0]) + LOOSE:
             found.append(f"bound of plant {seed}")
     return found
+
+
+class Still(Policy):
+    """Policy whose only plan does nothing."""
+
+    def candidates(self, x0: Tensor) -> Tensor:
+        return torch.zeros((len(x0), 1, self.task.horizon, 1), dtype=x0.dtype)
+
+
+def unguarded(seed: int, count: int) -> list[str]:
+    """Let the guard `certified` decide in rebuilt plants, and follow its plans there to the end.
+
+    Returns the plans whose guaranteed robustness is greater than that in the rebuilt plant.
+    """
+    case, found = Case(seed), []
+    guard, certifier = Guard(case.task, Still(case.task), "certified"), Certifier(case.task)
+    for _ in range(count):
+        other = case.rebuilt()
+        x = other.sample(PLANS, seed=seed, dtype=torch.float64)
+        case.plans = guard.decide(x).plan
+        low = certifier.guaranteed(x, case.plans)
+        safe = case.task.requirement_robustness(case.follow(other, x))[:, :2].amin(1)
+        if bool((low > safe + LOOSE).any()):
+            found.append(f"plan of the guard in plant {seed}")
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1000, 1020))
+def test_plans_of_the_guard_keep_their_guarantee_in_rebuilt_plants(seed: int) -> None:
+    assert unguarded(seed, 3) == []
 
 
 @pytest.mark.parametrize("seed", range(6))
