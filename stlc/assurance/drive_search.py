@@ -207,10 +207,11 @@ def round_of(
     setting = Setting((0,), test.agents, test.steps, test.replan)
     batch = min(max(ROWS // test.agents, 2), ROUND)
     simulator = DriveSimulator(run, "none", setting, batch=batch)
-    kept: list[NDArray[np.float64]] = []
+    kept, ended = list[NDArray[np.float64]](), list[int]()
 
     def seen(recording: DeploymentRecording, margins: NDArray[np.float64]) -> None:
         kept.append(wrong_states(recording, (margins < -TOLERANCE).any(2).reshape(-1), test.replan))
+        ended.append(int(simulator.inconclusive(recording).sum()))
 
     def watch(_step: SimulationStep) -> None:
         if stop():
@@ -226,7 +227,8 @@ def round_of(
     states = torch.from_numpy(np.concatenate(kept))
     states = states[run.task.alive(states)]  # from others, no plan satisfies the specification
     failing = found.failing
-    return SearchRound(states, found.worst(len(found.points)), failing.size, int(failing.sum()))
+    judged = failing.size - sum(ended)
+    return SearchRound(states, found.worst(len(found.points)), judged, int(failing.sum()))
 
 
 def wrong_states(

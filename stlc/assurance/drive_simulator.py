@@ -119,17 +119,18 @@ class DriveSimulator:
         assert recording is not None
         return recording
 
-    def margins(self, recording: DeploymentRecording) -> NDArray[np.float64]:
-        """Least robustness of the agents of each simulation, (count, requirements)."""
-        least: NDArray[np.float64] = self.margins_of_agents(recording).min(1)
-        return least
-
     def margins_of_agents(self, recording: DeploymentRecording) -> NDArray[np.float64]:
         """Robustness of each agent of each simulation, (count, agents, requirements).
 
         It is +inf where the assumptions of the specification do not hold: nothing is violated there.
         """
         return self._margins_of_agents(self._verdict(recording))
+
+    def inconclusive(self, recording: DeploymentRecording) -> NDArray[np.bool_]:
+        """True for the agents of each simulation whose drive ended before its verdict, (count, agents)."""
+        found = np.array(self._verdict(recording).statuses) == "inconclusive"
+        each: NDArray[np.bool_] = found.reshape(-1, self.setting.agents)
+        return each
 
     def _margins_of_agents(self, verdict: Verdict) -> NDArray[np.float64]:
         inside = _inside(verdict)

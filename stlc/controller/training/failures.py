@@ -50,7 +50,7 @@ class SearchRound:
     Attributes:
         states: states at which the policy planned wrongly in drives, (k, n) float64.
         points: points of all simulations, the least robust first, (simulations, dim).
-        drives: number of drives.
+        drives: number of drives with a verdict.
         failing: number of drives that violated a requirement.
     """
 

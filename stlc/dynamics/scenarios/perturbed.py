@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -24,7 +26,8 @@ from stlc.dynamics.model.algebra import multiply, names_in
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.uncertain import NumbersInUse, UncertainNumbers, uncertain_numbers
 from stlc.dynamics.schema.names import Names, NumberChanges, base_name, each_number
-from stlc.dynamics.schema.yaml_nodes import Mapping, Sequence
+from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.schema.yaml_nodes import Sequence
 from stlc.source import Span
 
 if TYPE_CHECKING:
@@ -79,21 +82,19 @@ def perturbable(decl: SystemDecl) -> Perturbable:
     texts = {**{_factor(name): name for name in choice.constants}, **choice.literals}
     listed = decl.test.uncertain is not None
     motion = _factored_motion(decl, found, choice, texts)
-    factored, started = _with_motion(decl, motion, every=listed)
-    numbers = tuple(
-        Uncertain(factor, text, _readers(factored, started, factor)) for factor, text in texts.items()
-    )
+    factored = _with_motion(decl, motion, every=listed)
+    started, readers = factored.init.computed, _readers(factored)
+    numbers = tuple(Uncertain(factor, text, tuple(readers[factor])) for factor, text in texts.items())
     if listed:
         for number in numbers:
-            if not number.states or not any(
-                value for name, (value, _) in decl.constants.items() if base_name(name) == number.text
-            ):
+            worth = [value for name, (value, _) in decl.constants.items() if base_name(name) == number.text]
+            if not number.states or not any(worth):
                 raise _without_effect(number, found, decl)
-    read = frozenset[str]().union(*(names_in(each.value) for each in started))
+    late = any(texts.keys() & names_in(each.value) for each in started)
     return Perturbable(
-        factored,
+        replace(factored, init=decl.init),
         tuple(each for each in numbers if each.states),
-        started if read & texts.keys() else (),
+        started if late else (),
         choice.exact,
     )
 
@@ -118,11 +119,8 @@ def _factored_motion(
     return motion_of(found, decl, names)
 
 
-def _with_motion(decl: SystemDecl, motion: Motion, *, every: bool) -> tuple[SystemDecl, tuple[Assign, ...]]:
-    """Return the declaration with another motion, and the values at the start that go with it.
-
-    Unless `every`, only the motion of real columns is taken.
-    """
+def _with_motion(decl: SystemDecl, motion: Motion, *, every: bool) -> SystemDecl:
+    """Return the declaration with another motion; unless `every`, only that of real columns is taken."""
     taken = {column.name for column in decl.signature.columns if every or column.kind == "real"}
 
     def replaced(assigns: tuple[Assign, ...], others: tuple[Assign, ...]) -> tuple[Assign, ...]:
@@ -133,23 +131,30 @@ def _with_motion(decl: SystemDecl, motion: Motion, *, every: bool) -> tuple[Syst
         replace(jump, guard=other.guard, resets=replaced(jump.resets, other.resets))
         for jump, other in zip(decl.jumps, motion.jumps, strict=True)
     )
-    flow = replaced(decl.flow, (*motion.flow, *motion.sampled.flow))
-    factored = replace(decl, flow=flow, jumps=jumps, updates=replaced(decl.updates, motion.updates))
-    return factored, replaced(decl.init.computed, motion.initial)
+    return replace(
+        decl,
+        flow=replaced(decl.flow, (*motion.flow, *motion.sampled.flow)),
+        jumps=jumps,
+        updates=replaced(decl.updates, motion.updates),
+        init=replace(decl.init, computed=replaced(decl.init.computed, motion.initial)),
+    )
 
 
-def _readers(decl: SystemDecl, started: tuple[Assign, ...], factor: str) -> tuple[str, ...]:
-    """Return the names of the states whose next value, or value at the start, depends on a factor.
+def _readers(decl: SystemDecl) -> Mapping[str, dict[str, None]]:
+    """Return the names of the states whose next value, or value at the start, depends on a column.
 
-    Either an assignment of such a state reads the column `factor`, or a jump that sets the state reads it, in
-    its guard or its reset.
+    Either an assignment of such a state reads the column, or a jump that sets the state reads it, in its
+    guard or its reset.
     """
-    assigns = (*decl.flow, *decl.updates, *started)
-    found = [assign.name for assign in assigns if factor in names_in(assign.value)]
+    found: defaultdict[str, dict[str, None]] = defaultdict(dict)
+    read = [(each.name, names_in(each.value)) for each in (*decl.flow, *decl.updates, *decl.init.computed)]
     for jump in decl.jumps:
-        guarded = factor in names_in(jump.guard)
-        found += [each.name for each in jump.resets if guarded or factor in names_in(each.value)]
-    return tuple(dict.fromkeys(map(base_name, found)))
+        guard = names_in(jump.guard)
+        read += [(each.name, guard | names_in(each.value)) for each in jump.resets]
+    for name, columns in read:
+        for column in columns:
+            found[column][base_name(name)] = None
+    return found
 
 
 def _without_effect(number: Uncertain, found: SystemKeys, decl: SystemDecl) -> SystemFileError:
@@ -166,7 +171,7 @@ def _without_effect(number: Uncertain, found: SystemKeys, decl: SystemDecl) -> S
 
 def _item(found: SystemKeys, name: str) -> Span | None:
     """Source location of a name in the list `uncertain`."""
-    node = found.test.get("uncertain") if isinstance(found.test, Mapping) else None
+    node = found.test.get("uncertain") if isinstance(found.test, MappingNode) else None
     items = node.items if isinstance(node, Sequence) else ()
     return next((item.span for item in items if getattr(item, "text", "") == name), None)
 
