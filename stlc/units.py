@@ -21,6 +21,7 @@ _NONE: Dims = (0, 0, 0, 0, 0)
 _FACTOR = re.compile(r"(?P<symbol>[A-Za-zµ°Ω]+|%|1)(?:\^?(?P<power>[+-]?\d+)|(?P<raised>⁻?[¹²³⁴]))?")
 _RAISED = str.maketrans("⁻¹²³⁴", "-1234")
 _MAX_POWER = 99
+_BLANKS = " \t\r\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +165,7 @@ def parse_unit(text: str) -> Unit:
     Raises:
         ValueError: the text is not a unit; the message has the reason.
     """
-    cleaned = text.strip()
+    cleaned = text.strip(_BLANKS)
     if not cleaned:
         raise ValueError("an empty unit")
     dims, ratio = _NONE, Fraction(1)
@@ -191,7 +192,7 @@ def written_unit(text: str) -> Unit:
 
 _QUANTITY = re.compile(
     r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)"
-    r"(\s*(?P<unit>[^\d\s.].*)|\s+(?P<per>1(/.*)?))?"  # such as `2 1/s`
+    r"([ \t\r\n]*(?P<unit>[^\d\s.].*)|[ \t\r\n]+(?P<per>1(/.*)?))?"  # such as `2 1/s`
 )
 
 
@@ -251,12 +252,12 @@ def _factors(text: str) -> list[tuple[str, int]]:
             raise ValueError(f"`{text}` is not a unit")
         raised = (match["raised"] or "").translate(_RAISED)
         factors.append((match["symbol"], sign * int(match["power"] or raised or 1)))
-        rest = text[match.end() :].lstrip()
+        rest = text[match.end() :].lstrip(_BLANKS)
         if not rest:
             return factors
         sign = -1 if rest[0] == "/" else 1
         tail = rest[1:] if rest[0] in "/*·." else rest
-        position = len(text) - len(tail.lstrip())
+        position = len(text) - len(tail.lstrip(_BLANKS))
 
 
 def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:

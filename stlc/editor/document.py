@@ -173,7 +173,7 @@ def analyse(source: Source, systems: Systems) -> Document:
 
 
 _ROUNDS = 8
-_INK = re.compile(r"[^\r\n]")
+_INK = re.compile(r"[^\n]")
 
 
 def read(source: Source) -> tuple[ast.Spec, tuple[Diagnostic, ...]]:

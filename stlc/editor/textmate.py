@@ -52,24 +52,25 @@ def _repository() -> dict[str, Any]:
         "string": _of("string.quoted.double", r'"[^"\n]*"'),
         "declaration": {"patterns": _declarations()},
         "pragma": {"patterns": _pragmas()},
-        "tag": _of("storage.modifier.tag", r"(?<!\w)@\s*[A-Za-z_]\w*"),
+        "tag": _of("storage.modifier.tag", rf"(?<!\w)@{_S}*[A-Za-z_]\w*"),
         "quoted": _of("variable.other", r"`[^`\n]+`"),
         "temporal": _of("keyword.operator.temporal", rf"\b{_any(_TEMPORAL)}_?(?!\w)"),
-        "role": _of("storage.modifier.role", rf"\b{_any(ROLES)}(?=\s+signal\b)"),
+        "role": _of("storage.modifier.role", rf"\b{_any(ROLES)}(?={_S}+signal\b)"),
         "constant": _of("constant.language", _words(_CONSTANTS)),
         "time": _of("variable.language", _words(BUILT_IN)),
         "keyword": _of("keyword.operator.word", _words(_WORDS)),
         "number": _numbers(),
-        "unit": _captures(rf"(\[)\s*({_unit()}|[%1])\s*(\])", {"2": "keyword.other.unit"}),
-        "region": _of("support.class.region", rf"{_words(REGIONS)}(?=\s*\()"),
+        "unit": _captures(rf"(\[){_S}*({_unit()}|[%1]){_S}*(\])", {"2": "keyword.other.unit"}),
+        "region": _of("support.class.region", rf"{_words(REGIONS)}(?={_S}*\()"),
         "function": _of(
-            "support.function", rf"{_words({*callable_names(), *FUNCTIONS} - {*REGIONS})}(?=\s*\()"
+            "support.function", rf"{_words({*callable_names(), *FUNCTIONS} - {*REGIONS})}(?={_S}*\()"
         ),
-        "type": _captures(rf"(:|->)\s*({_any(_TYPES)})\b", {"2": "support.type"}),
+        "type": _captures(rf"(:|->){_S}*({_any(_TYPES)})\b", {"2": "support.type"}),
         "operator": _of("keyword.operator", r"<->|<=>|->|=>|<=|>=|==|!=|\.\.|&&?|\|\|?|[-+*/%^<>=!~]"),
     }
 
 
+_S = r"[ \t]"
 _COMMENT = r"(?:#|//).*$"
 
 
@@ -89,11 +90,11 @@ def _declarations() -> list[dict[str, Any]]:
         (rest, "variable.other.declaration"),
     )
     named = [
-        _captures(rf"\b({_any(words)})\s+({_NAME})", {"1": "keyword.declaration", "2": scope})
+        _captures(rf"\b({_any(words)}){_S}+({_NAME})", {"1": "keyword.declaration", "2": scope})
         for words, scope in kinds
     ]
     extern = _captures(
-        rf"\b(extern)\s+(fn)\s+({_NAME})",
+        rf"\b(extern){_S}+(fn){_S}+({_NAME})",
         {"1": "keyword.declaration", "2": "keyword.declaration", "3": "entity.name.function"},
     )
     return [extern, *named, _of("keyword.declaration", _words(DECLARATIONS))]
@@ -104,7 +105,7 @@ def _pragmas() -> list[dict[str, Any]]:
 
     Their first words are keywords only at the start of a line.
     """
-    head = rf"^\s*({_any(PRAGMAS)})\s+"
+    head = rf"^{_S}*({_any(PRAGMAS)}){_S}+"
     return [
         _captures(rf"{head}({_NAME})", {"1": "keyword.control.pragma", "2": "entity.name.type"}),
         _captures(rf"{head}(?=\")", {"1": "keyword.control.pragma"}),
@@ -114,9 +115,9 @@ def _pragmas() -> list[dict[str, Any]]:
 def _numbers() -> dict[str, Any]:
     """Pattern for a number with its unit; a `%` before an operand is the modulo operator, not a unit."""
     number = r"(?:\d[\d_]*\.(?!\.)\d*|\.\d+|\d[\d_]*)(?:[eE][+-]?\d+)?"
-    percent = rf"%(?!\s*(?!{PATTERNS['AFTER_PERCENT']}\b)[\w(.`])"
+    percent = rf"%(?!{_S}*(?!{PATTERNS['AFTER_PERCENT']}\b)[\w(.`])"
     return _captures(
-        rf"(?<![\w.])({number})(?:\s*(steps?\b|{percent}|{_unit()}(?!\w)))?",
+        rf"(?<![\w.])({number})(?:{_S}*(steps?\b|{percent}|{_unit()}(?!\w)))?",
         {"1": "constant.numeric", "2": "keyword.other.unit"},
     )
 

@@ -12,13 +12,21 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
+from stlc.grammar.words import (
+    BINARY_TEMPORAL,
+    DECLARATIONS,
+    PRAGMAS,
+    RESERVED,
+    ROLES,
+    SPACE,
+    UNARY_TEMPORAL,
+)
 
 LexemeKind = Literal["word", "quoted", "number", "string", "sign"]
 
 _LEXEME = re.compile(
-    r"""
-    \s+ | (?:\#|//)[^\n]*
+    rf"""
+    {SPACE}+ | (?:\#|//)[^\n]*
     | (?P<string>"[^"\n]*")
     | (?P<quoted>`[^`\n]+`)
     | (?P<word>[^\W\d¹²³⁰⁴-⁹][^\W¹²³⁰⁴-⁹]*)

@@ -139,7 +139,10 @@ UNIT_NAMES = MappingProxyType(
 )
 """Unit written out -> its symbol in the language."""
 
-_BLANK = r"(?:\s|(?:#|\/\/)[^\n]*(?:\n|\Z))"
+SPACE = r"[ \t\r\n]"
+"""Pattern of a blank. `stlc.grammar.errors.unicode` refuses every other blank, and CR outside of CRLF."""
+
+_BLANK = rf"(?:{SPACE}|(?:#|\/\/)[^\n]*(?:\n|\Z))"
 
 
 def _choice(words: Iterable[str]) -> str:
@@ -148,6 +151,7 @@ def _choice(words: Iterable[str]) -> str:
 
 PATTERNS = MappingProxyType(
     {
+        "SPACE": SPACE,
         "BLANK": _BLANK,
         "UNARY": _choice(UNARY_TEMPORAL),
         "BINARY": _choice(BINARY_TEMPORAL),

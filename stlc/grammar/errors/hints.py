@@ -19,7 +19,7 @@ from stlc.grammar.errors.expected import (
     wrong_name,
 )
 from stlc.grammar.errors.failure import ParseFailure, Piece
-from stlc.grammar.errors.unicode import apart, replacement, unexpected_character
+from stlc.grammar.errors.unicode import apart, named, replacement, unexpected_character
 from stlc.grammar.scan import Bracket, Lexeme, brackets, opens_interval
 from stlc.grammar.words import BINARY_TEMPORAL
 from stlc.source import Span
@@ -69,8 +69,7 @@ def _character(failure: ParseFailure) -> Diagnostic | None:
         return None
     char = found.text[0]
     span = failure.piece.source.span(found.start, found.start + 1)
-    named = f"`{char}`" if char.isprintable() else f"U+{ord(char):04X} (invisible)"
-    message = f"unexpected character {named}"
+    message = f"unexpected character {named(char)}"
     advice = replacement(char)
     if advice is None or advice.text is None:
         return Diagnostic("E001", message, span, help=() if advice is None else (advice.help,))

@@ -1,13 +1,22 @@
 # ruff: noqa: RUF001 - this module lists such characters
-"""Replacements for mathematical and typographic characters, such as `□`, `≤` and curved quotes."""
+"""Characters that are not of the language, and what to write instead.
+
+Mathematical and typographic characters, such as `□`, `≤` and curved quotes, have a spelling. Blanks are
+space, tab, LF and CRLF. Other controls and the marks of bidirectional text are refused even in comments and
+texts, since an editor would show another text than the one that is parsed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+import unicodedata
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar.scan import Lexeme, lexemes
+from stlc.source import Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +69,12 @@ _ADVICE: Mapping[str, Replacement] = MappingProxyType(
         "∩": Replacement("write `intersect(a, b)`"),
     }
 )
+_SPACES = frozenset("\xa0\u1680\u202f\u205f\u3000" + "".join(map(chr, range(0x2000, 0x200B))))
+_BREAKS = frozenset("\r\x85\u2028\u2029")
+_UNSEEN = re.compile(
+    rf"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069{''.join(_SPACES)}]"
+    r"|\r(?!\n)"
+)
 _OF_THE_LANGUAGE = frozenset("()[]{}.,:;=<>!&|+-*/%^~@#")
 
 
@@ -86,17 +101,59 @@ def apart(word: str, text: str, at: int) -> str:
     return f"{before}{word}{behind}"
 
 
+def _unseen(text: str, start: int, end: int) -> Iterator[tuple[int, str | None]]:
+    """Yield (offset, replacement) of the foreign blanks and controls between two offsets.
+
+    The replacement is None within texts in quotes and names in backticks, where it would change a name.
+    Spaces such as the no-break space are allowed there, and in comments.
+    """
+    places = [match.start() for match in _UNSEEN.finditer(text, start, end)]
+    if not places:
+        return
+    signs: set[int] = set()
+    quoted: set[int] = set()
+    for lexeme in lexemes(text, start, end):
+        where = quoted if lexeme.kind in ("quoted", "string") else signs
+        where.update(range(lexeme.start, lexeme.end))
+    for at in places:
+        if text[at] not in _SPACES:
+            blank = "\n" if text[at] in _BREAKS else " " if text[at] in "\v\f" else ""
+            yield at, None if at in quoted else blank
+        elif at in signs:
+            yield at, " "
+
+
+def unseen_characters(source: Source, start: int, end: int) -> Iterator[Diagnostic]:
+    """Yield E001 for each blank or control character between two offsets that is not of the language."""
+    for at, blank in _unseen(source.text, start, end):
+        span = source.span(at, at + 1)
+        message = f"unexpected character {named(source.text[at])}"
+        help_ = ("blanks are space, tab and line breaks (LF or CRLF)",)
+        yield Diagnostic(
+            "E001", message, span, help=help_, fix=None if blank is None else Fix(((span, blank),))
+        )
+
+
+def named(char: str) -> str:
+    """Return a character for a message: itself, or its number and name if it is not visible."""
+    if char.isprintable():
+        return f"`{char}`"
+    return f"U+{ord(char):04X} ({unicodedata.name(char, 'control character').lower()})"
+
+
 def plain_text(text: str) -> str:
-    """Return the text with symbols such as `□`, `≤`, `∧` spelled in the language.
+    """Return the text with symbols such as `□`, `≤`, `∧` spelled in the language, and with its blanks only.
 
     Symbols in comments, strings and quoted names are kept.
     """
-    parts: list[str] = []
-    done = 0
+    edits = [(at, blank) for at, blank in _unseen(text, 0, len(text)) if blank is not None]
     for lexeme in lexemes(text):
         advice = replacement(lexeme.text[0]) if unexpected_character(lexeme) else None
-        if advice is None or advice.text is None:
-            continue
-        parts += [text[done : lexeme.start], apart(advice.text, text, lexeme.start)]
-        done = lexeme.start + 1
+        if advice is not None and advice.text is not None:
+            edits.append((lexeme.start, apart(advice.text, text, lexeme.start)))
+    parts: list[str] = []
+    done = 0
+    for at, written in sorted(edits):
+        parts += [text[done:at], written]
+        done = at + 1
     return "".join([*parts, text[done:]])

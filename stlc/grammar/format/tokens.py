@@ -13,7 +13,7 @@ from typing import Literal, TypeAlias
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar.parse.parser import MAX_DEPTH
 from stlc.grammar.parse.tokens import Token
-from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
+from stlc.grammar.words import BINARY_TEMPORAL, SPACE, UNARY_TEMPORAL
 
 Role: TypeAlias = Literal["interval", "call", "index", "group", "list", "enum"]
 
@@ -82,7 +82,7 @@ def spelling(kind: str, text: str) -> str:
     if kind == "OR":
         return "xor" if text == "xor" else "or"
     if kind in ("UNIT_BRACKET", "TYPE_SIZE"):
-        return re.sub(r"\s+", "", text)
+        return re.sub(SPACE, "", text)
     return _SPELLED.get(kind, text)
 
 

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
-from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, UNARY_TEMPORAL, UNIT_NAMES
+from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, SPACE, UNARY_TEMPORAL, UNIT_NAMES
 from stlc.registry import closest
 from stlc.source import Source, Span
 from stlc.units import CELSIUS, SYMBOLS, means_celsius, parse_unit
@@ -84,7 +84,7 @@ def unit_of(context: BuildContext, leaf: TerminalToken | None) -> str:
     """
     if leaf is None:
         return ""
-    text = re.sub(r"\s+", "", leaf.text.strip("[]"))
+    text = re.sub(SPACE, "", leaf.text.strip("[]"))
     if text in ("step", "steps"):
         return "steps"
     try:

@@ -19,6 +19,7 @@ from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
 from stlc.grammar.errors import hints
 from stlc.grammar.errors.failure import Piece
+from stlc.grammar.errors.unicode import unseen_characters
 from stlc.grammar.parse.builder import EXPRESSIONS, BuildContext, BuildRule, TerminalToken
 from stlc.grammar.parse.declarations import DECLARATIONS, Item, assemble
 from stlc.grammar.parse.tables import load_parser
@@ -41,7 +42,7 @@ def parse(source: Source) -> ast.Spec:
     Raises:
         SpecError: the text has errors; of the independent ones, the first `MAX_ERRORS` are reported.
     """
-    _check_size(source, 0, len(source.text))
+    _check_text(source, 0, len(source.text))
     context = BuildContext(source)
     items: list[Item] = []
     starts = declaration_starts(source.text)
@@ -78,7 +79,7 @@ def parse_expr(source: Source, start: int = 0, end: int | None = None) -> ast.Ex
 
 
 def _parsed(source: Source, start: int, end: int) -> ast.Expr:
-    _check_size(source, start, end)
+    _check_text(source, start, end)
     context = BuildContext(source)
     piece = Piece(source, start, end, "expr")
     try:
@@ -100,13 +101,16 @@ class _PieceError(Exception):
         self.finding = finding
 
 
-def _check_size(source: Source, start: int, end: int) -> None:
-    """Raise SpecError (E005) if the text from `start` to `end` is so long that parsing would take minutes."""
+def _check_text(source: Source, start: int, end: int) -> None:
+    """Raise SpecError if the text from `start` to `end` is too long (E005) or has odd blanks (E001)."""
     if end - start > MAX_TEXT:
         raise SpecError(Diagnostic("E005", f"`{source.name}` is larger than {MAX_TEXT // 1_000_000} MB"))
     if any(islice(lexemes(source.text, start, end), MAX_LEXEMES, None)):
         message = f"`{source.name}` has more than {MAX_LEXEMES:,} words and signs"
         raise SpecError(Diagnostic("E005", message))
+    unseen = tuple(islice(unseen_characters(source, start, end), MAX_ERRORS))
+    if unseen:
+        raise SpecError(*unseen)
 
 
 def _build(piece: Piece, context: BuildContext) -> Any:
