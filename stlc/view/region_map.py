@@ -38,6 +38,7 @@ from stlc.view.style import (
     new_figure,
     picture_style,
 )
+from stlc.view.thinning import extremes
 from stlc.view.words import labelled
 
 if TYPE_CHECKING:
@@ -237,7 +238,7 @@ def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
             continue
         strength = max(0.25, 0.9 - 0.01 * len(rows))
         width = 0.7 if across[rows].size < CROWDED else 0.45
-        xs, ys = _joined(across[rows]), _joined(up[rows])
+        xs, ys = _joined(across[rows], up[rows])
         count = int((region_map.violated == violated).sum())
         word = "violated" if violated else "satisfied"
         axes.plot(xs, ys, color=color, lw=width, alpha=strength, zorder=order, label=f"{word} ({count:,})")
@@ -246,12 +247,19 @@ def _draw_paths(axes: Axes, region_map: RegionMap) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, handlelength=1.4, borderpad=0)
 
 
-def _joined(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Concatenate rows with NaN between them.
+def _joined(
+    across: NDArray[np.float64], up: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Concatenate the rows of two coordinates with NaN between them, thinned.
 
     They can then be drawn as one line with gaps, which is faster.
     """
-    return np.hstack([rows, np.full((len(rows), 1), np.nan)]).ravel()
+    kept = [extremes(x, y) for x, y in zip(across, up, strict=True)]
+    xs, ys = (
+        np.concatenate([np.append(row[one], np.nan) for row, one in zip(rows, kept, strict=True)])
+        for rows in (across, up)
+    )
+    return xs, ys
 
 
 def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None:
@@ -267,12 +275,13 @@ def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None
         )
     inside = region_map.inside(region)
     share = inside.mean(0)
-    axes.fill_between(times, share, 0, color=color, alpha=0.35, lw=0, zorder=1)
-    axes.plot(times, share, color=color, lw=1.2, zorder=2)
+    kept = extremes(share)
+    axes.fill_between(times[kept], share[kept], 0, color=color, alpha=0.35, lw=0, zorder=1)
+    axes.plot(times[kept], share[kept], color=color, lw=1.2, zorder=2)
     if region.visited:
         active = region.active(times - region_map.trace.t0)
         so_far = np.logical_or.accumulate(inside & active, axis=1).mean(0)
-        axes.plot(times, so_far, color=color, lw=1, ls=(0, (3, 2)), zorder=2)
+        axes.plot(times[kept], so_far[kept], color=color, lw=1, ls=(0, (3, 2)), zorder=2)
     axes.set(ylim=(-0.04, 1.12), xlim=(times[0], times[-1]))
     axes.set_yticks([0, 1], ["0", "all"])
     axes.grid(visible=False)
@@ -289,7 +298,7 @@ class _MovingAgents:
         across, up = region_map.paths
         self._across, self._up = across[chosen], up[chosen]
         self._tail = max(1, round(TAIL / region_map.trace.dt))
-        axes.plot(_joined(self._across), _joined(self._up), color=MUTED, lw=0.5, alpha=0.25, zorder=3)
+        axes.plot(*_joined(self._across, self._up), color=MUTED, lw=0.5, alpha=0.25, zorder=3)
         (self._recent,) = axes.plot([], [], color=INK, lw=1.1, alpha=0.85, zorder=4)
         colors = [RED if violated else INK for violated in region_map.violated[chosen]]
         self._points = axes.scatter(
@@ -299,7 +308,7 @@ class _MovingAgents:
     def turn(self, index: int) -> None:
         """Move the agents to their positions at sample `index`."""
         recent = slice(max(0, index - self._tail), index + 1)
-        self._recent.set_data(_joined(self._across[:, recent]), _joined(self._up[:, recent]))
+        self._recent.set_data(*_joined(self._across[:, recent], self._up[:, recent]))
         self._points.set_offsets(np.column_stack([self._across[:, index], self._up[:, index]]))
 
 

@@ -31,6 +31,7 @@ from stlc.view.style import (
     new_figure,
     picture_style,
 )
+from stlc.view.thinning import extremes
 from stlc.view.words import labelled
 
 if TYPE_CHECKING:
@@ -115,6 +116,8 @@ def margin_text(rho: float, unit: str = "") -> str:
 def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
     """Draw robustness over time as a step function, blue where positive, red where negative."""
     rho = finite(rho)
+    kept = extremes(rho)
+    times, rho = times[kept], rho[kept]
     fails = rho < -TOLERANCE
     axes.axhline(0, color=MUTED, lw=0.6)
     axes.fill_between(times, rho, 0, where=~fails, step="post", color=BLUE, alpha=0.2, lw=0)
@@ -245,7 +248,9 @@ def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, 
     """
     match kind:
         case "line":
-            axes.plot(trace.times, _broken(trace.data[name][index]), color=INK, lw=1.1)
+            values = _broken(trace.data[name][index])
+            kept = extremes(values)
+            axes.plot(trace.times[kept], values[kept], color=INK, lw=1.1)
         case "strip":
             _draw_discrete(axes, trace, trace.data[name][index], trace.signature[name])
         case "robustness":
@@ -258,25 +263,26 @@ def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, 
         axes.set_ylim(0, 1)
         hide_frame(axes)
     decisions = None if kind == "strip" else decisions_of(trace)
-    for start, stop, source in [] if decisions is None else constant_ranges(decisions[index]):
+    for left, right, source in [] if decisions is None else _stretches(trace, decisions[index]):
         if kind == "decision" or source != POLICY:
             _, color = DECISIONS.get(source, ("", MUTED))
-            left, right = trace.t0 + start * trace.dt, trace.t0 + stop * trace.dt
             axes.axvspan(left, right, color=color, alpha=1 if kind == "decision" else 0.13, lw=0)
 
 
 def _broken(values: Floats) -> Floats:
-    """Return a signal with NaN at its jumps (such as resets).
+    """Return a signal with NaN at its jumps (such as resets), so that no line is drawn across them.
 
-    No line is then drawn across a jump. A signal that changes mainly by large steps is returned unchanged.
+    A single sample far from both its neighbours is no jump, and stays. A signal that changes mainly by large
+    steps is returned unchanged.
     """
     steps = np.abs(np.diff(values))
     moves = steps[steps > 0]
     span = float(np.ptp(values))
     if not len(moves) or np.median(moves) > 0.3 * span:
         return values
+    large = np.pad(steps > 0.4 * span, 1)
     broken = values.copy()
-    broken[1:][steps > 0.4 * span] = np.nan
+    broken[1:][large[1:-1] & ~large[:-2] & ~large[2:]] = np.nan
     return broken
 
 
@@ -285,12 +291,19 @@ def _draw_discrete(axes: Axes, trace: Trace, values: Floats, column: Column) -> 
     labels = {value: label for label, value in column.labels} or {0.0: "", 1.0: "yes"}
     levels = sorted({*labels, *np.unique(values[np.isfinite(values)]).tolist()})
     tints = (FAINT, SKY, MUTED, BLUE, GREEN)
-    for start, stop, value in constant_ranges(values):
-        left, right = trace.times[start], trace.times[stop - 1] + trace.dt
+    for left, right, value in _stretches(trace, values):
         axes.axvspan(left, right, color=tints[levels.index(value) % len(tints)], alpha=0.75, lw=0)
         label = labels.get(value, f"{value:g}")
         if label and (right - left) > 0.08 * trace.dt * trace.samples:
             axes.text((left + right) / 2, 0.5, label, ha="center", va="center", fontsize=7, color=INK)
+
+
+def _stretches(trace: Trace, values: NDArray[Any]) -> Iterator[tuple[float, float, Any]]:
+    """Yield the stretches in which `values`, one a sample, is constant, as (begin, end, value)."""
+    kept = extremes(values.astype(np.float64))
+    edges = np.append(trace.times[kept], trace.times[-1] + trace.dt)
+    for start, stop, value in constant_ranges(values[kept]):
+        yield float(edges[start]), float(edges[stop]), value
 
 
 def constant_ranges(values: NDArray[Any]) -> list[tuple[int, int, Any]]:
