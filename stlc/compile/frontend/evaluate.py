@@ -554,18 +554,18 @@ def _not(expr: ast.Not, scope: Scope) -> Value:
 def _logic(expr: ast.Logic, scope: Scope) -> Value:
     """Return the formula of a logical connective.
 
-    A chain of `and` or `or` becomes one node, without recursion along the chain.
+    A chain of `and` or `or` becomes one node.
     """
-    operands: list[ast.Expr] = [expr.right]
-    left = expr.left
-    while expr.op in ("and", "or") and isinstance(left, ast.Logic) and left.op == expr.op:
-        operands.append(left.right)
-        left = left.left
-    operands.append(left)
+    operands: list[ast.Expr] = []
+    waiting = [expr.right, expr.left]
+    while waiting:
+        item = waiting.pop()
+        if expr.op in ("and", "or") and isinstance(item, ast.Logic) and item.op == expr.op:
+            waiting += [item.right, item.left]
+        else:
+            operands.append(item)
     need = Expectation(f"`{expr.op}`")
-    return typed.Logic(
-        expr.span, expr.op, tuple(formulas([(item, need) for item in reversed(operands)], scope))
-    )
+    return typed.Logic(expr.span, expr.op, tuple(formulas([(item, need) for item in operands], scope)))
 
 
 def _temporal(expr: ast.Temporal, scope: Scope) -> Value:

@@ -13,6 +13,9 @@ from stlc.grammar.scan import Bracket, Lexeme, brackets, lexemes
 from stlc.grammar.words import BINARY_TEMPORAL
 from stlc.source import Source, Span
 
+_REPAIRABLE = 100_000
+"""Characters of the longest part of a text in which repairs are tried."""
+
 
 @dataclass(frozen=True)
 class Piece:
@@ -36,7 +39,12 @@ class Piece:
         return self.source.text[self.start : self.end]
 
     def repaired_by(self, start: int, end: int, replacement: str) -> bool:
-        """True if this part parses with the characters from `start` to `end` replaced by `replacement`."""
+        """True if this part parses with the characters from `start` to `end` replaced by `replacement`.
+
+        No repair is tried in a part that takes long to parse.
+        """
+        if self.end - self.start > _REPAIRABLE:
+            return False
         text = self.text[: start - self.start] + replacement + self.text[end - self.start :]
         return parses(text, self.rule)
 
