@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from types import MappingProxyType
 
-Dims = tuple[int, int, int, int, int]
+Dims = tuple[int, ...]
 
-_BASES = ("m", "kg", "s", "A", "K")
-_NONE: Dims = (0, 0, 0, 0, 0)
-_FACTOR = re.compile(r"(?P<symbol>[A-Za-zµ°Ω]+|%|1)(?:\^?(?P<power>[+-]?\d+)|(?P<raised>⁻?[¹²³⁴]))?")
+_BASES = ("m", "kg", "s", "A", "K", "mol", "cd")
+_NONE: Dims = (0,) * len(_BASES)
+_FACTOR = re.compile(r"(?P<symbol>[A-Za-zµμ°Ω]+|%|1)(?:\^?(?P<power>[+-]?\d+)|(?P<raised>⁻?[¹²³⁴]))?")
 _RAISED = str.maketrans("⁻¹²³⁴", "-1234")
 _MAX_POWER = 99
 _BLANKS = " \t\r\n"
@@ -29,7 +29,7 @@ class Unit:
     """A physical unit; two units are equal if they have the same dimensions, size and zero.
 
     Attributes:
-        dims: exponents of m, kg, s, A and K.
+        dims: exponents of m, kg, s, A, K, mol and cd.
         ratio: size of the unit in SI units, exactly (pi to double precision).
         text: text of the unit in the file; "" if none is declared, but "1" for the declared unit `1`.
         offset: value of the unit's zero in SI units, exactly: 273.15 for `degC`, 0 for units without offset.
@@ -85,7 +85,7 @@ class Unit:
         dims = tuple(exponent * power for exponent in self.dims)
         if any(exponent.denominator != 1 for exponent in dims):
             raise ValueError(f"[{self}] to the power {power} has no unit")
-        whole = _dims(int(exponent) for exponent in dims)
+        whole = tuple(int(exponent) for exponent in dims)
         return Unit(whole, Fraction(self.scale ** float(power)), text=_si_text(whole))
 
     def __str__(self) -> str:
@@ -95,68 +95,69 @@ class Unit:
 DIMENSIONLESS = Unit()
 
 
-def _dims(exponents: Iterable[int]) -> Dims:
-    m, kg, s, amp, kelvin = exponents
-    return (m, kg, s, amp, kelvin)
+PREFIXES: Mapping[str, int] = MappingProxyType(
+    {
+        **{"q": -30, "r": -27, "y": -24, "z": -21, "a": -18, "f": -15, "p": -12, "n": -9, "u": -6, "m": -3},
+        **{"µ": -6, "μ": -6, "c": -2, "d": -1, "da": 1, "h": 2, "k": 3, "M": 6, "G": 9, "T": 12, "P": 15},
+        **{"E": 18, "Z": 21, "Y": 24, "R": 27, "Q": 30},
+    }
+)
+"""SI prefix -> its power of ten; micro is `u`, the micro sign or the Greek letter."""
+
+_DEFINED: Mapping[str, tuple[Fraction | int | str, str]] = {
+    **{"g": ("1/1000", "kg"), "rad": (1, "1"), "sr": (1, "1"), "Hz": (1, "1/s"), "N": (1, "kg*m/s^2")},
+    **{"Nm": (1, "N*m"), "Pa": (1, "N/m^2"), "J": (1, "N*m"), "W": (1, "J/s"), "VA": (1, "J/s")},
+    **{
+        "C": (1, "A*s"),
+        "V": (1, "W/A"),
+        "F": (1, "C/V"),
+        "ohm": (1, "V/A"),
+        "Ω": (1, "V/A"),
+        "S": (1, "A/V"),
+    },
+    **{"Wb": (1, "V*s"), "T": (1, "Wb/m^2"), "H": (1, "Wb/A"), "lm": (1, "cd"), "lx": (1, "lm/m^2")},
+    **{"Bq": (1, "1/s"), "Gy": (1, "J/kg"), "Sv": (1, "J/kg"), "kat": (1, "mol/s"), "l": ("1/1000", "m^3")},
+    **{"L": (1, "l"), "bar": (100_000, "Pa"), "Wh": (3600, "J"), "Ah": (3600, "C")},
+    **{"eV": (Fraction("1.602176634e-19"), "J")},
+}
+"""Unit that takes prefixes -> (size, unit of the size)."""
+
+_PLAIN: Mapping[str, tuple[Fraction | int | str, str]] = {
+    **{"min": (60, "s"), "h": (3600, "s"), "ft": ("381/1250", "m"), "mph": ("1397/3125", "m/s")},
+    **{"lb": ("45359237/100000000", "kg"), "rpm": (Fraction(math.pi) / 30, "1/s"), "%": ("1/100", "1")},
+    **{"deg": (Fraction(math.pi) / 180, "1"), "°": (Fraction(math.pi) / 180, "1")},
+}
+"""Unit without prefixes -> (size, unit of the size)."""
+
+PREFIXED = tuple(sorted({*_BASES, *_DEFINED} - {"kg"}))
+"""Units that take prefixes. `T` is a unit with a prefix only: alone, it is the planning horizon."""
 
 
 def _symbols() -> Mapping[str, Unit]:
-    pi = Fraction(math.pi)
-    table: dict[str, Unit] = {}
-
-    def define(text: str, dims: Dims, ratio: Fraction | int | str = 1) -> None:
-        table[text] = Unit(dims, Fraction(ratio), text)
-
-    def prefixed(text: str, dims: Dims, prefixes: str) -> None:
-        powers = {"": 0, "n": -9, "u": -6, "µ": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9}
-        for prefix in ("", *prefixes):
-            define(prefix + text, dims, Fraction(10) ** powers[prefix])
-
-    for text, dims, prefixes in (
-        ("m", (1, 0, 0, 0, 0), "nuµmck"),
-        ("s", (0, 0, 1, 0, 0), "nuµm"),
-        ("A", (0, 0, 0, 1, 0), "uµmk"),
-        ("K", (0, 0, 0, 0, 1), "m"),
-        ("N", (1, 1, -2, 0, 0), "mkM"),
-        ("Nm", (2, 1, -2, 0, 0), "mk"),
-        ("J", (2, 1, -2, 0, 0), "mkMG"),
-        ("W", (2, 1, -3, 0, 0), "mkMG"),
-        ("Pa", (-1, 1, -2, 0, 0), "kMG"),
-        ("V", (2, 1, -3, -1, 0), "mk"),
-        ("Hz", (0, 0, -1, 0, 0), "kMG"),
-        ("C", (0, 0, 1, 1, 0), "m"),
-        ("ohm", (2, 1, -3, -2, 0), "k"),
-        ("rad", _NONE, "m"),
-    ):
-        prefixed(text, dims, prefixes)
-    for text, dims, ratio in (
-        ("kg", (0, 1, 0, 0, 0), 1),
-        ("g", (0, 1, 0, 0, 0), "1/1000"),
-        ("mg", (0, 1, 0, 0, 0), "1/1000000"),
-        ("min", (0, 0, 1, 0, 0), 60),
-        ("h", (0, 0, 1, 0, 0), 3600),
-        ("bar", (-1, 1, -2, 0, 0), 100_000),
-        ("Ah", (0, 0, 1, 1, 0), 3600),
-        ("Wh", (2, 1, -2, 0, 0), 3600),
-        ("kWh", (2, 1, -2, 0, 0), 3_600_000),
-        ("l", (3, 0, 0, 0, 0), "1/1000"),
-        ("ft", (1, 0, 0, 0, 0), "381/1250"),
-        ("mph", (1, 0, -1, 0, 0), "1397/3125"),
-        ("lb", (0, 1, 0, 0, 0), "45359237/100000000"),
-        ("deg", _NONE, pi / 180),
-        ("°", _NONE, pi / 180),
-        ("rpm", (0, 0, -1, 0, 0), pi / 30),
-        ("%", _NONE, "1/100"),
-        ("1", _NONE, 1),
-    ):
-        define(text, dims, ratio)
-    table["Ω"] = table["ohm"]
-    table["degC"] = Unit((0, 0, 0, 0, 1), Fraction(1), "degC", Fraction("273.15"))
+    table = {"1": Unit(text="1")}
+    for index, text in enumerate(_BASES):
+        table[text] = Unit(tuple(int(index == other) for other in range(len(_BASES))), text=text)
+    for text, (size, of) in {**_DEFINED, **_PLAIN}.items():
+        dims, ratio = _combined(_factors(of), table)
+        table[text] = Unit(dims, Fraction(size) * ratio, text)
+    for text in PREFIXED:
+        for prefix, power in PREFIXES.items():
+            whole = prefix + text
+            table.setdefault(whole, Unit(table[text].dims, table[text].ratio * Fraction(10) ** power, whole))
+    del table["T"]
+    table["degC"] = Unit(table["K"].dims, Fraction(1), "degC", Fraction("273.15"))
     table["°C"] = replace(table["degC"], text="°C")
     return MappingProxyType(table)
 
 
-SYMBOLS = _symbols()
+def _combined(factors: Iterable[tuple[str, int]], symbols: Mapping[str, Unit]) -> tuple[Dims, Fraction]:
+    """Return dimensions and size of a product of powers of known units, given as pairs (symbol, power)."""
+    dims, ratio = _NONE, Fraction(1)
+    for symbol, power in factors:
+        unit = symbols[symbol]
+        dims = tuple(a + b * power for a, b in zip(dims, unit.dims, strict=True))
+        ratio *= unit.ratio**power
+    return dims, ratio
 
 
 def parse_unit(text: str) -> Unit:
@@ -168,7 +169,6 @@ def parse_unit(text: str) -> Unit:
     cleaned = text.strip(_BLANKS)
     if not cleaned:
         raise ValueError("an empty unit")
-    dims, ratio = _NONE, Fraction(1)
     factors = _factors(cleaned)
     for symbol, power in factors:
         unit = SYMBOLS.get(symbol)
@@ -180,9 +180,7 @@ def parse_unit(text: str) -> Unit:
             raise ValueError(f"`{symbol}` has a zero of its own and stands alone: {_in_kelvin(factors)}")
         if abs(power) > _MAX_POWER:
             raise ValueError(f"the power {power} of `{symbol}` is too large")
-        dims = _dims(a + b * power for a, b in zip(dims, unit.dims, strict=True))
-        ratio *= unit.ratio**power
-    return Unit(dims, ratio, cleaned)
+    return Unit(*_combined(factors, SYMBOLS), cleaned)
 
 
 def written_unit(text: str) -> Unit:
@@ -279,7 +277,7 @@ def _product(parts: Iterable[tuple[Unit, int]]) -> Unit:
     powers: dict[str, int] = {}
     parts = [(unit.interval, power) for unit, power in parts]
     for unit, power in parts:
-        dims = _dims(a + b * power for a, b in zip(dims, unit.dims, strict=True))
+        dims = tuple(a + b * power for a, b in zip(dims, unit.dims, strict=True))
         ratio *= unit.ratio**power
         for symbol, exponent in _factors(unit.text) if unit.text else ():
             powers[symbol] = powers.get(symbol, 0) + exponent * power
@@ -299,3 +297,7 @@ def _text(powers: Mapping[str, int]) -> str:
     above = [written(s, p) for s, p in powers.items() if p > 0 and s != "1"]
     below = [written(s, -p) for s, p in powers.items() if p < 0 and s != "1"]
     return "/".join(["*".join(above) or "1", *below])
+
+
+SYMBOLS = _symbols()
+"""Symbol -> unit, with all prefixes."""

@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_quantity, parse_unit, same_dims
+from stlc.units import (
+    DIMENSIONLESS,
+    PREFIXED,
+    PREFIXES,
+    SYMBOLS,
+    Unit,
+    means_celsius,
+    parse_quantity,
+    parse_unit,
+    same_dims,
+)
 
 _PRODUCTS = sorted(symbol for symbol, unit in SYMBOLS.items() if not unit.offset)
 _factors = st.lists(st.tuples(st.sampled_from(_PRODUCTS), st.integers(-3, 3)), min_size=1, max_size=3)
@@ -23,30 +33,62 @@ units = _factors.map(_text).map(parse_unit)
 @pytest.mark.parametrize(
     ("text", "dims", "ratio"),
     [
-        ("m", (1, 0, 0, 0, 0), 1),
-        ("m/s^2", (1, 0, -2, 0, 0), 1),
-        ("m/s/s", (1, 0, -2, 0, 0), 1),
-        ("m/s²", (1, 0, -2, 0, 0), 1),
-        ("m s^-2", (1, 0, -2, 0, 0), 1),
-        ("kg*m", (1, 1, 0, 0, 0), 1),
-        ("1/s", (0, 0, -1, 0, 0), 1),
-        ("1", (0, 0, 0, 0, 0), 1),
-        ("Hz", (0, 0, -1, 0, 0), 1),
-        ("N", (1, 1, -2, 0, 0), 1),
-        ("Nm", (2, 1, -2, 0, 0), 1),
-        ("W", (2, 1, -3, 0, 0), 1),
-        ("km/h", (1, 0, -1, 0, 0), Fraction(5, 18)),
-        ("ms", (0, 0, 1, 0, 0), Fraction(1, 1000)),
-        ("min", (0, 0, 1, 0, 0), 60),
-        ("%", (0, 0, 0, 0, 0), Fraction(1, 100)),
-        ("mrad", (0, 0, 0, 0, 0), Fraction(1, 1000)),
-        ("kPa", (-1, 1, -2, 0, 0), 1000),
-        ("m/rad", (1, 0, 0, 0, 0), 1),
+        ("m", (1, 0, 0, 0, 0, 0, 0), 1),
+        ("m/s^2", (1, 0, -2, 0, 0, 0, 0), 1),
+        ("m/s/s", (1, 0, -2, 0, 0, 0, 0), 1),
+        ("m/s²", (1, 0, -2, 0, 0, 0, 0), 1),
+        ("m s^-2", (1, 0, -2, 0, 0, 0, 0), 1),
+        ("kg*m", (1, 1, 0, 0, 0, 0, 0), 1),
+        ("1/s", (0, 0, -1, 0, 0, 0, 0), 1),
+        ("1", (0, 0, 0, 0, 0, 0, 0), 1),
+        ("Hz", (0, 0, -1, 0, 0, 0, 0), 1),
+        ("N", (1, 1, -2, 0, 0, 0, 0), 1),
+        ("Nm", (2, 1, -2, 0, 0, 0, 0), 1),
+        ("W", (2, 1, -3, 0, 0, 0, 0), 1),
+        ("km/h", (1, 0, -1, 0, 0, 0, 0), Fraction(5, 18)),
+        ("ms", (0, 0, 1, 0, 0, 0, 0), Fraction(1, 1000)),
+        ("min", (0, 0, 1, 0, 0, 0, 0), 60),
+        ("%", (0, 0, 0, 0, 0, 0, 0), Fraction(1, 100)),
+        ("mrad", (0, 0, 0, 0, 0, 0, 0), Fraction(1, 1000)),
+        ("kPa", (-1, 1, -2, 0, 0, 0, 0), 1000),
+        ("m/rad", (1, 0, 0, 0, 0, 0, 0), 1),
     ],
 )
 def test_reads_what_people_write(text: str, dims: tuple[int, ...], ratio: Fraction | int) -> None:
     assert parse_unit(text) == Unit(dims, Fraction(ratio))  # type: ignore[arg-type]
     assert parse_unit(text).text == text
+
+
+@pytest.mark.parametrize("unit", PREFIXED)
+def test_every_prefix_scales_every_unit(unit: str) -> None:
+    one = parse_unit(f"m{unit}").ratio * 1000
+    for prefix, power in PREFIXES.items():
+        found = parse_unit(prefix + unit)
+        assert found.ratio == one * Fraction(10) ** power
+        assert found.dims == parse_unit(f"k{unit}").dims
+
+
+def test_no_two_units_share_a_spelling() -> None:
+    spelled = [prefix + unit for unit in PREFIXED for prefix in ("", *PREFIXES)]
+    plain = ["min", "h", "ft", "mph", "lb", "rpm", "deg", "°", "degC", "°C", "%", "1"]
+    assert len({*spelled, *plain}) == len([*spelled, *plain])
+    assert {*spelled, *plain, "kg"} - {"T"} == SYMBOLS.keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "product"),
+    [
+        ("MNm", "1000000 kg*m^2/s^2"), ("MV", "1000000 kg*m^2/s^3/A"), ("MA", "1000000 A"), ("kK", "1000 K"),
+        ("Mohm", "1000000 kg*m^2/s^3/A^2"), ("GN", "1000000000 kg*m/s^2"), ("hPa", "100 kg/m/s^2"),
+        ("mbar", "100 kg/m/s^2"), ("MWh", "3600000000 kg*m^2/s^2"), ("kΩ", "1000 kg*m^2/s^3/A^2"),
+        ("mT", "0.001 kg/s^2/A"), ("uF", "0.000001 A^2*s^4/kg/m^2"), ("μH", "0.000001 kg*m^2/s^2/A^2"),
+        ("lx", "1 cd/m^2"), ("kat", "1 mol/s"), ("dam", "10 m"), ("dal", "0.01 m^3"), ("mSv", "0.001 m^2/s^2"),
+    ],
+)  # fmt: skip
+def test_prefixed_units(text: str, product: str) -> None:
+    number, base = product.split()
+    assert parse_unit(text).ratio == Fraction(number) * parse_unit(base).ratio
+    assert same_dims(parse_unit(text), parse_unit(base))
 
 
 def test_degrees_and_revolutions() -> None:

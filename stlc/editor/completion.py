@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -22,7 +22,7 @@ from stlc.grammar.parse.tables import acceptable
 from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.grammar.show.printer import own_name
 from stlc.grammar.words import BINARY_TEMPORAL, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
-from stlc.units import SYMBOLS
+from stlc.units import PREFIXED, SYMBOLS
 
 OfferKind: TypeAlias = Literal[
     "Keyword", "Function", "Unit", "Property", "Class", "Variable", "Constant", "Reference", "EnumMember"
@@ -222,6 +222,7 @@ def _shared(document: Document, alias: str) -> Iterator[Offer]:
 
 
 def _units() -> Iterator[Offer]:
-    rest: Iterable[str] = (unit for unit in SYMBOLS if unit not in _FIRST_UNITS)
+    usual = {prefix + unit for prefix in ("", *"numkM") for unit in PREFIXED}
+    rest = (unit for unit in SYMBOLS if unit in usual and unit not in _FIRST_UNITS)
     yield from (Offer(unit, "Unit", order=1) for unit in _FIRST_UNITS)
     yield from (Offer(unit, "Unit", order=8) for unit in rest)

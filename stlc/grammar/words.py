@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from stlc.units import SYMBOLS
+from stlc.units import PREFIXED, PREFIXES, SYMBOLS
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +149,14 @@ def _choice(words: Iterable[str]) -> str:
     return "(?:" + "|".join(sorted(map(re.escape, words), key=lambda word: (-len(word), word))) + ")"
 
 
+def _units() -> str:
+    """Pattern of one unit; a table of all of them with their prefixes would make the lexer slow."""
+    prefix = _choice(PREFIXES)
+    known = {*PREFIXED, *(prefix + unit for prefix in PREFIXES for unit in PREFIXED)}
+    plain = _choice(SYMBOLS.keys() - known - {"%", "1"})
+    return f"(?:{prefix}?{_choice({*PREFIXED} - {'T'})}|{prefix}T|{plain})"
+
+
 PATTERNS = MappingProxyType(
     {
         "SPACE": SPACE,
@@ -157,7 +165,7 @@ PATTERNS = MappingProxyType(
         "BINARY": _choice(BINARY_TEMPORAL),
         "RESERVED": _choice(RESERVED),
         "AFTER_PERCENT": _choice(RESERVED - {"true", "false", "inf"}),
-        "UNITS": _choice(SYMBOLS.keys() - {"%", "1"}),
+        "UNITS": _units(),
         "EXPONENT": r"(?:\^-?\d+(?!\.?\d)|⁻?[¹²³⁴])",
     }
 )

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar.errors.failure import ParseFailure
-from stlc.grammar.parse.builder import near_unit
+from stlc.grammar.parse.builder import unit_advice
 from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest
@@ -107,8 +107,7 @@ def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
         return None
     if found.text in RESERVED or "UNIT" not in failure.accepts or _begins_line(failure, found):
         return None
-    near = near_unit(found.text)
-    advice = (CELSIUS,) if means_celsius(found.text) else (f"did you mean `{near}`?",) if near else ()
+    advice = (CELSIUS,) if means_celsius(found.text) else unit_advice(found.text)
     product = f"a product is written with a sign: `{previous.text} * {found.text}`"
     return Diagnostic("E101", f"unknown unit `{found.text}`", failure.of(found), help=(*advice, product))
 

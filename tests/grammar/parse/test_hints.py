@@ -161,3 +161,25 @@ def test_degrees_celsius_are_not_taken_for_angles(text):
     (finding,) = findings(text)
     assert (finding.code, "`degC`" in finding.help[0]) == ("E101", True)
     assert not any("`deg`" in line for line in finding.help)
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("kOhm", ["kohm"]),
+        ("khz", ["kHz"]),
+        ("kNn", ["kN"]),
+        ("metre", ["m"]),
+        ("barr", ["bar"]),
+        ("mpa", ["mPa` (0.001 ", "MPa` (1e+06 "]),
+        ("Mnm", ["mNm` (0.001 ", "MNm` (1e+06 "]),
+        ("furlong", []),
+    ],
+)
+def test_a_unit_is_never_meant_with_another_prefix_unsaid(word, meant):
+    for text in (f"signal x [{word}]", f"signal x\nrequire r: x > 3 {word}"):
+        (finding,) = findings(text)
+        assert finding.code == "E101"
+        (advice,) = [line for line in finding.help if "did you mean" in line] or [""]
+        assert [unit for unit in meant if f"`{unit}" in advice] == meant
+        assert advice.count("`") == 2 * len(meant)
