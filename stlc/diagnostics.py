@@ -185,6 +185,7 @@ CODES: dict[str, str] = {
     "E013": "`=` where `==` is meant",
     "E014": "a vector directly after a temporal operator",
     "E015": "a feature of the language that this version does not compile yet",
+    "E016": "a number over a window that has no equivalent formula",
     # names
     "E101": "an unknown name",
     "E102": "a name defined twice",

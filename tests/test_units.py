@@ -82,7 +82,8 @@ def test_no_two_units_share_a_spelling() -> None:
         ("Mohm", "1000000 kg*m^2/s^3/A^2"), ("GN", "1000000000 kg*m/s^2"), ("hPa", "100 kg/m/s^2"),
         ("mbar", "100 kg/m/s^2"), ("MWh", "3600000000 kg*m^2/s^2"), ("kΩ", "1000 kg*m^2/s^3/A^2"),
         ("mT", "0.001 kg/s^2/A"), ("uF", "0.000001 A^2*s^4/kg/m^2"), ("μH", "0.000001 kg*m^2/s^2/A^2"),
-        ("lx", "1 cd/m^2"), ("kat", "1 mol/s"), ("dam", "10 m"), ("dal", "0.01 m^3"), ("mSv", "0.001 m^2/s^2"),
+        ("lx", "1 cd/m^2"), ("kat", "1 mol/s"), ("dam", "10 m"), ("dal", "0.01 m^3"),
+        ("mSv", "0.001 m^2/s^2"),
     ],
 )  # fmt: skip
 def test_prefixed_units(text: str, product: str) -> None:

@@ -217,6 +217,15 @@ class Quantifier(Node):
 
 
 @dataclass(frozen=True, slots=True)
+class Extreme(Node):
+    """Greatest or least value of a number over a window, `max[-5 s, 0 s](x)`; it stands in a comparison."""
+
+    op: Literal["max", "min"]
+    interval: Interval
+    body: Expr
+
+
+@dataclass(frozen=True, slots=True)
 class Freeze(Node):
     """Formula `freeze p0 = p, … in body`, in which p0 keeps the value that p has now."""
 
@@ -253,6 +262,7 @@ Expr: TypeAlias = (
     | Until
     | Quantifier
     | Freeze
+    | Extreme
     | IfThenElse
 )
 

@@ -103,6 +103,9 @@ def _numbers(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
         _node(ast.Neg, inner),
         _node(ast.Binary, st.sampled_from(["+", "-", "*", "/", "%", "^"]), inner, inner),
         _node(ast.IfThenElse, inner, inner, inner),
+        _node(
+            ast.Extreme, st.sampled_from(["max", "min"]), _node(ast.Interval, quantities, quantities), inner
+        ),
     )
 
 

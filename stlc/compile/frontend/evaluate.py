@@ -21,6 +21,7 @@ from stlc.compile.frontend import intervals as moments
 from stlc.compile.frontend.arithmetic import agree, broadcast, negate, refuse_point, too_large
 from stlc.compile.frontend.builtins import builtin, outside, unsupported
 from stlc.compile.frontend.coerce import Expectation, as_formula, as_number, as_state_formula, loose_number
+from stlc.compile.frontend.extremes import misplaced, without_extremes
 from stlc.compile.frontend.macros import arguments, cycle, finished, too_big
 from stlc.compile.frontend.scope import Cost, Definition, External, Failed, Scope, reserved
 from stlc.compile.frontend.values import (
@@ -299,7 +300,6 @@ OPERATIONS: Mapping[type[ast.Node], Operation] = MappingProxyType(
         ast.Index: Operation(lambda expr: (expr.base, expr.index), _index),
         ast.Neg: Operation(lambda expr: (expr.operand,), _neg),
         ast.Binary: Operation(lambda expr: (expr.left, expr.right), _binary),
-        ast.Compare: Operation(lambda expr: expr.operands, comparisons.comparison),
         ast.Member: Operation(_member_parts, _membership),
         ast.IfThenElse: Operation(lambda expr: (expr.cond, expr.yes, expr.no), choose),
     }
@@ -728,8 +728,16 @@ def _domain(expr: ast.Quantifier, scope: Scope) -> Iterator[Number]:
         yield literal(Fraction(index), expr.span)
 
 
+def _compare(expr: ast.Compare, scope: Scope) -> Value:
+    if any(isinstance(node, ast.Extreme) for node in descendants(expr)):
+        return evaluate(without_extremes(expr, scope, evaluate), scope)
+    return comparisons.comparison(expr, evaluate_all(expr.operands, scope), scope)
+
+
 _HANDLERS: Mapping[type[ast.Node], Callable[[Any, Scope], Value]] = MappingProxyType(
     {
+        ast.Compare: _compare,
+        ast.Extreme: misplaced,
         ast.Name: _name,
         ast.Attr: _attr,
         ast.Call: _call,

@@ -175,15 +175,15 @@ def interval(
     low, high = moment(node.lo, bounds[0], scope), moment(node.hi, bounds[1], scope)
     if low.end:
         scope.fail(Diagnostic("E303", "an interval cannot start at the end of the trace", node.lo.span))
-    if _sign(low) < 0 or (not high.end and _sign(high) < 0):
+    if sign(low) < 0 or (not high.end and sign(high) < 0):
         scope.fail(_negative(op, node, (low, high), body))
-    if not high.end and _sign(high.plus(low, -1)) < 0:
+    if not high.end and sign(high.plus(low, -1)) < 0:
         scope.fail(_reversed(node))
     lo, hi = low.on(low.span), None if high.end else high.on(high.span)
     return typed.Interval(lo, hi, node.lo_open, node.hi_open, node.clock, node.span)
 
 
-def _sign(value: TimeExpr) -> int:
+def sign(value: TimeExpr) -> int:
     """Return -1 if a time is negative for every time step and horizon, 0 if it is zero, else 1.
 
     A time such as `T - 1 s`, whose sign depends on the horizon, gives 1.
@@ -204,14 +204,14 @@ def _reversed(node: ast.Interval) -> Diagnostic:
 
 def _negative(name: str, node: ast.Interval, ends: tuple[TimeExpr, TimeExpr], body: ast.Expr) -> Diagnostic:
     low, high = ends
-    bound = node.lo if _sign(low) < 0 else node.hi
+    bound = node.lo if sign(low) < 0 else node.hi
     if OPERATORS[name].past:
         help_ = (f"bounds of `{name}` count backwards already: write them without the sign",)
         return Diagnostic(
             "E302", "a bound of a past operator is a length of time, never negative", bound.span, help=help_
         )
     mirror = OPERATORS[name].mirror
-    plain = all(not end.end and _sign(end) <= 0 for end in ends)
+    plain = all(not end.end and sign(end) <= 0 for end in ends)
     hints: tuple[str, ...] = ()
     if mirror and plain and name in UNARY_TEMPORAL:
         near, far = _shown(high, node.hi), _shown(low, node.lo)
@@ -227,4 +227,4 @@ def _shown(value: TimeExpr, expr: ast.Expr) -> str:
     If `value` is negative, the minus sign is removed from the text.
     """
     text = expr.span.text.strip()
-    return text.removeprefix("-").strip() if _sign(value) < 0 else text
+    return text.removeprefix("-").strip() if sign(value) < 0 else text

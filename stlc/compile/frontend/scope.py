@@ -282,6 +282,10 @@ class Scope:
         near = closest(name.name, candidates) if pairs <= _MAX_PAIRS else None
         what = "function" if called else "name"
         help_ = () if near is None else (f"did you mean `{near}`?{self._about(near)}",)
+        if name.name == "t" and self.in_spec:
+            help_ = (
+                "a signal's name is its value now: `x`, not `x[t]`; other samples: `prev(x)`, `shift(x, 1)`",
+            )
         if name.name in self.system_hints:
             help_ = (self.system_hints[name.name],)
         note = () if called or not self.in_spec else ("parameters never default to 0",)

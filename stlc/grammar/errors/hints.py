@@ -19,6 +19,7 @@ from stlc.grammar.errors.expected import (
     wrong_name,
 )
 from stlc.grammar.errors.failure import ParseFailure, Piece
+from stlc.grammar.errors.foreign import definition_of_breach, number_over_window
 from stlc.grammar.errors.unicode import apart, named, replacement, unexpected_character
 from stlc.grammar.scan import Bracket, Lexeme, brackets, opens_interval
 from stlc.grammar.words import BINARY_TEMPORAL
@@ -274,6 +275,8 @@ RECOGNISERS: tuple[Recogniser, ...] = (
     _chain,
     misspelt_operator,
     _vector,
+    number_over_window,
+    definition_of_breach,
     unknown_unit,
     unknown_declaration,
     wrong_name,

@@ -162,6 +162,10 @@ def _role(text: Text, index: int) -> Role:
         return "enum" if text.tokens[0].kind == "_ENUM" else "list"
     if index and text.ends_operand(index - 1):
         return "call" if token.text == "(" else "index"
+    if token.text == "(" and before is not None and before.text == "]":
+        opening = text.partner[index - 1]
+        if opening and text.tokens[opening - 1].kind == "EXTREME_BRACKET":
+            return "call"
     return "group" if token.text == "(" else "list"
 
 

@@ -117,10 +117,10 @@ def unit_advice(word: str) -> tuple[str, ...]:
     A prefix is kept, since `mNm` is no advice for a misspelt `MNm`. Units that differ in case only are named
     with their sizes.
     """
-    if word in SYMBOLS or means_celsius(word):
-        return ()
     if word == "T":
         return ("`T` is the planning horizon; a tesla is `Wb/m^2`, a millitesla `mT`",)
+    if len(word) < 2 or word in SYMBOLS or means_celsius(word):
+        return ()
     named = UNIT_NAMES.get(word.lower())
     alike = [named] if named else [unit for unit in _USUAL if unit.casefold() == word.casefold()]
     for prefix in "" if alike else _PREFIXES:
@@ -291,6 +291,7 @@ EXPRESSIONS: Mapping[str, BuildRule] = MappingProxyType(
         "freeze": lambda _, span, children: ast.Freeze(span, tuple(children[:-1]), children[-1]),
         "binding": _binding,
         "if_then_else": node(ast.IfThenElse),
+        "extreme": lambda _, span, children: ast.Extreme(span, children[0].text, *children[1:]),
     }
 )
 """Rule of the grammar -> function that converts its parse-tree nodes."""

@@ -190,6 +190,7 @@ _SHOWN: Mapping[type, Callable[[Any], str]] = MappingProxyType(
         ast.Quantifier: _quantifier,
         ast.Freeze: _freeze,
         ast.IfThenElse: _if,
+        ast.Extreme: lambda expr: f"{expr.op}{show_interval(expr.interval)}({show_expr(expr.body)})",
     }
 )
 """Class of expressions -> function that returns the text of one."""

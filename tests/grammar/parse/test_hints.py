@@ -183,3 +183,26 @@ def test_a_unit_is_never_meant_with_another_prefix_unsaid(word, meant):
         (advice,) = [line for line in finding.help if "did you mean" in line] or [""]
         assert [unit for unit in meant if f"`{unit}" in advice] == meant
         assert advice.count("`") == 2 * len(meant)
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "advice"),
+    [
+        ("require r: count[0 s, 5 s](x > 0) >= 3", "E016", "eventually(0 s, 5 s]"),
+        ("require r: always mean[0:5](x) < 3", "E016", "shift(x, -1)"),
+        ("phi := alw_[0, 5] (x[t] > 0)", "E010", "require phi: always[0 s, 5 s] x > 0"),
+        (
+            "mu := (x[t] > 0) and ev_[1, 2.5] (y[t] < 3)  # c",
+            "E010",
+            "def mu = (x > 0) and eventually[1 s, 2.5 s] y < 3",
+        ),
+        ("a := G[0, 5] x > 0", "E010", "require a: always[0 s, 5 s] x > 0"),
+    ],
+)
+def test_words_of_other_tools_have_an_answer(text, code, advice):
+    (finding,) = findings(f"signal x\nsignal y\n{text}\n")
+    assert finding.code == code
+    assert any(advice in line for line in finding.help)
+    if ":=" in text:
+        for line in finding.help:
+            parse(Source("t", line.removeprefix("or, for a part of others:  ")))
