@@ -20,7 +20,7 @@ from stlc.compile.augment.mission import (
 )
 from stlc.compile.augment.nested import TooFarError, in_past_form
 from stlc.compile.augment.past import Past
-from stlc.compile.augment.timers import Timer, TimerTable, tolerant
+from stlc.compile.augment.timers import Timer, TimerTable, cited, tolerant
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
@@ -150,7 +150,7 @@ def _about(formula: Absolute) -> str:
 
     The text says which condition decides the status for the rest of the mission.
     """
-    left, right = (f"`{' '.join(body.span.text.split())}`" for body in (formula.left, formula.right))
+    left, right = cited(formula.left), cited(formula.right)
     window = formula.window
     if formula.right.span == formula.left.span:  # rewritten, with no text of its own
         return f"open | true | false  what is known of {right}"

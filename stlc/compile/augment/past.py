@@ -24,6 +24,7 @@ from stlc.compile.augment.timers import (
     TimerTable,
     at_least,
     choose,
+    cited,
     time_test,
     timer_test,
     tolerant,
@@ -164,10 +165,10 @@ class Past:
         """
         condition = self._condition(body)
         if most is None:
-            draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {_short(node.body)} ever held")
+            draft = self._draft("latch", "seen", 0.0, 1.0, f"whether {cited(node.body)} ever held")
             seen = self.table.add(draft, lambda own: choose(condition, _ONE, own))
             return _Test(seen, _ONE, node.span).decides()
-        about = f"steps since {_short(node.body)} last held, up to {most}"
+        about = f"steps since {cited(node.body)} last held, up to {most}"
         draft = self._draft("timer", "since", most + 1.0, most + 1.0, about)
         since = self.table.add(draft, lambda own: choose(condition, _ONE, _counted(own, most + 1)))
         return _Test(ir.Const(float(most)), since, node.span, later=1).decides()
@@ -180,10 +181,10 @@ class Past:
         """
         condition = self._condition(body)
         if most is None:
-            draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {_short(node.body)} always held")
+            draft = self._draft("latch", "kept", 1.0, 1.0, f"whether {cited(node.body)} always held")
             latch = self.table.add(draft, lambda own: choose(condition, own, _ZERO))
             return _Test(latch, _ONE, node.span).lacks()
-        about = f"steps for which {_short(node.body)} has held, up to {most}"
+        about = f"steps for which {cited(node.body)} has held, up to {most}"
         draft = self._draft("timer", "held", float(most), float(most), about)
         held = self.table.add(draft, lambda own: choose(condition, _counted(own, most), _ZERO))
         return _Test(held, ir.Const(float(most)), node.span, later=1).lacks()
@@ -233,7 +234,7 @@ class Past:
         and `left` and `right` are the negations of p and q.
         """
         held, met = (left, right) if positive else (negate(left), negate(right))
-        about = f"{_short(node.right)}, and {_short(node.left)} from there on"
+        about = f"{cited(node.right)}, and {cited(node.left)} from there on"
         if most is None:
             draft = self._draft("latch", "since", 0.0, 1.0, f"whether there was {about}")
             latch = self.table.add(draft, lambda own: choose(held, choose(met, _ONE, own), _ZERO))
@@ -281,7 +282,7 @@ class Past:
             return self._refused(node.span, f"that asks what was more than {REGISTER} samples ago")
         condition = self._condition(body)
         initial = float(before)
-        known = _short(node.body if not isinstance(node, typed.Until) else node)
+        known = cited(node.body if not isinstance(node, typed.Until) else node)
         about = f"whether {known} held at the sample before"
         draft = self._draft("latch", "before", initial, 1.0, about)
         latch = self.table.add(draft, lambda _own: choose(condition, _ONE, _ZERO))
@@ -323,7 +324,7 @@ class Past:
         """
         p, q = self._condition(left), self._condition(right)
         held, met = (p, q) if positive else (negate(p), negate(q))
-        from_there = f"{_short(node.right)} with {_short(node.left)} from there on"
+        from_there = f"{cited(node.right)} with {cited(node.left)} from there on"
         about = f"steps since the first {from_there}, up to {least}"
         draft = self._draft("timer", "lasting", 0.0, float(least), about)
 
@@ -392,12 +393,6 @@ class Past:
 def _counted(own: ir.Num, most: int) -> ir.Num:
     """Return the number `own + 1`, but at most `most`."""
     return ir.Op("min", (ir.Op("add", (own, _ONE)), ir.Const(float(most))))
-
-
-def _short(formula: typed.Formula) -> str:
-    """Return the source text of a formula in backticks, cut to 40 characters."""
-    text = " ".join(formula.span.text.split())
-    return f"`{text}`" if len(text) <= 40 else f"`{text[:37]}...`"
 
 
 def in_steps(window: ir.Window, span: Span, clock: Literal["now", "start"] = "now") -> typed.Interval:

@@ -157,3 +157,12 @@ def tolerant(formula: ir.Formula) -> ir.Formula:
 def both(*items: ir.Formula) -> ir.Formula:
     """Return the conjunction of formulas, simplified where a formula is a constant."""
     return joined("and", items, ir.Truth(True))
+
+
+def cited(formula: typed.Formula) -> str:
+    """Return the source text of a formula, cut to 40 characters; in quotes if it has backticks."""
+    text = " ".join(formula.span.text.split())
+    if isinstance(formula, typed.Not) and formula.span == formula.body.span:
+        text = f"not ({text})"
+    text = text if len(text) <= 40 else f"{text[:37]}..."
+    return f"'{text}'" if "`" in text else f"`{text}`"

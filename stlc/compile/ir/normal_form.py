@@ -36,8 +36,9 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
             return formula if sign > 0 else typed.Not(formula.span, formula)
         case typed.Truth(_, value):
             return formula if sign > 0 else replace(formula, value=not value)
-        case typed.Not(_, body):
-            return normal(body, flip(sign))
+        case typed.Not(span, body):
+            inner = normal(body, flip(sign))
+            return replace(inner, span=span) if sign > 0 else inner  # the text there has the `not`
         case typed.Until(_, "unless"):
             return normal(_unless(formula), sign)
         case typed.Logic(_, "->" | "<->" | "xor"):
