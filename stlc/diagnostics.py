@@ -195,6 +195,7 @@ CODES: dict[str, str] = {
     "W105": "a name that is declared and never used",
     "W106": "a word or sign of another tool, where the language has its own",
     "W107": "a temperature in coulombs",
+    "W108": "a state without a unit, whose flow has one",
     "E106": "an import that cannot be read, or that leads back to itself",
     "E107": "a function from outside that nobody provides",
     # types and units

@@ -231,6 +231,14 @@ def nearest(value: Fraction | float) -> float:
         return math.inf if value > 0 else -math.inf
 
 
+def time_text(seconds: Fraction | float) -> str:
+    """Text of a length of time: in hours or minutes if it is at least two and whole (hours in quarters)."""
+    for unit, size, part in (("h", 3600, 900), ("min", 60, 60)):
+        if seconds >= 2 * size and seconds % part == 0:
+            return f"{nearest(seconds) / size:g} {unit}"
+    return f"{nearest(seconds):g} s"
+
+
 def same_dims(a: Unit, b: Unit) -> bool:
     """True if the units have the same dimensions, so that their quantities can be added and compared."""
     return a.dims == b.dims

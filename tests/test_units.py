@@ -17,6 +17,7 @@ from stlc.units import (
     parse_quantity,
     parse_unit,
     same_dims,
+    time_text,
 )
 
 _PRODUCTS = sorted(symbol for symbol, unit in SYMBOLS.items() if not unit.offset)
@@ -232,3 +233,15 @@ def test_a_quantity(text, unit, value):
 def test_what_is_no_quantity(text, message):
     with pytest.raises(ValueError, match=message):
         parse_quantity(text, parse_unit("m"))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(17100, "4.75 h"), (7200, "2 h"), (3600, "60 min"), (120, "2 min"), (7260, "121 min"), (90, "90 s"),
+     (0.02, "0.02 s")],
+)  # fmt: skip
+def test_a_length_of_time_is_readable(seconds: float, text: str) -> None:
+    assert time_text(seconds) == text
+    assert time_text(Fraction(seconds)) == text
+    number, unit = text.split()
+    assert float(number) * parse_unit(unit).scale == pytest.approx(seconds)

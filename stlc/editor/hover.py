@@ -22,6 +22,7 @@ from stlc.grammar.traverse import descendants
 from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS, UNARY_TEMPORAL
 from stlc.signature import Column
 from stlc.source import Span
+from stlc.units import time_text
 
 _ALIASES = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
 
@@ -254,4 +255,4 @@ def _seconds(time: typed.Time, grid: Grid) -> str:
     if grid.dt is None or (time.horizons and grid.horizon is None):
         return ""
     seconds = time.seconds + grid.dt * (time.steps + time.horizons * (grid.horizon or 0))
-    return f"{float(seconds):g} s"
+    return time_text(seconds)

@@ -114,12 +114,15 @@ class Binary(Node):
     right: Expr
 
 
+Comparison: TypeAlias = Literal["<", "<=", ">", ">=", "==", "!="]
+
+
 @dataclass(frozen=True, slots=True)
 class Compare(Node):
     """Chain of comparisons: `a <= b < c` has three operands and two operators."""
 
     operands: tuple[Expr, ...]
-    ops: tuple[Literal["<", "<=", ">", ">=", "==", "!="], ...]
+    ops: tuple[Comparison, ...]
 
 
 @dataclass(frozen=True, slots=True)

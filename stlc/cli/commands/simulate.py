@@ -37,6 +37,7 @@ from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.registry import GUARDS, guard_named
+from stlc.units import time_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -274,9 +275,8 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
     seconds = steps * run.task.system.dt
     if not isinstance(judged, int | float) or seconds <= judged:
         return ()
-    message = (
-        f"the simulation lasts {seconds:g} s, and training validated the policy on missions of {judged:g} s"
-    )
+    lasts, known = time_text(seconds), time_text(judged)
+    message = f"the simulation lasts {lasts}, and training validated the policy on missions of {known}"
     note = "the requirements have no end: beyond that time nothing is known but this simulation"
     return (Diagnostic("W604", message, note=(note,)),)
 

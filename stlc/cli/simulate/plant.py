@@ -22,7 +22,7 @@ from stlc.cli.framework.plant_documents import (
 from stlc.diagnostics import usage
 from stlc.escape import operand, shell, visible
 from stlc.registry import did_you_mean
-from stlc.units import parse_quantity
+from stlc.units import parse_quantity, time_text
 
 if TYPE_CHECKING:
     from stlc.monitor.judgement import Status
@@ -218,7 +218,7 @@ def _show(plant: Plant, monitor: Monitor, runs: Sequence[JudgedRun], order: Plan
     count = f"{len(runs)} simulation{'s' if len(runs) != 1 else ''}"
     emit(
         f"{visible(monitor.compiled.name)} on {visible(decl.name)}    "
-        f"{count} of {float(decl.duration):g} s, dt {float(decl.dt):g} s"
+        f"{count} of {time_text(decl.duration)}, dt {float(decl.dt):g} s"
     )
     emit("")
     emit(table(list(_rows(plant, runs)), header=("seed", "verdict", "requirement", "robustness", "point")))

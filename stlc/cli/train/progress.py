@@ -15,6 +15,7 @@ from rich.text import Text
 from stlc.cli.framework.assured import FalsificationRounds
 from stlc.cli.framework.documents import TrainedRun
 from stlc.cli.framework.output import console as open_console
+from stlc.units import time_text
 from stlc.view.learning import driven_lines
 
 LINE_EVERY = 25.0  # seconds between lines without a terminal
@@ -306,7 +307,7 @@ def final_screen(
         partly = 0 < searched < result["held_out"]
         rows.append(("known feasible", f"{feasible:.3f}   of which {share} are satisfied{estimate * partly}"))
     if judged := result.get("judged_seconds"):
-        rows.append(("judged", f"on missions of {judged:g} s; what is required has no end"))
+        rows.append(("judged", f"on missions of {time_text(judged)}; what is required has no end"))
     verdict, requirements = result.get("verdict"), result["requirements"]
     if verdict is not None:
         rows.append(("verdict", f"{verdict['level']}: {verdict['sentence']}"))

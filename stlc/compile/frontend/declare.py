@@ -265,6 +265,8 @@ def _absent_signal(column: Column, decl: ast.Signal | ast.Param, interface: Inte
         help_ = (
             f'{where} declares `{found}`{same}; write `{role}signal {decl.name} from "{found}"` or rename',
         )
+    own = interface.unread.get(column.name.partition("[")[0])
+    help_ = help_ if own is None else (own,)
     return Diagnostic(
         "E103",
         f"the system has no signal `{column.name}`",

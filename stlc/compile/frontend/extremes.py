@@ -27,7 +27,7 @@ from stlc.source import Span
 
 def misplaced(expr: ast.Extreme, scope: Scope) -> NoReturn:
     """Raise Failed (E016): an extreme over a window is not in a comparison that can be rewritten."""
-    return scope.fail(_refused(expr, "is compared with `<`, `<=`, `>` or `>=`"))
+    scope.fail(_refused(expr, "is compared with `<`, `<=`, `>` or `>=`"))
 
 
 def _refused(expr: ast.Extreme, need: str) -> Diagnostic:
@@ -81,7 +81,7 @@ class _Rewriting:
     evaluate: Evaluator
     bindings: list[tuple[str, ast.Expr]] = field(default_factory=list)
 
-    def comparison(self, left: ast.Expr, op: str, right: ast.Expr, span: Span) -> ast.Expr:
+    def comparison(self, left: ast.Expr, op: ast.Comparison, right: ast.Expr, span: Span) -> ast.Expr:
         """Return the comparison `left op right` without the extreme."""
         if not self.scope.temporal or op not in ("<", "<=", ">", ">="):
             misplaced(self.extreme, self.scope)

@@ -45,6 +45,7 @@ class Interface:
         functions: loaded functions, by name.
         path: path of the system file, for messages.
         places: source location of each state and constant in the system file, by name.
+        unread: names of the system file that no specification can use: name -> advice.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Interface:
     functions: Mapping[str, InterfaceFunction] = field(default_factory=dict)
     path: str = ""
     places: Mapping[str, Span] = field(default_factory=dict)
+    unread: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def where(self) -> str:

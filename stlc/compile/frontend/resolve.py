@@ -215,7 +215,7 @@ def _system_hints(interface: Interface | None) -> dict[str, str]:
     """Return a hint for each state and constant of the system, by its name: how to declare it in the file."""
     if interface is None:
         return {}
-    found = {}
+    found = dict(interface.unread)
     sizes = Counter(column.name.partition("[")[0] for column in interface.signature.columns)
     for column in interface.signature.columns:
         unit = f" [{column.unit}]" if column.unit.text else ""

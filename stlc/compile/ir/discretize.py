@@ -17,7 +17,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import NumberLeaf, leaves, map_children, map_leaves, nodes, numbers
 from stlc.diagnostics import Diagnostic, tell
 from stlc.source import Span
-from stlc.units import nearest
+from stlc.units import nearest, time_text
 
 MAX_STEPS = 10**12
 """Limit of bounds in steps: longer than any trace, and sums still fit into 64 bits."""
@@ -176,10 +176,10 @@ def duration(steps: int, grid: Grid) -> str:
 
 
 def in_words(steps: Fraction, grid: Grid) -> str:
-    """Return the text of a time for messages: in seconds if the time step is known, else in steps."""
+    """Return the text of a time for messages: in steps if no time step is known."""
     if grid.dt is None:
         return f"{nearest(steps):g} steps"
-    return f"{nearest(steps * grid.dt):g} s"
+    return time_text(steps * grid.dt)
 
 
 def _step(grid: Grid) -> str:

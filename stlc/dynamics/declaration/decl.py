@@ -27,7 +27,7 @@ from stlc.escape import visible
 from stlc.files import real
 from stlc.signature import Column, Signature
 from stlc.source import Source, Span
-from stlc.units import Unit
+from stlc.units import Unit, time_text
 
 LEARNT = (
     *("dt", "horizon", "substeps", "integrator", "discrete", "constants", "signature", "controls"),
@@ -170,10 +170,31 @@ class SystemDecl:
         """
         names = frozenset(function.name for function in self.functions)
         known = {function.name: function for function in self.functions if function.body is not None}
-        path = self.source.name
         return Interface(
-            self.name, self.signature, self.constants, names, known, path=path, places=self.places
+            self.name,
+            self.signature,
+            self.constants,
+            names,
+            known,
+            path=self.source.name,
+            places=self.places,
+            unread=self._unread(),
         )
+
+    def _unread(self) -> dict[str, str]:
+        """Return an advice for each name of the file that no specification can use."""
+        where = self.source.name
+        shared = {*(column.name.partition("[")[0] for column in self.signature.columns), *self.constants}
+        found = {
+            name: f"`{name}` is a definition of {where}; repeat it here, `def {name} = …`, to use it"
+            for name in self.places.keys() - shared
+        }
+        for table in self.tables:
+            found[table.name] = f"`{table.name}` is a table of {where}; requirements cannot call it"
+        for control in self.controls:
+            name = control.name.partition("[")[0]
+            found[name] = f"`{name}` is a control of {where}; requirements cannot read it: they read states"
+        return found
 
 
 Row = tuple[str, ...]
@@ -184,8 +205,8 @@ def describe(decl: SystemDecl) -> str:
     head = visible(f"{decl.name}: {decl.doc}" if decl.doc else decl.name)
     substeps = f", {decl.substeps} substeps" if decl.substeps > 1 else ""
     kind = "discrete" if decl.discrete else decl.integrator
-    seconds = float(decl.dt * decl.horizon)
-    grid = f"dt = {float(decl.dt):g} s, T = {decl.horizon} steps = {seconds:g} s, {kind}{substeps}"
+    horizon = time_text(decl.dt * decl.horizon)
+    grid = f"dt = {float(decl.dt):g} s, T = {decl.horizon} steps = {horizon}, {kind}{substeps}"
     flow = {assign.name: assign.text for assign in decl.flow}
     rate = "{}' =" if decl.discrete else "d{}/dt ="
     jumps = [
@@ -217,7 +238,7 @@ def _state(column: Column, moves: str | None) -> Row:
 def _input(decl: InputDecl) -> Row:
     unit = f"[{decl.unit}]" if decl.unit.text else ""
     pieces = "constant" if not decl.moves else f"{decl.pieces} pieces, {decl.interpolate}"
-    span = f"{float(decl.duration):g} s" + (", free times" if decl.free_times else "")
+    span = time_text(decl.duration) + (", free times" if decl.free_times else "")
     return decl.name, unit, f"[{decl.low:g}, {decl.high:g}]", f"{pieces}, {span}" if decl.moves else pieces
 
 

@@ -224,6 +224,11 @@ class Expressions:
         """
         if self._fits(number, unit):
             place = first_line(node.span)
+            if not unit.text and not number.flexible and not number.unit.dimensionless:
+                message = (
+                    f"{where} is in [{number.unit}], and no unit is declared that it could be checked with"
+                )
+                self._report((Diagnostic("W108", message, place, help=("declare the `unit` of the state",)),))
             if self.amounts and number.unit.offset:
                 self._report((point_for_amount(where, number, place),))
                 return None
