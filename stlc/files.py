@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import glob
 import os
@@ -14,6 +15,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError, os_reason
+from stlc.escape import operand, shell
 from stlc.registry import closest
 from stlc.source import Source
 from stlc.stopping import leaving
@@ -107,6 +109,8 @@ def _mesh(name: str, source: Source | None) -> Diagnostic:
 
 
 def _not_utf8(name: str, data: bytes, error: UnicodeDecodeError) -> Diagnostic:
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return Diagnostic("E003", f"`{name}` is UTF-16", help=("save it as UTF-8 in your editor",))
     if b"\0" in data[:1024]:
         return Diagnostic("E003", f"`{name}` is a binary file, not a text")
     line = data.count(b"\n", 0, error.start) + 1
@@ -224,6 +228,11 @@ def find_spec(name: Path | str) -> Path:
     is returned unchanged; an attempt to read it then raises the error.
     """
     path = Path(name)
+    if path.suffix in (".yaml", ".yml"):
+        advice = f"name the specification, and  {shell(('--system', operand(str(path))))}"
+        raise UsageError(
+            Diagnostic("U101", f"`{name}` is a system file, not a specification", help=(advice,))
+        )
     if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
         return path
     return next((there for folder in (LIBRARY, SPECS) if (there := folder / path).is_file()), path)

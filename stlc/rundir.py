@@ -19,9 +19,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from stlc.diagnostics import Diagnostic, RunError, UsageError, usage
+from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, usage
 from stlc.escape import file_part, shell
-from stlc.files import alone_in, reported, write_atomic
+from stlc.files import alone_in, find_trace, reported, write_atomic
 from stlc.jsontext import dumps
 from stlc.registry import did_you_mean
 
@@ -432,3 +432,25 @@ _ANIMALS = """
 def draw_words() -> str:
     """Two random words, such as `quiet-heron`, independent of all seeds of an experiment."""
     return f"{secrets.choice(_ADJECTIVES.split())}-{secrets.choice(_ANIMALS.split())}"
+
+
+def recorded_trace(what: str, runs: Path) -> Path:
+    """Return the path of the trace file `what`, or of the trace in the run called `what`.
+
+    Raises:
+        UsageError: U102, there is no such trace or run, or the run has no trace.
+    """
+    try:
+        if not Path(what).is_dir():
+            return find_trace(what, runs)
+    except UsageError as missing:
+        try:
+            folder = RunDir.open(what, runs)
+        except StlcError:
+            raise missing from None
+    else:
+        folder = RunDir.open(what, runs)
+    if not (folder.path / TRACE).is_file():
+        advice = (f"record one: {shell(('stlc', 'simulate', folder.name))}",)
+        raise UsageError(Diagnostic("U102", f"`{folder.shown}` has no trace", help=advice))
+    return Path(folder.shown) / TRACE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shlex
 import signal
 import struct
 import subprocess
@@ -343,3 +344,23 @@ def test_patterns_of_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for pattern in ("none/*.csv", "a/**/*.npz"):
         with pytest.raises(UsageError, match="U102: no file matches"):
             matching_traces(pattern)
+
+
+@pytest.mark.parametrize("codec", ["utf-16", "utf-16-be", "utf-16-le"])
+def test_a_text_in_utf_16_is_told_by_name(tmp_path, codec):
+    path = tmp_path / "wide.stl"
+    mark = "" if codec == "utf-16" else "\ufeff"
+    path.write_bytes((mark + "signal x\n").encode(codec))
+    with pytest.raises(SpecError) as caught:
+        read_source(path)
+    assert "is UTF-16" in finding(caught).message
+    assert "UTF-8" in finding(caught).help[0]
+
+
+@pytest.mark.parametrize("name", ["tank.yaml", "my tank.yml", "-x.yaml"])
+def test_a_system_file_is_no_specification(name):
+    with pytest.raises(UsageError) as caught:
+        files.find_spec(name)
+    assert "is a system file" in finding(caught).message
+    option, word = shlex.split(finding(caught).help[0].partition(", and ")[2])
+    assert (option, word) == ("--system", name if not name.startswith("-") else f"./{name}")

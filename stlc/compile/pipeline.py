@@ -354,5 +354,8 @@ def _too_far(rule: CompiledRequirement, grid: Grid) -> Diagnostic:
         text,
         rule.typed.written.span,
         label=label,
-        help=("shorten its intervals, end them with `T` or `end`, or give the system a longer horizon",),
+        help=(
+            "shorten its intervals, end them with `T` or `end`, or give the system a longer horizon",
+            "times of the whole mission, over many plans, are written with `@`: `always@[0 s, 60 s] …`",
+        ),
     )

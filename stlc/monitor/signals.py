@@ -25,7 +25,7 @@ from stlc.compile.ir.support import columns as columns_of
 from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
-from stlc.escape import visible
+from stlc.escape import shell, visible
 from stlc.grammar import ast
 from stlc.monitor.cells import Cells
 from stlc.monitor.given import UNNAMED, Given
@@ -292,7 +292,8 @@ def _missing(need: Need, data: Given, name: str) -> Diagnostic:
     near = closest(wanted, data)
     first = islice(data.items(), 40)
     shapes = ", ".join(key if x is None else f"{key} {tuple(np.shape(x))}" for key, x in first)
-    help_ = () if near is None else (f"did you mean `{near}`? map it with  --map {wanted}={near}",)
+    mapped = shell(("--map", f"{wanted}={near}"))
+    help_ = () if near is None else (f"did you mean `{near}`? map it with  {mapped}",)
     if need.parameter:
         option = f"--set {wanted.partition('[')[0]}={need.column.low or 0:g}{need.column.unit}"
         help_ = (*help_, f"{'or ' if help_ else ''}give it one value for all traces:  {option}")

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.escape import shell
 from stlc.signature import Kind, Signature
 from stlc.trace.clocks import ClockSetting, clocked
 from stlc.trace.enums import Words, in_numbers, wordless
@@ -272,7 +273,9 @@ def _require_readable(recording: Recording, read: Mapping[str, bool] | None) -> 
         elif name in recording.clashes:
             sources = recording.clashes[name]
             message = f"`{name}` in `{recording.name}` is ambiguous: {' and '.join(map(str, sources))}"
-            help_ = tuple(f"--map SIGNAL={one}  reads {source}" for source, one in sources.items())
+            help_ = tuple(
+                f"{shell(('--map', f'SIGNAL={one}'))}  reads {source}" for source, one in sources.items()
+            )
             findings.append(Diagnostic("E605", message, help=help_))
     if findings:
         raise TraceError(*findings)

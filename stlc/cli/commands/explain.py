@@ -71,8 +71,11 @@ def explain(
     if what == STDIN or Path(what).suffix in SPEC_SUFFIXES:
         return _spec(what, reading.require or [])
     from stlc.cli.check.causes import explain_trace
+    from stlc.files import has_wildcard
+    from stlc.rundir import recorded_trace
 
-    return explain_trace(what, reading.question(at=at), reading.runs, talk=not json)
+    trace = what if has_wildcard(what) else str(recorded_trace(what, reading.runs))
+    return explain_trace(trace, reading.question(at=at), reading.runs, talk=not json)
 
 
 def _code(code: str) -> str:

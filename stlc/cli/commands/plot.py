@@ -13,7 +13,7 @@ from stlc.cli.framework.documents import PlottedTrace
 from stlc.cli.framework.options import require_separate
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, StlcError, UsageError, usage
+from stlc.diagnostics import usage
 from stlc.escape import visible
 
 if TYPE_CHECKING:
@@ -49,12 +49,13 @@ def plot(
     `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
     from stlc.cli.check.judge import load
+    from stlc.rundir import recorded_trace
     from stlc.view import require_drawing
     from stlc.view.signals import draw_signals
     from stlc.view.verdicts import margins_of, units_of
 
     require_drawing()
-    path = _find(what, reading.runs)
+    path = recorded_trace(what, reading.runs)
     target = _target(output, path)
     require_separate([("--output", target)], (path, reading.spec, reading.system))
     question = reading.question(require=())
@@ -80,32 +81,6 @@ def plot(
         emit(visible(str(target)))
 
     return Answer({"trace": str(path), "picture": str(target), "shown": shown}, show)
-
-
-def _find(what: str, runs: Path) -> Path:
-    """Return the path of the trace file `what`, or of the trace in the run called `what`.
-
-    Raises:
-        UsageError: U102, there is no such trace or run, or the run has no trace.
-    """
-    from stlc.files import find_trace
-    from stlc.rundir import TRACE, RunDir
-
-    try:
-        if not Path(what).is_dir():
-            return find_trace(what, runs)
-    except UsageError as missing:
-        try:
-            folder = RunDir.open(what, runs)
-        except StlcError:
-            raise missing from None
-    else:
-        folder = RunDir.open(what, runs)
-    path = folder.path / TRACE
-    if not path.is_file():
-        advice = (f"record one: stlc simulate {folder.name}",)
-        raise UsageError(Diagnostic("U102", f"`{folder.shown}` has no trace", help=advice))
-    return Path(folder.shown) / TRACE
 
 
 def _target(output: Path | None, trace: Path) -> Path:

@@ -72,10 +72,10 @@ def _stopped(code: int, argv: Sequence[str]) -> int:
 
 
 def wants_json(argv: Sequence[str]) -> bool:
-    """True if the options ask for a JSON document: `--json`, `--format json`, `--ast json`."""
+    """True if the options ask for a JSON document: `--json`, `--format json`."""
     options = list(argv[: argv.index("--")] if "--" in argv else argv)
     joined = {f"{option}={value}" for option, value in pairwise([*options, ""])}
-    return bool({"--json", "--format=json", "--ast=json"} & ({*options} | joined))
+    return bool({"--json", "--format=json"} & ({*options} | joined))
 
 
 def _schema(argv: Sequence[str]) -> str:

@@ -50,7 +50,7 @@ def read_overrides(
             except SpecError as error:
                 faults.append(_unreadable(name, text, error))
         elif name not in systems and "." not in name:
-            faults.append(_unknown(name, own | systems))
+            faults.append(_unknown(name, own, interface))
     if faults:
         raise UsageError(*faults)
     return found
@@ -62,11 +62,15 @@ def _unreadable(name: str, text: str, error: SpecError) -> Diagnostic:
     return Diagnostic("U101", message, first.span, help=(f"write a value with its unit: `--set {name}=3s`",))
 
 
-def _unknown(name: str, names: set[str]) -> Diagnostic:
-    near = closest(name, names)
-    known = f"constants: {', '.join(sorted(names))}" if names else "the specification has no constant"
-    hint = f"did you mean `{near}`?  " if near is not None else ""
-    return Diagnostic("U101", f"`--set {name}=…`: there is no constant `{name}`", help=(f"{hint}{known}",))
+def _unknown(name: str, own: set[str], interface: Interface | None) -> Diagnostic:
+    states = () if interface is None else {each.partition("[")[0] for each in interface.signature.names}
+    constants = own | (set() if interface is None else {*interface.constants}) - {*states}
+    near = closest(name, [*constants, *states])
+    help_ = () if near is None else (f"did you mean `{near}`?",)
+    for kind, names in (("constants", constants), ("states, whose initial values it fixes", states)):
+        help_ = (*help_, f"{kind}: {', '.join(sorted(names))}") if names else help_
+    message = f"`--set {name}=…`: there is no constant or state `{name}`"
+    return Diagnostic("U101", message, help=help_ or ("the specification has no constant",))
 
 
 def parameters(

@@ -93,7 +93,7 @@ class StateKeys:
 
     unit: Unit = key(unit_text, "unit of the stored numbers", Unit())
     ends: Node | None = key(RANGE, "lower and upper end, numbers or vectors", name="range")
-    clamp: bool = key(FLAG, "kept within `range` after every step", False)
+    clamp: bool = key(FLAG, "kept within `range` after every substep", False)
     role: str = key(word(("state", "env")), "`env`: changed by events alone", "state")
     enum: Node | None = key(_ENUM, "members, by name or by name and value")
     boolean: bool = key(FLAG, "takes 0 and 1", False, name="bool")

@@ -147,11 +147,11 @@ def _held(linear: Linear) -> NDArray[np.bool_]:
     return np.asarray(others.max(0, initial=0.0) > STILL)
 
 
-def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
+def linearised(decl: SystemDecl, state: Doubles, control: Doubles, slope: float = SLOPE) -> Linear:
     """Linearise the step at `state` (n,) and `control` (m,) by central differences.
 
     The step follows the flow, without inner feedback, jumps and clamps. All values are in the units of the
-    columns.
+    columns; `slope` is the size of a difference, as a share of half the range of its column.
     """
     columns, names = decl.signature.columns, decl.signature.names
     moved = {assign.name for assign in decl.flow}
@@ -166,7 +166,7 @@ def linearised(decl: SystemDecl, state: Doubles, control: Doubles) -> Linear:
     )
     turned = [*moving, *range(len(names), len(spans))]
     at = np.concatenate((state, control))
-    nudge = SLOPE * half[turned]
+    nudge = slope * half[turned]
     points = np.tile(at, (2 * len(turned) + 1, 1))
     for row, (index, size) in enumerate(zip(turned, nudge, strict=True)):
         points[1 + 2 * row, index] += size
@@ -281,8 +281,10 @@ def growth_of(decl: SystemDecl) -> float:
     feedback = decl.feedback
     try:
         if feedback is None:
-            linear = linearised(decl, *_rest(decl, {}))
-            factor = linear.growth
+            rest = _rest(decl, {})
+            factor, closer = (linearised(decl, *rest, slope).growth for slope in (SLOPE, SLOPE / 8))
+            if not math.isclose(factor, closer, rel_tol=0.05):
+                return 1.0  # there is no slope, as where a root meets 0
         else:
             ends = zip(decl.controls, feedback.low, feedback.high, strict=True)
             own = tuple(replace(each, low=low, high=high) for each, low, high in ends)

@@ -210,6 +210,15 @@ def _syntax(source: Source, error: yaml.MarkedYAMLError) -> Diagnostic:
     for ugly, plain in _PLAIN_WORDS:
         problem = problem.replace(ugly, plain)
     helps = ("indent with blanks",) if "\t" in source.text[offset : offset + 1] else ()
+    row, column = source.position(offset)
+    above = next((line for line in range(row - 1, 0, -1) if source.line(line).split("#")[0].strip()), 0)
+    indent = len(source.line(above)) - len(source.line(above).lstrip()) if above else column - 1
+    if "block end" in (error.problem or "") and indent != column - 1:
+        start = source.line_starts[above - 1] + indent
+        said = f"indented by {indent}, the line below by {column - 1}"
+        labels = (Label(source.span(start, start + 1), said),)
+        problem = "two neighbouring lines are indented differently"
+        helps = ("keys of one mapping start in one column; keys below a key, farther right",)
     return Diagnostic(
         "S100", f"not YAML: {problem}", source.span(offset, offset + 1), labels=labels, help=helps
     )

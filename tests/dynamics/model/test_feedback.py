@@ -19,6 +19,7 @@ from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import SystemFileError
+from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.model.feedback import growth_of, linearised, riccati, unstable
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import truth, under
@@ -332,3 +333,27 @@ def test_what_cannot_be_had_is_refused(make: Make, text: str, code: str, says: s
     assert finding.code == code
     assert says in f"{finding.message} {finding.label} {' '.join(finding.help)}"
     assert finding.span is not None
+
+
+TANK = """
+stlc: 1
+name: tank
+time: {dt: 1 s, horizon: 60 steps, integrator: rk4}
+state: {h: {unit: m, range: [0 m, 4 m]}}
+control: {q: {unit: m/s, range: [0, 0.2]}}
+flow: {h: "q - FLOW"}
+init: {mixture: [{draw: {h: "uniform(0 m, 4 m)"}}]}
+"""
+
+
+@pytest.mark.parametrize("flow", ["0.1 * sqrt(max(h, 0 m) * 1 m) / 1 s", "0.1 / 1 s * h"])
+def test_a_stable_tank_is_not_called_unstable(tmp_path, flow):
+    path = tmp_path / "tank.yaml"
+    path.write_text(TANK.replace("FLOW", flow))
+    assert unstable(load_system_decl(path)) == ()
+
+
+def test_an_unstable_tank_is(tmp_path):
+    path = tmp_path / "tank.yaml"
+    path.write_text(TANK.replace("FLOW", "-0.2 / 1 s * h"))
+    assert [finding.code for finding in unstable(load_system_decl(path))] == ["W602"]

@@ -245,3 +245,23 @@ def test_both_parsers_give_the_same_document(part: int, monkeypatch: pytest.Monk
         assert read_by(text, fast, monkeypatch) == read_by(text, None, monkeypatch), text
     for text in ODD[part::2]:
         assert read_by(text, fast, monkeypatch) == read_by(text, None, monkeypatch), text
+
+
+@pytest.mark.parametrize(
+    ("text", "row"),
+    [
+        ("a: 1\nb: {c: 2}\n   d: {e: 3}\n", 3),
+        ("a:\n   b: 1\n  c: 2\n", 3),
+        ("a:\n   b: 1\n\n  # why\n  c: 2\n", 5),
+    ],
+)
+def test_lines_that_are_indented_differently_are_both_shown(text: str, row: int) -> None:
+    with pytest.raises(SystemFileError) as caught:
+        load(text)
+    (finding,) = caught.value.diagnostics
+    assert finding.span is not None
+    assert finding.span.line == row
+    assert "indented differently" in finding.message
+    (label,) = finding.labels
+    assert label.span.line == 2
+    assert label.text.startswith("indented by ")
