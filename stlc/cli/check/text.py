@@ -13,6 +13,7 @@ from stlc.cli.check.outcome import WORDS, Checked, VerdictRow
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns
+from stlc.compile.ir.traverse import margin_units
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import operand, shell, visible
 from stlc.monitor.explain.report import Cause
@@ -146,10 +147,12 @@ def rows_of(result: Checked, violated_at: Mapping[str, float]) -> tuple[VerdictR
         low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
         robustness, least = "", 0.0
         unit = judged.unit or ("" if cause is None else cause.unit)
+        several = margin_units(judged.rule.typed.formula)[:3]
+        units = unit or ("|".join(each or "1" for each in several) if any(several) else "")
         if judged.counted(judged.least).size:
             least = low if status == "inconclusive" else float(judged.counted(judged.least).min())
             shown = "inconclusive" if result.uncertain else status
-            robustness = robustness_text(shown, low, high, least, unit, judged.tolerance)
+            robustness = robustness_text(shown, low, high, least, units, judged.tolerance)
         share = "" if judged.holds.size == 1 else percent(judged.share)
         why = _inconclusive(judged, result) if status == "inconclusive" else ""
         why, where = why if cause is None else cause.because, _where(judged, result)
