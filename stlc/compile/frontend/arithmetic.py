@@ -33,11 +33,11 @@ _OF_POINTS = ("min", "max", "clip", "choice", "uniform")
 """Functions that select among temperatures in degC, or draw between them."""
 
 _LENGTHS = ("abs", "norm", "norm1", "norminf")
-_TEMPERATURE = (0, 0, 0, 0, 1)
+_TEMPERATURE = SYMBOLS["K"].dims
 _MISSING = {
-    (1, 0, 0, 0, 0): ("length", "m"),
-    (0, 1, 0, 0, 0): ("mass", "kg"),
-    (0, 0, 1, 0, 0): ("time", "s"),
+    SYMBOLS["m"].dims: ("length", "m"),
+    SYMBOLS["kg"].dims: ("mass", "kg"),
+    SYMBOLS["s"].dims: ("time", "s"),
 }
 
 
