@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import pytest
 from helpers.mission_strategies import bodies, missions, nested
 from hypothesis import given, settings
@@ -9,6 +11,10 @@ from hypothesis import strategies as st
 from proof.missions import check_margins, check_mission, check_nested, check_past, check_recorded
 
 from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
+from stlc.compile.pipeline import compile_spec
+from stlc.grammar.parse.parser import parse
+from stlc.source import Source
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -64,3 +70,17 @@ def test_margins_of_the_past_are_those_of_the_definition(formula: typed.Formula,
 @given(missions, seeds)
 def test_a_recorded_trace_is_judged_as_defined(formula: typed.Formula, seed: int) -> None:
     check_recorded(formula, seed)
+
+
+@pytest.mark.parametrize(
+    ("body", "text"),
+    [
+        ("not x <= 0.4 m", "true where `not x <= 0.4 m` holds"),
+        ("not (x > 1 m and x < 2 m)", "true where `not (x > 1 m and x < 2 m)` holds"),
+        ("`x` > 0.4 m", "true where '`x` > 0.4 m' holds"),
+    ],
+)
+def test_the_text_of_a_status_is_true(body, text):
+    spec = parse(Source("s.stl", f"signal x [m]\nrequire r: eventually@[0 s, 5 s] {body}\n"))
+    compiled = compile_spec(spec, grid=Grid(Fraction(1, 10), 10), interface=None)
+    assert any(text in timer.about for timer in compiled.timers)
