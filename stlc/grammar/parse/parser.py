@@ -27,7 +27,7 @@ from stlc.source import Source
 MAX_ERRORS = 20
 MAX_TEXT = 4_000_000
 MAX_LEXEMES = 500_000
-"""Words and signs of the longest text: parsing it takes half a minute and some 400 MB."""
+"""Words and signs of the longest text: linting it takes half a minute of the processor and some 200 MB."""
 _SHARED_TEXT = 32_768
 """Characters of the longest text whose trees are shared: they keep the text in memory."""
 
