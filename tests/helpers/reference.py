@@ -344,6 +344,11 @@ class Robustness:
             return self._most(
                 [self.at(i, t, positive) for i in node.items], "min" if node.op == "and" else "max"
             )
+        if node.op == "if":
+            cond, yes, no = node.items
+            first = self._most([self.at(cond, t, positive), self.at(yes, t, positive)], "min")
+            second = self._most([_negated(self.at(cond, t, not positive)), self.at(no, t, positive)], "min")
+            return self._most([first, second], "max")
         left, right = node.items
         if node.op == "->":
             return self._most([_negated(self.at(left, t, not positive)), self.at(right, t, positive)], "max")
@@ -460,8 +465,8 @@ def holds(formula: typed.Formula, trace: Trace, t: int = 0) -> bool:
                     return all(values)
                 case "or":
                     return any(values)
-                case "->":
-                    return not values[0] or values[1]
+                case "->" | "if":
+                    return values[1] if values[0] else op == "->" or values[2]
                 case "<->":
                     return values[0] is values[1]
                 case "xor":

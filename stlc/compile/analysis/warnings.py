@@ -23,6 +23,8 @@ def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
     """Yield the warning W505 for each conjunction in a formula that no values of its signals satisfy."""
     reported: set[Span] = set()
     for node in nodes(formula):
+        if isinstance(node, typed.Logic) and node.op == "if":
+            node = typed.Logic(node.items[1].span, "and", node.items[:2])
         if isinstance(node, typed.Logic) and node.op == "and" and node.span not in reported:
             found = _contradiction(node)
             if found is not None:

@@ -114,19 +114,16 @@ def _is_bool(value: Value) -> bool:
 def _choice_of_formulas(
     expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope
 ) -> typed.Formula:
-    """Return the formula `(cond and yes) or (not cond and no)`; `branches` are `yes` and `no`."""
+    """Return the formula `if cond then yes else no`; `branches` are `yes` and `no`."""
     yes = as_formula(branches[0], expr.yes, Expectation("`then`"), scope)
     no = as_formula(branches[1], expr.no, Expectation("`else`"), scope)
-    first = typed.Logic(expr.yes.span, "and", (cond, yes))
-    second = typed.Logic(expr.no.span, "and", (typed.Not(expr.cond.span, cond), no))
-    return typed.Logic(expr.span, "or", (first, second))
+    return typed.Logic(expr.span, "if", (cond, yes, no))
 
 
 def _choose(expr: ast.IfThenElse, cond: typed.Formula, branches: tuple[Value, Value], scope: Scope) -> Number:
     """Return the number `if cond then yes else no`; `branches` are the values of `yes` and `no`.
 
-    If both branches are bools, the number can also be used as a formula. `Number.formula` then holds
-    `(cond and yes) or (not cond and no)`.
+    If both branches are bools, the number can also be used as a formula, `Number.formula`.
     """
     decides = as_state_formula(cond, expr.cond, Expectation("`if`"), scope)
     need = Expectation("the branches of `if` are of one sort", "this")
@@ -681,7 +678,7 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
     names = [name for name, _ in expr.bindings]
     if len(set(names)) < len(names):
         scope.fail(Diagnostic("E102", "`freeze` binds one name twice", expr.span))
-    bindings: list[tuple[str, ir.Num]] = []
+    bindings: dict[str, Number] = {}
     bound: dict[str, tuple[Value, Cost]] = {}
     values = evaluate_all([value for _, value in expr.bindings], scope)
     for (name, written), value in zip(expr.bindings, values, strict=True):
@@ -693,19 +690,22 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
             bound[name] = (_frozen(number, name, expr, bindings), Cost(1, 1))
     inner = replace(scope, locals={**scope.locals, **bound})
     body = formula(expr.body, Expectation("`freeze`"), inner)
-    return typed.Freeze(expr.span, tuple(bindings), body) if bindings else body
+    if not bindings:
+        return body
+    pairs = tuple((key, number.num) for key, number in bindings.items())
+    return typed.Freeze(expr.span, pairs, body, tuple(number.unit for number in bindings.values()))
 
 
-def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: list[tuple[str, ir.Num]]) -> Number:
+def _frozen(number: Number, name: str, expr: ast.Freeze, bindings: dict[str, Number]) -> Number:
     """Return the frozen value of `number`, which a `freeze` binds to `name`.
 
-    The pair (unique name, number in the IR) is appended to `bindings`. For a constant, the result is `number`
-    itself, and nothing is appended.
+    The number is added to `bindings` under a unique name. For a constant, the result is `number` itself, and
+    nothing is added.
     """
     if number.constant is not None:
         return number
     key = f"{name}#{expr.span.start}@{expr.span.source.name}"
-    bindings.append((key, number.num))
+    bindings[key] = number
     return replace(number, num=ir.FrozenVar(key), formula=None, origin=None)
 
 

@@ -1,4 +1,4 @@
-"""Negation normal form: the expansion of `not`, `->`, `<->`, `xor` and `unless`.
+"""Negation normal form: the expansion of `not`, `->`, `<->`, `xor`, `if` and `unless`.
 
 De Morgan's laws push a negation down to the leaves: it swaps `and` with `or`, `always` with `eventually`,
 `once` with `historically`, `until` with `release`, `since` with `trigger`.
@@ -7,9 +7,9 @@ De Morgan's laws push a negation down to the leaves: it swaps `and` with `or`, `
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, assert_never
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -28,7 +28,7 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
     """Return `formula` if `sign` is 1, or its negation if -1, with negations pushed down to the leaves.
 
     The result has a `not` only before predicates, `since`, `rise`, `fall`, `prev`, `next`, and `Recalled`
-    nodes (past operators rewritten with timers). `->`, `<->`, `xor` and `unless` are expanded.
+    nodes (past operators rewritten with timers). `->`, `<->`, `xor`, `if` and `unless` are expanded.
     """
     op = getattr(formula, "op", "")
     match formula:
@@ -40,9 +40,15 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
             inner = normal(body, flip(sign))
             return replace(inner, span=span) if sign > 0 else inner  # the text there has the `not`
         case typed.Until(_, "unless"):
-            return normal(_unless(formula), sign)
-        case typed.Logic(_, "->" | "<->" | "xor"):
-            return _implication(formula, sign)
+            return normal(unless(formula), sign)
+        case typed.Logic(span, "->" | "<->" | "xor" | "if"):
+            outer = connective(formula, sign)
+            groups = [tuple(normal(*part) for part in group) for group in outer.groups]
+            inner = DUAL[outer.op]
+            parts = tuple(
+                group[0] if len(group) == 1 else typed.Logic(span, inner, group) for group in groups
+            )
+            return typed.Logic(span, outer.op, parts)
         case typed.Freeze():
             return map_children(formula, formulas=lambda part: normal(part, sign))
         case _ if op in DUAL and op != "since":
@@ -53,24 +59,46 @@ def normal(formula: typed.Formula, sign: Sign = 1) -> typed.Formula:
             return inner if sign > 0 else typed.Not(formula.span, inner)
 
 
-def _implication(node: typed.Logic, sign: Sign) -> typed.Formula:
-    """Rewrite `a -> b`, `a <-> b` (both directions) or `a xor b` (the negation of `a <-> b`).
+@dataclass(frozen=True, slots=True)
+class Connective:
+    """A propositional operator, or its negation, as an `and` or `or` of groups of operands.
 
-    For `sign` -1 the result is the negation.
+    Attributes:
+        op: operator between the groups; within a group it is the dual one.
+        groups: pairs (operand, sign); the sign -1 stands for the negation of the operand.
     """
-    left, right = node.items
-    if node.op == "xor":
-        sign = flip(sign)
-    inner: Literal["and", "or"] = "or" if sign > 0 else "and"
-    there = typed.Logic(node.span, inner, (normal(left, flip(sign)), normal(right, sign)))
-    if node.op == "->":
-        return there
-    back = typed.Logic(node.span, inner, (normal(left, sign), normal(right, flip(sign))))
-    return typed.Logic(node.span, DUAL[inner], (there, back))
+
+    op: Literal["and", "or"]
+    groups: tuple[tuple[tuple[typed.Formula, Sign], ...], ...]
 
 
-def _unless(node: typed.Until) -> typed.Formula:
-    """Rewrite `left unless[a, b] right` as `always[0, b] left or left until[a, b] right`."""
+def connective(formula: typed.Logic, sign: Sign = 1) -> Connective:
+    """Return the definition of a propositional operator, or of its negation if `sign` is -1.
+
+    `a -> b` is `not a or b`, `a <-> b` is `(a -> b) and (b -> a)`, and `a xor b` is the negation of that.
+    `if c then p else q` is `(c and p) or (not c and q)`.
+    """
+    op, items, inverse = formula.op, formula.items, flip(sign)
+    plain: Literal["and", "or"] = "and" if sign > 0 else "or"
+    dual: Literal["and", "or"] = DUAL[plain]
+    match op:
+        case "and" | "or":
+            return Connective(plain if op == "and" else dual, tuple(((item, sign),) for item in items))
+        case "->":
+            return Connective(dual, (((items[0], inverse),), ((items[1], sign),)))
+        case "if":
+            cond, yes, no = items
+            return Connective(dual, (((cond, sign), (yes, sign)), ((cond, inverse), (no, sign))))
+        case "xor":
+            return connective(replace(formula, op="<->"), inverse)
+        case "<->":
+            left, right = items
+            return Connective(plain, (((left, inverse), (right, sign)), ((left, sign), (right, inverse))))
+    assert_never(op)
+
+
+def unless(node: typed.Until) -> typed.Logic:
+    """Return `left unless[a, b] right` as `always[0, b] left or left until[a, b] right`."""
     whole = replace(node.interval, lo=typed.Time(), lo_open=False)
     held = typed.Temporal(node.span, "always", whole, node.left)
     return typed.Logic(node.span, "or", (held, replace(node, op="until")))

@@ -110,9 +110,12 @@ class Not(Node):
 
 @dataclass(frozen=True, slots=True)
 class Logic(Node):
-    """Propositional operator: `and`, `or` of two or more items; `->`, `<->`, `xor` of exactly two."""
+    """Propositional operator: `and`, `or` of two or more items; `->`, `<->`, `xor` of two; `if` of three.
 
-    op: Literal["and", "or", "xor", "->", "<->"]
+    The items of `if` are the condition and the formulas after `then` and `else`.
+    """
+
+    op: Literal["and", "or", "xor", "->", "<->", "if"]
     items: tuple[Formula, ...]
 
 
@@ -168,10 +171,12 @@ class Freeze(Node):
     Attributes:
         bindings: pairs (p0, p) of a name and an expression. In `body`, `ir.FrozenVar` refers to the name.
         body: formula that reads the names.
+        units: unit of each value in the source, for messages.
     """
 
     bindings: tuple[tuple[str, ir.Num], ...]
     body: Formula
+    units: tuple[Unit, ...] = field(default=(), compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
