@@ -43,9 +43,8 @@ def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[s
     tree = CauseFinder(Record(env, NUMPY), GRID).blame(formula, 0)
     assert -abs(tree.rho) == pytest.approx(value[1])
     for node in nodes(tree):
-        if node.until is None:
-            polarity = not node.holds
-            found = judge.at(node.formula, node.sample, polarity)
+        for sample in node.during or (node.sample,):
+            found = judge.at(node.formula, sample, not node.holds)
             assert found is not None
             assert (found[0] > 0) if node.holds else (found[1] < 0), node
         assert not node.reads or 0 <= node.sample < trace.samples
@@ -92,9 +91,9 @@ def test_an_operator_that_never_succeeds_is_explained_by_its_best(
     tree = CauseFinder(Record(env, NUMPY), GRID).blame(formula, 0)
     for node in nodes(tree):
         match node:
-            case CauseNode(formula=typed.Temporal(body=body), until=int() as last, parts=(best,)):
+            case CauseNode(formula=typed.Temporal(body=body), parts=(CauseNode(during=range()) as best,)):
                 wanted = not node.holds
-                ends = [judge.at(body, k, wanted) for k in range(node.sample, last + 1)]
+                ends = [judge.at(body, k, wanted) for k in best.during or ()]
                 margins = [end[1] if wanted else -end[0] for end in ends if end is not None]
                 assert -abs(best.rho) == pytest.approx(max(margins))
 

@@ -8,18 +8,21 @@ trace.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from helpers import reference
 from proof.cases import Case
-from proof.draw import Taste
+from proof.draw import DT, HORIZON, Taste
 from proof.streamed import drawn
 
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import from_now, on_clock
-from stlc.diagnostics import TraceError
+from stlc.diagnostics import SpecError, TraceError
 from stlc.monitor.explain.causes import CauseNode
 from stlc.monitor.explain.report import Cause, explain
 from stlc.monitor.instants import window_of
@@ -47,7 +50,7 @@ def check_cause(seed: int) -> bool:
     cause = explain(verdict, "r")
     if cause is None or _known_by_folding(case, monitor, cause):
         return False
-    wrong = [*_values(case, cause), *_labels(case, monitor, cause), *_change(case, monitor, cause)]
+    wrong = [*_values(case, cause), *_statements(case, monitor, cause), *_change(case, monitor, cause)]
     assert not wrong, f"{', '.join(wrong)}\n{cause.because}\n{cause.place.text} {cause.labels}\n{case}"
     return True
 
@@ -95,7 +98,7 @@ def _values(case: Case, cause: Cause) -> Iterator[str]:
     if not np.isclose(-leaf.rho if leaf.holds else leaf.rho, rho, rtol=0, atol=1e-9):
         yield f"value: {leaf.rho} at the leaf, {rho} is the robustness"
     for reading in cause.readings:
-        if reading.value not in case.columns()[reading.signal]:
+        if not reading.frozen and reading.value not in case.columns()[reading.signal]:
             yield f"value: {reading.text}"
 
 
@@ -118,30 +121,84 @@ class _Definition(reference.Robustness):
         return super()._at(node, t, positive)
 
 
-def _labels(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
-    """Check that the statements beside the parts are those of the definition."""
-    judge = _Definition(_seen(case, monitor, cause))
-    for node in _said(cause.tree):
-        formula: typed.Formula = node.formula
-        if node.until is not None:
-            formula = _body(formula)
-        for k in range(node.sample, (node.sample if node.until is None else node.until) + 1):
-            ends = judge.at(formula, k, not node.holds)
+@dataclass(frozen=True)
+class Statement:
+    """What is printed: a text, the truth value that it has at some instants, and its robustness, if told."""
+
+    text: str
+    holds: bool
+    instants: tuple[int, ...]
+    rho: float | None = None
+    formula: typed.Formula | None = None
+
+
+MOMENT = r"t = ([-+.\de]+) s"
+LABEL = re.compile(rf"(true|false|always true|never true) (?:at|from) {MOMENT}(?: to {MOMENT})?")
+BECAUSE = re.compile(rf"`([^`]*)` is (true|false) where .*?, at {MOMENT}(?:$|;)")
+
+
+def _printed(cause: Cause) -> Iterator[Statement]:
+    """The lines of the tree, the texts beside the underlined parts, and the sentence."""
+    for node in _nodes(cause.tree):
+        instants = tuple(node.during or (node.sample,))
+        rho = None if node.during else node.rho
+        yield Statement(node.span.text, node.holds, instants, rho, node.formula)
+    for label in (cause.place, *cause.labels):
+        found = LABEL.match(label.text)
+        assert found is not None, label
+        first = _sample(found[2])
+        last = first if found[3] is None else _sample(found[3])
+        yield Statement(label.span.text, found[1] in ("true", "always true"), tuple(range(first, last + 1)))
+    for text, truth, moment in BECAUSE.findall(cause.because):
+        yield Statement(text, truth == "true", (_sample(moment),))
+
+
+def _nodes(tree: CauseNode) -> Iterator[CauseNode]:
+    yield tree
+    for part in tree.parts:
+        yield from _nodes(part)
+
+
+def _sample(seconds: str) -> int:
+    return round(float(seconds) / float(DT))
+
+
+def _statements(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
+    """Check every printed text by the definition of the formula that it is, read alone.
+
+    A text with a name that has no meaning alone, an argument of a `def` or a variable of a quantifier, is
+    checked as the formula of its line, if it is one.
+    """
+    seen = _seen(case, monitor, cause)
+    kept = {each.name: each.num for leaf in cause.tree.leaves for each in leaf.frozen}
+    known = {name: f"({num.value!r})" for name, num in kept.items() if isinstance(num, ir.Const)}
+    source = cause.tree.span.source.text
+    alone: dict[str, typed.Formula | None] = {}
+    for said in _printed(cause):
+        if said.text not in alone:
+            text = re.sub(r"kept\d+", lambda found: known.get(found[0], found[0]), said.text)
+            alone[said.text] = _read(source[: source.index("require r:")], text)
+        formula = alone[said.text] or said.formula
+        if formula is None or (formula is said.formula and "kept" in said.text):
+            continue
+        for k in said.instants:
+            ends = _Definition(seen).at(formula, k, not said.holds)
             if case.folds and ends == reference.UNKNOWN:
                 continue  # the compiler knows what the definition leaves open
-            if ends is None or not (ends[0] >= 0 if node.holds else ends[1] <= 0):
-                yield f"label: {formula.span.text} {'true' if node.holds else 'false'} at {k}, not {ends}"
+            if ends is None or not (ends[0] >= 0 if said.holds else ends[1] <= 0):
+                yield f"printed: `{said.text}` {'true' if said.holds else 'false'} at {k}, not {ends}"
+            elif said.rho is not None and not case.folds:
+                value = ends[0] if said.holds else ends[1]
+                if not np.isclose(value, said.rho, rtol=0, atol=1e-9):
+                    yield f"printed: `{said.text}` robustness {said.rho} at {k}, not {value}"
 
 
-def _said(tree: CauseNode) -> Iterator[CauseNode]:
-    if tree.until is not None or tree.premise or not tree.parts:
-        yield tree
-    for part in tree.parts:
-        yield from _said(part)
-
-
-def _body(formula: typed.Formula) -> typed.Formula:
-    return formula.right if isinstance(formula, typed.Until) else formula.body  # type: ignore[union-attr]
+def _read(declarations: str, text: str) -> typed.Formula | None:
+    try:
+        alone = Monitor(f"{declarations}\nrequire r: {text}\n", dt=DT, horizon=HORIZON * DT)
+    except SpecError:
+        return None
+    return alone.compiled.requirements[0].typed.formula
 
 
 def _change(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:

@@ -89,33 +89,23 @@ def _walk(tree: CauseNode) -> Iterator[tuple[int, CauseNode]]:
 def _line(node: CauseNode, cause: Cause) -> str:
     """Line of output about one sub-formula, `node`, in the tree of causes of a violation.
 
-    It shows the text of the sub-formula, its truth value and instant, the values of its signals, and its
-    robustness.
+    It shows the text of the sub-formula, its truth value and instant, the values that it reads, and its
+    robustness. Of a sub-formula with the wrong truth value in a whole window, it shows this window too.
     """
+    from stlc.monitor.explain.report import readings_of
+
     text = " ".join(node.span.text.split())
     short = text if len(text) <= _WIDTH else f"{text[: _WIDTH - 1]}…"
     subject = cause.subject
-    when = subject.moment(node.sample)
-    if node.until is not None and node.until > node.sample:
-        when = f"from {when} to {subject.moment(node.until)}".replace("to t = ", "to ")
-    values = _readings(node, cause)
+    moment = subject.moment(node.sample)
+    when = f"at {moment}"
+    if node.during is not None:
+        first, last = (subject.moment(k) for k in (node.during[0], node.during[-1]))
+        when = f"from {first} to {last.removeprefix('t = ')}, closest {when}"
+    values = [reading.text for reading in readings_of(node, subject, subject.record.samples)]
     shown = f", {', '.join(values)}" if values else ""
     margin = in_unit(f"{node.rho:+.6g}", margin_unit(node.formula))
-    return f"{short}    is {str(node.holds).lower()} at {when}{shown}, robustness {margin}"
-
-
-def _readings(node: CauseNode, cause: Cause) -> list[str]:
-    from stlc.monitor.explain.report import shown
-
-    subject = cause.subject
-    found = []
-    for name, later in node.reads:
-        if not 0 <= node.sample + later < subject.record.samples:
-            continue
-        value = float(subject.record.env[name][node.sample + later, 0])
-        when = f" at {subject.moment(node.sample + later)}" if later else ""
-        found.append(f"{name} = {shown(value, subject.compiled.signature[name])}{when}")
-    return found
+    return f"{short}    is {str(node.holds).lower()} {when}{shown}, robustness {margin}"
 
 
 def _record(cause: Cause) -> ViolationCause:
@@ -124,7 +114,10 @@ def _record(cause: Cause) -> ViolationCause:
     The tree of causes becomes a list of nodes, parents before their children, each with its depth in the
     tree.
     """
+    from stlc.monitor.explain.report import readings_of
+
     subject = cause.subject
+    samples = subject.record.samples
     nodes: list[CauseNodeRecord] = [
         {
             "depth": depth,
@@ -135,7 +128,7 @@ def _record(cause: Cause) -> ViolationCause:
             "time": subject.time(node.sample),
             "robustness": node.rho,
             "unit": margin_unit(node.formula),
-            "readings": _readings(node, cause),
+            "readings": [reading.text for reading in readings_of(node, subject, samples)],
         }
         for depth, node in _walk(cause.tree)
     ]

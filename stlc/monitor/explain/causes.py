@@ -1,10 +1,11 @@
 """Causes of a violation at an instant (a sample of the trace), as a tree of sub-formulas.
 
-A node of the tree is a sub-formula at an instant, at which it has the wrong truth value. The children of a
-node explain this value. A violated conjunction has one child: the operand with the least robustness. A
-violated disjunction has all operands as children. A violated `always` has one child: its body at the worst
-instant. The body of a violated `eventually` fails at all instants of the window. The only child is the body
-at the instant at which it is closest to being true.
+A node of the tree is a sub-formula as written in the source, at an instant at which it has the wrong truth
+value. The children of a node explain this value. A violated conjunction has one child: the operand with the
+least robustness. A violated disjunction has all operands as children; other connectives are conjunctions and
+disjunctions by their definition. A violated `always` has one child: its body at the worst instant. The body
+of a violated `eventually` fails at all instants of the window. The only child is the body at the instant at
+which it is closest to being true.
 
 The main path leads from the root to one predicate at one instant, the deciding predicate. Its value is the
 robustness of the whole formula. Several predicate values may be equal to the robustness. The path then leads,
@@ -14,9 +15,10 @@ if possible, to one that decides alone: a change of this value changes the robus
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias, assert_never
+from itertools import chain
+from typing import Any, TypeAlias, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +28,26 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.normal_form import connective, unless
 from stlc.compile.ir.support import columns_of, history
-from stlc.compile.ir.traverse import from_now, leaves, numbers, on_clock, operands, substitute_frozen
+from stlc.compile.ir.traverse import (
+    from_now,
+    frozen_in,
+    is_state,
+    leaves,
+    nodes,
+    numbers,
+    on_clock,
+    operands,
+    substitute_frozen,
+)
 from stlc.compile.lowering.lower import lower
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.monitor.cells import over_columns
 from stlc.monitor.holes import KNOWN
 from stlc.monitor.values import Record, assume_missing_true, bounds
 from stlc.source import Span
+from stlc.units import DIMENSIONLESS, Unit
 
 Floats = NDArray[np.float64]
 
@@ -42,8 +57,28 @@ MOST_TIED = 64
 _MOST_NUMBERS = 1 << 26
 """Greatest number of stored predicate values for that search."""
 
+_SMALL = 1e-7
+"""Relative change of a signal, to see whether the value of a predicate moves with it."""
+
 _MOST_LATER = 64
 """Greatest number of instants after the last sample at which past operators are still evaluated."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenValue:
+    """Value that a `freeze` has stored.
+
+    Attributes:
+        name: name to which the `freeze` binds it.
+        num: the value, as a constant in SI units; a signal after the end of the trace if it is unknown.
+        unit: unit of the value in the source.
+        sample: instant of the `freeze`, as a sample number.
+    """
+
+    name: str
+    num: ir.Num
+    unit: Unit
+    sample: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +90,13 @@ class CauseNode:
         holds: truth value that the sub-formula has; the opposite value is needed.
         sample: the instant, as a sample number.
         rho: robustness of the sub-formula at `sample`; its sign gives `holds`.
-        until: last instant of the window, if the node is a temporal operator whose body has the wrong truth
-            value in the whole window; `sample` is then the first instant. Otherwise None.
+        during: instants of a window of the parent at all of which the sub-formula has this truth value;
+            `sample` is the one at which it is closest to the other. None if only `sample` matters.
         reads: pairs (signal, offset) of a predicate, which reads the signal `offset` samples after `sample`.
+        frozen: frozen values that a predicate reads.
         parts: the children, which explain this node; empty for a predicate.
         main: index in `parts` of the child on the main path, whose robustness determines that of the node.
-        premise: whether the sub-formula is the left side of an implication.
+        premise: whether the sub-formula is the left side of an implication, or the condition of an `if`.
         moves: whether the robustness changes if only the value of the deciding predicate (`leaf`) changes.
             Not if a `freeze` stores a value that the predicate inside reads at the same sample.
     """
@@ -69,8 +105,9 @@ class CauseNode:
     holds: bool
     sample: int
     rho: float
-    until: int | None = None
+    during: range | None = None
     reads: tuple[tuple[str, int], ...] = ()
+    frozen: tuple[FrozenValue, ...] = ()
     parts: tuple[CauseNode, ...] = ()
     main: int = 0
     premise: bool = False
@@ -92,6 +129,15 @@ class CauseNode:
         return self.moves and (not self.parts or self.parts[self.main].path_moves)
 
     @property
+    def violated(self) -> int:
+        """Instant at which the body of the outermost `always` is violated; without one, `sample`."""
+        outer: bool = isinstance(self.formula, (typed.Not, typed.Logic)) or (
+            isinstance(self.formula, typed.Temporal)
+            and self.formula.op == ("eventually" if self.holds else "always")
+        )
+        return self.parts[0].violated if outer and len(self.parts) == 1 else self.sample
+
+    @property
     def leaves(self) -> tuple[CauseNode, ...]:
         """All predicate nodes of the tree."""
         return tuple(leaf for part in self.parts for leaf in part.leaves) if self.parts else (self,)
@@ -102,6 +148,15 @@ Spot: TypeAlias = tuple[ir.Formula, int]
 
 Goal: TypeAlias = tuple[typed.Formula, int, bool]
 """A formula, an instant, and the truth value that the formula should have there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Violations:
+    """Instants at which a sub-formula of a requirement does not have the truth value `wanted`."""
+
+    formula: typed.Formula
+    wanted: bool
+    instants: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +222,7 @@ class CauseFinder:
         known: lowered formula -> list of pairs (range of instants, upper bounds on the robustness at them).
         tied: predicate values, one of them slightly increased, on which formulas are then evaluated.
         stop: number of samples that the complete trace would have, if the recording is shorter; else None.
+        frozen: values of the enclosing `freeze` operators.
     """
 
     record: Record
@@ -175,6 +231,7 @@ class CauseFinder:
     known: dict[ir.Formula, list[tuple[range, Floats]]] = field(default_factory=dict)
     tied: _Tied | None = None
     stop: int | None = None
+    frozen: Mapping[str, FrozenValue] = field(default_factory=dict)
 
     def why(self, formula: typed.Formula, sample: int, *, wanted: bool = True) -> tuple[CauseNode, bool]:
         """Explain why `formula` does not have the truth value `wanted` at `sample`.
@@ -189,7 +246,7 @@ class CauseFinder:
         worth = self._margin(formula, sample, wanted)
         equal = self._equal(lowered, worth) if np.isfinite(worth) else []
         if len(equal) < 2:
-            return tree, len(equal) == 1 and tree.path_moves
+            return tree, len(equal) == 1 and self._alone(tree, lowered)
         samples = self.record.samples
         if equal[-1][1] >= samples or samples * len(_leaves_of(lowered)) > _MOST_NUMBERS:
             return tree, False
@@ -204,8 +261,42 @@ class CauseFinder:
             if raised.worth(lowered, sample) > worth:
                 if chosen not in first:
                     tree = replace(self, cache={}, known={}, tied=raised).blame(formula, sample, wanted)
-                return tree, tree.path_moves
+                return tree, self._alone(tree, lowered)
         return tree, False
+
+    def _alone(self, tree: CauseNode, lowered: ir.Formula) -> bool:
+        """True if the deciding predicate, whose value decides alone, also does if its signals change.
+
+        Not if its value only moves with a step of a signal, as that of `floor(x) > 2`, which may change other
+        predicates or instants that read the signal.
+        """
+        leaf = tree.leaf
+        names = {name for name, _ in leaf.reads}
+        frozen = dict(zip(_frozen_in(leaf), leaf.frozen, strict=True))
+        own = replace(self, cache={}, frozen=frozen)._lowered(leaf.formula, not leaf.holds)
+        parts = set(_leaves_of(own))
+        alike = (node for node in nodes(lowered) if isinstance(node, ir.Predicate) and node not in parts)
+        shared = len(names) < len(leaf.reads) or any(columns_of(node.num) & names for node in alike)
+        return tree.path_moves and not (shared and self._steps(leaf, own))
+
+    def _steps(self, leaf: CauseNode, own: ir.Formula) -> bool:
+        """True if no small change of a signal moves the value of the predicate `leaf`, lowered as `own`."""
+        at, env = range(leaf.sample, leaf.sample + 1), self.record.env
+
+        def worth(record: Record) -> float:
+            return float(record.values([own], at, "upper", self.stop)[0][0, 0])
+
+        before = worth(self.record)
+        for name, later in leaf.reads:
+            there = leaf.sample + later
+            if not 0 <= there < self.record.samples:
+                continue
+            for side in (1.0, -1.0):
+                column = env[name].copy()
+                column[there] += side * _SMALL * max(1.0, abs(column[there, 0]))
+                if worth(replace(self.record, env={**env, name: column})) > before:
+                    return False
+        return True
 
     def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
         """Predicates of `lowered` and instants at which they have the value `worth`, in order of time."""
@@ -221,37 +312,80 @@ class CauseFinder:
 
     def blame(self, formula: typed.Formula, sample: int, wanted: bool = True) -> CauseNode:
         """Return the tree that explains why `formula` does not have the truth value `wanted` at `sample`."""
+        node = self._node(formula, sample, wanted)
         match formula:
-            case typed.Truth() | typed.Recalled():
-                return self._node(formula, sample, wanted)
             case typed.Predicate():
-                return self._predicate(formula, sample, wanted)
-            case typed.Not(span, body) if span == body.span and span.text:
-                return self._predicate(formula, sample, wanted)  # `not in`: to a reader one predicate
+                return self._predicate(node)
+            case _ if _is_written_predicate(formula):
+                return self._predicate(node)
+            case typed.Truth() | typed.Recalled():
+                return node
             case typed.Not(_, body):
-                return self.blame(body, sample, not wanted)
+                found = replace(node, parts=(self.blame(body, sample, not wanted),))
             case typed.Logic():
-                return self._logic(formula, sample, wanted)
+                found = self._logic(node, formula)
             case typed.Temporal() | typed.Until() if on_clock(formula):
-                return self.blame(from_now(formula), 0, wanted)
+                found = replace(self.blame(from_now(formula), 0, wanted), formula=formula)
             case typed.Temporal():
-                return self._temporal(formula, sample, wanted)
-            case typed.Until(span, "unless", interval, left, _):
-                whole = replace(interval, lo=typed.Time(), lo_open=False)
-                either = (typed.Temporal(span, "always", whole, left), replace(formula, op="until"))
-                return self.blame(typed.Logic(span, "or", either), sample, wanted)
+                found = self._temporal(node, formula)
+            case typed.Until(_, "unless"):
+                found = replace(node, parts=(self.blame(unless(formula), sample, wanted),))
             case typed.Until():
-                return self._until(formula, sample, wanted)
+                found = self._until(node, formula)
             case typed.Shift(_, steps, body):
                 there = sample + steps
                 decided = there < self.record.samples or self._margin(body, there, wanted) != math.inf
                 parts = (self.blame(body, there, wanted),) if there >= 0 and decided else ()
-                return replace(self._node(formula, sample, wanted), parts=parts)
+                found = replace(node, parts=parts)
             case typed.Edge():
-                return self._edge(formula, sample, wanted)
+                found = self._edge(node, formula)
             case typed.Freeze():
-                return self._freeze(formula, sample, wanted)
-        assert_never(formula)
+                found = self._freeze(node, formula)
+            case _:
+                assert_never(formula)
+        return _merged(found)
+
+    def violations(
+        self, formula: typed.Formula, instants: NDArray[np.int64], *, wanted: bool = True
+    ) -> Iterator[Violations]:
+        """Yield the instants at which the bodies of the outermost `always` are violated.
+
+        Args:
+            formula: formula that does not have the truth value `wanted` at `instants`, in ascending order.
+            instants: samples.
+            wanted: truth value that is needed.
+        """
+        match formula:
+            case typed.Not(_, body):
+                yield from self.violations(body, instants, wanted=not wanted)
+            case typed.Temporal(_, op, _, body) if op == ("always" if wanted else "eventually"):
+                here = from_now(formula) if on_clock(formula) else formula
+                windows = [self._instants(self._lowered(here, wanted), int(k)) for k in instants]
+                edges = np.zeros(max((each.stop for each in windows), default=0) + 1, np.int64)
+                for window in windows:
+                    if window:
+                        edges[window.start] += 1
+                        edges[window.stop] -= 1
+                inside = np.flatnonzero(np.cumsum(edges) > 0)
+                yield from self._failing(body, inside, wanted)
+            case typed.Logic():
+                outer = connective(formula, 1 if wanted else -1)
+                if outer.op == "or" or any(len(group) > 1 for group in outer.groups):
+                    yield Violations(formula, wanted, instants)
+                    return
+                for ((part, sign),) in outer.groups:
+                    yield from self._failing(part, instants, sign > 0)
+            case _:
+                yield Violations(formula, wanted, instants)
+
+    def _failing(
+        self, formula: typed.Formula, instants: NDArray[np.int64], wanted: bool
+    ) -> Iterator[Violations]:
+        if len(instants):
+            span = range(int(instants[0]), int(instants[-1]) + 1)
+            margins = self._margins(formula, wanted, span)[instants - span.start]
+            if (margins < -TOLERANCE).any():
+                yield from self.violations(formula, instants[margins < -TOLERANCE], wanted=wanted)
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
         """Return the formula with basic operators and intervals in samples, negated if `wanted` is False.
@@ -261,7 +395,10 @@ class CauseFinder:
         key = (formula, wanted)
         if key not in self.cache:
             goal = formula if wanted else typed.Not(formula.span, formula)
-            given = assume_missing_true(lower(goal, self.grid, []), self.record.env)
+            thawed = substitute_frozen(
+                lower(goal, self.grid, []), {key: kept.num for key, kept in self.frozen.items()}
+            )
+            given = assume_missing_true(thawed, self.record.env)
             self.cache[key] = self.record.sides(given)[1]
         return self.cache[key]
 
@@ -298,9 +435,10 @@ class CauseFinder:
         margin = self._margin(formula, sample, wanted)
         return CauseNode(formula, not wanted, sample, margin if wanted else -margin)
 
-    def _predicate(self, formula: typed.Formula, sample: int, wanted: bool) -> CauseNode:
-        reads = self._reads(numbers(self._lowered(formula, wanted)), sample)
-        return replace(self._node(formula, sample, wanted), reads=tuple(sorted(reads)))
+    def _predicate(self, node: CauseNode) -> CauseNode:
+        reads = self._reads(numbers(self._lowered(node.formula, not node.holds)), node.sample)
+        frozen = tuple(self.frozen[key] for key in _frozen_in(node))
+        return replace(node, reads=tuple(sorted(reads)), frozen=frozen)
 
     def _reads(self, nums: Iterable[ir.Num], sample: int) -> set[tuple[str, int]]:
         """Pairs (signal, offset) of the values that expressions read when evaluated at `sample`."""
@@ -313,63 +451,68 @@ class CauseFinder:
                 found.add((leaf.name, there - sample if leaf.clamped else leaf.steps))
         return found
 
-    def _freeze(self, formula: typed.Freeze, sample: int, wanted: bool) -> CauseNode:
-        thawed = substitute_frozen(formula.body, self._values(formula, sample))
-        tree, alone = replace(self, cache={}, known={}, tied=None).why(thawed, sample, wanted=wanted)
-        stored = self._reads((num for _, num in formula.bindings), sample)
-        frozen = {(name, sample + later) for name, later in stored}
+    def _freeze(self, node: CauseNode, formula: typed.Freeze) -> CauseNode:
+        values = {**self.frozen, **self._values(formula, node.sample)}
+        inner = replace(self, cache={}, known={}, tied=None, frozen=values)
+        tree, alone = inner.why(formula.body, node.sample, wanted=not node.holds)
+        stored = self._reads((num for _, num in formula.bindings), node.sample)
+        frozen = {(name, node.sample + later) for name, later in stored}
         read = {(name, tree.leaf.sample + later) for name, later in tree.leaf.reads}
-        return replace(tree, moves=alone and not frozen & read)
+        return replace(node, parts=(tree,), moves=alone and not frozen & read)
 
-    def _values(self, formula: typed.Freeze, sample: int) -> dict[str, ir.Num]:
-        """Constants that a `freeze` stores; an unknown one is a signal after the end of the trace."""
-        values: dict[str, ir.Num] = {}
+    def _values(self, formula: typed.Freeze, sample: int) -> dict[str, FrozenValue]:
+        values: dict[str, FrozenValue] = {}
         last = self.record.samples - 1
-        for name, num in formula.bindings:
-            values[name] = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
+        outer = {key: kept.num for key, kept in self.frozen.items()}
+        units = formula.units or (DIMENSIONLESS,) * len(formula.bindings)
+        for (key, written), unit in zip(formula.bindings, units, strict=True):
+            num = substitute_frozen(written, outer)
+            value: ir.Num = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
             given = columns_of(num) <= self.record.env.keys()
             if given and sample <= last and defined(ir.Predicate(num), last + 1)[sample]:
                 low, high = bounds(ir.Predicate(num), self.record, range(sample, sample + 1), "open")
                 if low[0, 0] == high[0, 0]:
-                    values[name] = ir.Const(float(low[0, 0]))
+                    value = ir.Const(float(low[0, 0]))
+            values[key] = FrozenValue(key.partition("#")[0], value, unit, sample)
         return values
 
     # ---------------------------------------------------------------- connectives
 
-    def _logic(self, formula: typed.Logic, sample: int, wanted: bool) -> CauseNode:
-        node = self._node(formula, sample, wanted)
-        items: Sequence[Goal]
-        match formula.op:
-            case "and" | "or":
-                items = [(item, sample, wanted) for item in formula.items]
-                all_needed = (formula.op == "and") is wanted
-            case "->":
-                left, right = formula.items
-                items = [(left, sample, not wanted), (right, sample, wanted)]
-                all_needed = not wanted
-            case "<->" | "xor":  # of each way to become true, the operand that is farthest from it
-                left, right = formula.items
-                same = (formula.op == "<->") is wanted
-                ways = [[(left, sample, its), (right, sample, its is same)] for its in (True, False)]
-                items = sorted(map(self._least, ways), key=lambda item: item[0] is right)
-                all_needed = False
-            case _:
-                assert_never(formula.op)
-        if all_needed:
-            return replace(node, parts=(self.blame(*self._least(items)),))
-        parts = tuple(self.blame(*item) for item in items)
+    def _logic(self, node: CauseNode, formula: typed.Logic) -> CauseNode:
+        outer = connective(formula, -1 if node.holds else 1)
+        groups = [[(part, node.sample, sign > 0) for part, sign in group] for group in outer.groups]
+        if outer.op == "and":  # of the group that is farthest from holding, no operand has the needed value
+            items = min(groups, key=lambda group: max(self._margin(*item) for item in group))
+        else:  # of each group, the operand that is farthest from the needed value
+            items = sorted(map(self._least, groups), key=lambda item: _place(formula, item[0]))
+        if formula.op in ("->", "if") and len(items) > 1:
+            return replace(node, **self._decision(formula.items[0], items))
         margins = np.array([self._margin(*item) for item in items])
-        if formula.op == "->":
-            main = int(margins[1] >= margins[0])
-            return replace(node, parts=(replace(parts[0], premise=True), parts[1]), main=main)
-        return replace(node, parts=parts, main=_greatest_known(margins))
+        return replace(node, parts=tuple(self.blame(*item) for item in items), main=_greatest_known(margins))
 
-    def _edge(self, formula: typed.Edge, sample: int, wanted: bool) -> CauseNode:
-        node = self._node(formula, sample, wanted)
-        if sample == 0:
+    def _decision(self, premise: typed.Formula, items: Sequence[Goal]) -> dict[str, Any]:
+        """Parts of an implication or `if`: what it decides on first, and then the operands in its scope."""
+        margins = np.array([self._margin(*item) for item in items])
+        main = len(items) - 1 - _greatest_known(margins[::-1])  # of equal ones the last
+        found = [self.blame(*item) for item in items]
+        if items[0][0] is not premise:
+            sample = items[0][1]
+            fails = [side for side in (True, False) if self._margin(premise, sample, side) < 0]
+            found[:0] = [self.blame(premise, sample, side) for side in fails[:1]]
+            main += len(fails[:1])
+        first, *rest = found
+        if first.formula is premise:
+            first = replace(first, premise=True)
+        return {"parts": (first, *rest), "main": main}
+
+    def _edge(self, node: CauseNode, formula: typed.Edge) -> CauseNode:
+        if node.sample == 0:
             return node
-        now = formula.op == "rise"
-        items = [(formula.body, sample, now is wanted), (formula.body, sample - 1, now is not wanted)]
+        now, wanted = formula.op == "rise", not node.holds
+        items = [
+            (formula.body, node.sample, now is wanted),
+            (formula.body, node.sample - 1, now is not wanted),
+        ]
         if wanted:
             return replace(node, parts=(self.blame(*self._least(items)),))
         main = int(np.argmax([self._margin(*item) for item in items]))
@@ -394,9 +537,9 @@ class CauseFinder:
         """First instant at which operands are unknown; past operators read samples before it, too."""
         return self.record.samples + min(max(map(history, operands(lowered))), _MOST_LATER)
 
-    def _temporal(self, formula: typed.Temporal, sample: int, wanted: bool) -> CauseNode:
-        node = self._node(formula, sample, wanted)
-        instants = self._instants(self._lowered(formula, wanted), sample)
+    def _temporal(self, node: CauseNode, formula: typed.Temporal) -> CauseNode:
+        wanted = not node.holds
+        instants = self._instants(self._lowered(formula, wanted), node.sample)
         if not instants:
             return node
         margins = self._margins(formula.body, wanted, instants)
@@ -404,10 +547,11 @@ class CauseFinder:
             worst = instants[int(np.argmin(margins))]
             return replace(node, parts=(self.blame(formula.body, worst, wanted),))
         part = self.blame(formula.body, instants[_greatest_known(margins)], wanted)
-        return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
+        return replace(node, parts=(_throughout(part, instants),))
 
-    def _until(self, formula: typed.Until, sample: int, wanted: bool) -> CauseNode:
-        node, lowered = self._node(formula, sample, wanted), self._lowered(formula, wanted)
+    def _until(self, node: CauseNode, formula: typed.Until) -> CauseNode:
+        sample, wanted = node.sample, not node.holds
+        lowered = self._lowered(formula, wanted)
         instants = self._instants(lowered, sample)
         last = lowered.window.hi if isinstance(lowered, ir.Until) else None
         # the window extends to instants at which operands are unknown
@@ -432,9 +576,48 @@ class CauseFinder:
             return replace(node, parts=(freed, failed), main=main)
         offset, is_left = _unmet(left, right)
         part = self.blame(formula.left if is_left else formula.right, sample + way * offset, wanted)
-        if is_left or beyond or (right >= 0).any():
-            return replace(node, parts=(part,))
-        return replace(node, sample=instants[0], until=instants[-1], parts=(part,))
+        if not (is_left or beyond or (right >= 0).any()):
+            part = _throughout(part, instants)
+        return replace(node, parts=(part,))
+
+
+def _throughout(node: CauseNode, instants: range) -> CauseNode:
+    """The node, and what it negates, with all instants of a window, at which the truth value is the same."""
+    if len(instants) < 2:
+        return node
+    negated = isinstance(node.formula, typed.Not) and len(node.parts) == 1
+    parts = (_throughout(node.parts[0], instants),) if negated else node.parts
+    return replace(node, during=instants, parts=parts)
+
+
+def _is_written_predicate(formula: typed.Formula) -> bool:
+    """True for a formula that is one predicate in the source, such as `a != b` or `x not in [1, 2]`."""
+    whole = formula.span
+    return bool(whole.text) and is_state(formula) and all(node.span == whole for node in nodes(formula))
+
+
+def _merged(node: CauseNode) -> CauseNode:
+    """Put the children of children at the same place of the source in place of these.
+
+    They come from the definition of an operator, such as `unless`, and have no text of their own.
+    """
+    merged = [bool(part.parts) and part.span == node.span and bool(node.span.text) for part in node.parts]
+    if not any(merged):
+        return node
+    groups = [part.parts if its else (part,) for part, its in zip(node.parts, merged, strict=True)]
+    main, moves = sum(map(len, groups[: node.main])), node.moves
+    if merged[node.main]:
+        main, moves = main + node.parts[node.main].main, moves and node.parts[node.main].moves
+    return replace(node, parts=tuple(chain.from_iterable(groups)), main=main, moves=moves)
+
+
+def _frozen_in(node: CauseNode) -> list[str]:
+    """Keys of the frozen values that a predicate reads, in the order of their names."""
+    return sorted(frozenset().union(*map(frozen_in, numbers(node.formula))))
+
+
+def _place(formula: typed.Logic, item: typed.Formula) -> int:
+    return next(index for index, each in enumerate(formula.items) if each is item)
 
 
 def _greatest_known(margins: Floats) -> int:

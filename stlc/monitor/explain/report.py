@@ -6,13 +6,16 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 
+import numpy as np
+
 from stlc.compile.augment.lift import from_first_sample
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.traverse import margin_unit, operands
+from stlc.compile.ir.traverse import margin_unit
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Label
 from stlc.grammar import ast
-from stlc.monitor.explain.causes import CauseFinder, CauseNode
+from stlc.monitor.explain.causes import CauseFinder, CauseNode, Violations
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import Judgement, Part, Prepared, Verdict
 from stlc.monitor.values import Record
@@ -24,19 +27,21 @@ _MOST_LABELS = 6
 
 @dataclass(frozen=True, slots=True)
 class SignalValue:
-    """Value of a signal at an instant at which the deciding predicate reads it.
+    """Value of a signal at an instant at which a predicate reads it, or value that a `freeze` has stored.
 
     Attributes:
-        signal: name of the signal.
+        signal: name of the signal, or of the frozen value.
         value: value in the unit of the signal.
-        unit: declared unit; "" if there is none.
-        text: name and value in words: `x = 0.27 m`, `sign = stop`.
+        unit: its unit; "" if there is none.
+        text: name and value in words: `x = 0.27 m`, `sign = stop`, `x0 = 2 m (frozen at t = 4 s)`.
+        frozen: whether it is a frozen value.
     """
 
     signal: str
     value: float
     unit: str
     text: str
+    frozen: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +54,16 @@ class Cause:
         start: sample at which the requirement was evaluated.
         sample: sample at which the deciding predicate was evaluated.
         time: time of `sample` in seconds.
+        violated: sample at which the body of the outermost `always` is violated; without one, `start`.
         predicate: text of the deciding predicate.
         span: source location of the deciding predicate.
-        readings: values of the signals that the predicate reads at `sample`.
+        readings: values of the signals and of frozen values that the predicate reads at `sample`.
         place: the part of the requirement to underline first, and the text beside it.
         labels: the other parts to underline, and their texts.
         because: the cause in words, on one line.
         tree: tree of the sub-formulas that explain the violation, down to predicates.
-        alone: whether the robustness rises if only the value of `predicate` at `sample` rises.
+        alone: whether the robustness rises if only the value of `predicate` at `sample` rises, and a change
+            of its signals there can make it rise.
         subject: the trace from the first judged sample on, from which the tree counts samples.
         first: index of this sample in the trace.
     """
@@ -66,6 +73,7 @@ class Cause:
     start: int
     sample: int
     time: float
+    violated: int
     predicate: str
     span: Span
     readings: tuple[SignalValue, ...]
@@ -83,9 +91,19 @@ class Cause:
         return self.subject.moment(self.start - self.first)
 
     @property
+    def shown(self) -> int:
+        """Sample by which the violation shows: `violated`, or `sample` where that comes later."""
+        return max(self.violated, self.sample)
+
+    @property
+    def shown_time(self) -> float:
+        """Time of `shown` in seconds."""
+        return self.subject.time(self.shown - self.first)
+
+    @property
     def moment(self) -> str:
-        """Instant at which the deciding predicate was evaluated, as text."""
-        return self.subject.moment(self.sample - self.first)
+        """Instant by which the violation shows, as text."""
+        return self.subject.moment(self.shown - self.first)
 
     @property
     def unit(self) -> str:
@@ -97,6 +115,23 @@ MOST = 500
 """Greatest number of violated requirements explained at once; each takes half a millisecond."""
 
 
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """Consecutive samples at which the body of the outermost `always` of a requirement is violated.
+
+    A requirement without an `always` is violated at the sample at which it is evaluated.
+
+    Attributes:
+        first: the first of the samples.
+        last: the last of them.
+        cause: cause of the violation at the first one.
+    """
+
+    first: int
+    last: int
+    cause: Cause
+
+
 def explain(verdict: Verdict, name: str) -> Cause | None:
     """Return the cause of the worst violation of a requirement; None if it is not violated.
 
@@ -105,64 +140,120 @@ def explain(verdict: Verdict, name: str) -> Cause | None:
     judgement = verdict[name]
     if judgement.overall != "violated":
         return None
-    definitions = _definitions(verdict.subject.compiled.spec)
-    return _cause(judgement, verdict.subject, judgement.worst, definitions)
-
-
-def explain_at(verdict: Verdict, name: str, trace: int, start: int) -> Cause | None:
-    """Return the cause of a violation by one trace in the window that begins at sample `start`.
-
-    None if no single sample in each step shows it. Raises UsageError (U101) for an unknown requirement.
-    """
-    definitions = _definitions(verdict.subject.compiled.spec)
-    return _cause(verdict[name], verdict.subject, (trace, start), definitions)
+    return _cause(judgement, verdict.subject, _definitions(verdict.subject.compiled.spec))
 
 
 def explain_all(verdict: Verdict) -> dict[str, Cause]:
     """Return the causes of the first `MOST` violated requirements, by name of the requirement."""
     definitions = _definitions(verdict.subject.compiled.spec)
     violated = [judgement for judgement in verdict if judgement.overall == "violated"]
-    found = {x.name: _cause(x, verdict.subject, x.worst, definitions) for x in violated[:MOST]}
+    found = {x.name: _cause(x, verdict.subject, definitions) for x in violated[:MOST]}
     return {name: cause for name, cause in found.items() if cause is not None}
 
 
-def _cause(
-    judgement: Judgement, subject: Prepared, at: tuple[int, int], definitions: dict[str, ast.Expr]
-) -> Cause | None:
-    rule, (trace, start) = judgement.rule, at
-    part = judgement.part or Part(0, subject.record.samples)
-    subject = _evidence(rule, subject, part, trace)
-    record, start = subject.record, start - part.first
-    if subject.signals.times is not None:  # of several samples in a step, one was chosen
-        (high,) = rule_bounds(rule, record, range(start, start + 1), subject.horizon, "open")[1]
-        if not float(high.max()) < 0.0:
-            return None
-    window = window_of(rule, subject.horizon)
-    stop = None if window is None else start + window + 1
-    if stop is not None and stop <= record.samples:
-        record, stop = record.cut(stop), None
-    formula = from_first_sample(rule.typed.formula) if rule.absolute else rule.typed.formula
-    tree, alone = CauseFinder(record, subject.compiled.grid, stop=stop).why(formula, start)
-    words = _Words(subject, record, rule.typed.written, definitions)
-    leaf = tree.leaf
-    place, *labels = words.labels(tree)
-    return Cause(
-        judgement=judgement,
-        trace=trace,
-        start=start + part.first,
-        sample=leaf.sample + part.first,
-        time=subject.time(leaf.sample),
-        predicate=_flat(leaf.span.text),
-        span=leaf.span,
-        readings=words.readings(leaf),
-        place=place,
-        labels=tuple(labels[: _MOST_LABELS - 1]),
-        because=words.because(tree),
-        tree=tree,
-        alone=alone,
-        subject=subject,
-        first=part.first,
-    )
+def violations(verdict: Verdict, name: str, trace: int, most: int) -> list[Violation]:
+    """Return the first `most` violations of a requirement by one trace, in order of time.
+
+    Left out are those that no single sample in each step shows. Raises UsageError (U101) for an unknown
+    requirement.
+    """
+    judgement, definitions = verdict[name], _definitions(verdict.subject.compiled.spec)
+    judged = _JudgedTrace.of(judgement, verdict.subject, trace)
+    found: dict[int, tuple[int, CauseFinder, typed.Formula, bool]] = {}
+    finder = None
+    for start in (judgement.start - judged.first + np.flatnonzero(judgement.fails[:, trace])).tolist():
+        if not judged.shows(start):
+            continue
+        if finder is None or judged.window is not None:
+            finder = judged.finder(start)
+        own = list(finder.violations(judged.formula, np.array([start])))
+        for each in own or [Violations(judged.formula, True, np.array([start]))]:
+            for sample in each.instants.tolist():
+                found.setdefault(sample, (start, finder, each.formula, each.wanted))
+    instants = np.array(sorted(found), dtype=np.int64)
+    result = []
+    for run in np.split(instants, np.flatnonzero(np.diff(instants) > 1) + 1)[:most] if found else ():
+        sample = int(run[0])
+        start, finder, formula, wanted = found[sample]
+        tree, alone = finder.why(formula, sample, wanted=wanted)
+        cause = judged.cause(finder.record, start, tree, alone, definitions)
+        result.append(Violation(judged.first + sample, judged.first + int(run[-1]), cause))
+    return result
+
+
+def _cause(judgement: Judgement, subject: Prepared, definitions: dict[str, ast.Expr]) -> Cause | None:
+    trace, start = judgement.worst
+    judged = _JudgedTrace.of(judgement, subject, trace)
+    start -= judged.first
+    if not judged.shows(start):
+        return None
+    finder = judged.finder(start)
+    tree, alone = finder.why(judged.formula, start)
+    return judged.cause(finder.record, start, tree, alone, definitions)
+
+
+@dataclass(frozen=True, slots=True)
+class _JudgedTrace:
+    """The samples of one trace on which a requirement is judged; instants are counted from the first one."""
+
+    judgement: Judgement
+    subject: Prepared
+    trace: int
+    first: int
+
+    @staticmethod
+    def of(judgement: Judgement, subject: Prepared, trace: int) -> _JudgedTrace:
+        part = judgement.part or Part(0, subject.record.samples)
+        return _JudgedTrace(judgement, _evidence(judgement.rule, subject, part, trace), trace, part.first)
+
+    @property
+    def formula(self) -> typed.Formula:
+        rule = self.judgement.rule
+        return from_first_sample(rule.typed.formula) if rule.absolute else rule.typed.formula
+
+    @property
+    def window(self) -> int | None:
+        return window_of(self.judgement.rule, self.subject.horizon)
+
+    def shows(self, start: int) -> bool:
+        """True if the samples show the violation at `start`; of several in a step, one was chosen."""
+        if self.subject.signals.times is None:
+            return True
+        rule, record = self.judgement.rule, self.subject.record
+        (high,) = rule_bounds(rule, record, range(start, start + 1), self.subject.horizon, "open")[1]
+        return float(high.max()) < 0.0
+
+    def finder(self, start: int) -> CauseFinder:
+        record = self.subject.record
+        stop = None if self.window is None else start + self.window + 1
+        if stop is not None and stop <= record.samples:
+            record, stop = record.cut(stop), None
+        return CauseFinder(record, self.subject.compiled.grid, stop=stop)
+
+    def cause(
+        self, record: Record, start: int, tree: CauseNode, alone: bool, definitions: dict[str, ast.Expr]
+    ) -> Cause:
+        words = _Words(self.subject, record, self.judgement.rule.typed.written, definitions)
+        leaf = tree.leaf
+        place, *labels = words.labels(tree)
+        return Cause(
+            judgement=self.judgement,
+            trace=self.trace,
+            start=start + self.first,
+            sample=leaf.sample + self.first,
+            time=self.subject.time(leaf.sample),
+            violated=tree.violated + self.first,
+            predicate=_flat(leaf.span.text),
+            span=leaf.span,
+            readings=readings_of(leaf, self.subject, record.samples),
+            place=place,
+            labels=tuple(labels[: _MOST_LABELS - 1]),
+            because=words.because(tree),
+            tree=tree,
+            alone=alone,
+            subject=self.subject,
+            first=self.first,
+        )
 
 
 def _evidence(rule: CompiledRequirement, subject: Prepared, part: Part, trace: int) -> Prepared:
@@ -191,70 +282,75 @@ class _Words:
     written: ast.Expr
     definitions: dict[str, ast.Expr]
 
-    def readings(self, cause: CauseNode) -> tuple[SignalValue, ...]:
-        """Signal values that the predicates of a cause tree read, without duplicates."""
-        seen: dict[tuple[str, int], SignalValue] = {}
-        read = self.subject.compiled.signature
-        for leaf in cause.leaves:
-            for name, later in _in_order(leaf):
-                sample = leaf.sample + later
-                if name not in read or not 0 <= sample < self.record.samples:
-                    continue
-                value = float(self.record.env[name][sample, 0])
-                when = f" at {self.subject.moment(sample)}" if later else ""
-                text = f"{name} = {shown(value, read[name])}{when}"
-                seen.setdefault((name, sample), SignalValue(name, value, read[name].unit.text, text))
-        return tuple(seen.values())
-
     def labels(self, tree: CauseNode) -> list[Label]:
         """Source locations to underline, each with its text; that of the deciding predicate is the first."""
         found: dict[Span, str] = {}
-        for node in _labelled(tree):
-            found.setdefault(self.site(_body(node).span), self.label(node))
-        deciding = tree
-        while deciding.until is None and deciding.parts:
-            deciding = deciding.parts[deciding.main]
-        first = self.site(_body(deciding).span)
-        spans = sorted(found, key=lambda span: (span != first, span.start))
-        return [Label(span, found[span]) for span in spans]
+        for span, node in self.stated(tree):
+            found.setdefault(span, self.label(node))
+        first, *rest = found
+        return [Label(span, found[span]) for span in (first, *sorted(rest, key=lambda span: span.start))]
+
+    def stated(
+        self, node: CauseNode, use: Span | None = None, whole: CauseNode | None = None
+    ) -> Iterator[tuple[Span, CauseNode]]:
+        """Yield source locations and the nodes whose truth values are stated there, the deciding one first.
+
+        These are left sides of implications, conditions, predicates, and operands that have the wrong truth
+        value in a whole window. In a definition, the location is the name in the requirement, and the truth
+        value that of the whole definition. `use` and `whole` are this name and value above `node`.
+        """
+        chain = self.chain(self.written, node.span)
+        site = chain[0].span if chain else node.span
+        whole = (whole if site == use else None) or node
+        if node.premise or node.during is not None or not node.parts:
+            yield site, whole
+            return
+        for part in (node.parts[node.main], *node.parts[: node.main], *node.parts[node.main + 1 :]):
+            yield from self.stated(part, site, whole)
 
     def label(self, node: CauseNode) -> str:
-        """Truth value and instant of `node`; of the left side of an implication, also its signals."""
-        moment = self.subject.moment(node.sample)
-        if node.until is not None:
-            window = f"from {moment} to {self.subject.moment(node.until)}"
-            return f"{'always' if node.holds else 'never'} true {window}"
-        values = ", ".join(reading.text for reading in self.readings(node)) if node.premise else ""
-        return f"{'true' if node.holds else 'false'} at {moment}" + (f" ({values})" if values else "")
+        """Truth value and instant of `node`, and its frozen values; of a premise, also its signals."""
+        text = f"{'true' if node.holds else 'false'} at {self.subject.moment(node.sample)}"
+        if node.during is not None:
+            first, last = map(self.subject.moment, (node.during[0], node.during[-1]))
+            text = f"{'always' if node.holds else 'never'} true from {first} to {last}"
+        told = [each.text for each in self.readings(node) if node.premise or (each.frozen and not node.parts)]
+        return text + (f" ({', '.join(told)})" if told else "")
+
+    def readings(self, node: CauseNode) -> tuple[SignalValue, ...]:
+        """Values that the predicates of a cause tree read, without duplicates."""
+        samples = self.record.samples
+        found = (each for leaf in node.leaves for each in readings_of(leaf, self.subject, samples))
+        return tuple({each.text: each for each in found}.values())
 
     def because(self, tree: CauseNode) -> str:
-        """The cause in words, as one line; with both sides of an implication whose left side decides."""
-        text = self.reason(tree)
+        """The cause in words, as one line; with both sides of an implication whose left side decides.
+
+        The instant of the violation is named if it comes after that of the deciding predicate.
+        """
+        text = self.reason(tree.leaf)
+        if tree.violated > tree.leaf.sample:
+            text = f"violated at {self.subject.moment(tree.violated)}: {text}"
         while tree.parts:
             if tree.parts[0].premise and tree.main == 0:
-                return f"{text}; {self.reason(tree.parts[1])}"
+                return f"{text}; {self.reason(tree.parts[1].leaf)}"
             tree = tree.parts[tree.main]
         return text
 
-    def reason(self, tree: CauseNode) -> str:
-        """Sentence on the deciding predicate, or on its definition: `near means x < 2, and x = 0.27 m …`."""
-        leaf = tree.leaf
+    def reason(self, leaf: CauseNode) -> str:
+        """Sentence on a predicate, or on its definition: `near means x < 2, and x = 0.27 m …`."""
         moment, truth = self.subject.moment(leaf.sample), "true" if leaf.holds else "false"
         values = " and ".join(reading.text for reading in self.readings(leaf))
         text = f"`{_flat(leaf.span.text)}`"
         if not values:
             return f"{text} is {truth} whatever the signals are"
-        nearest = f"comes closest at {moment}, where {values}" if _closest(tree) else ""
+        other = " to false" if leaf.holds else ""
+        nearest = f"comes closest{other} at {moment}, where {values}" if leaf.during is not None else ""
         if chain := self.chain(self.written, leaf.span):
             name = chain[-1].name
             body = _flat(self.definitions[name].span.text)
             return f"{name} means {body}, and {nearest or f'{values} at {moment}'} (line {leaf.span.line})"
         return f"{text} {nearest}" if nearest else f"{text} is {truth} where {values}, at {moment}"
-
-    def site(self, span: Span) -> Span:
-        """Return `span`, or the name in the requirement that refers to it if it lies in a definition."""
-        chain = self.chain(self.written, span)
-        return chain[0].span if chain else span
 
     def chain(self, expr: ast.Expr, span: Span) -> tuple[ast.Name, ...] | None:
         """Return the names that lead from the expression `expr` to the source location `span`.
@@ -282,32 +378,25 @@ def _in_order(leaf: CauseNode) -> list[tuple[str, int]]:
     )
 
 
-def _labelled(tree: CauseNode) -> Iterator[CauseNode]:
-    """Yield the nodes to underline, none inside another.
-
-    These are left sides of implications, predicates, and temporal operators whose body has the wrong truth
-    value in the whole window.
-    """
-    if tree.premise or tree.until is not None or not tree.parts:
-        yield tree
-        return
-    for part in tree.parts:
-        yield from _labelled(part)
-
-
-def _closest(tree: CauseNode) -> bool:
-    """True if the deciding predicate fails at every instant of its window."""
-    if not tree.parts:
-        return False
-    part = tree.parts[tree.main]
-    return _closest(part) or (tree.until is not None and not part.parts)
-
-
-def _body(node: CauseNode) -> typed.Formula:
-    """The part to underline: of an operator whose body is wrong in the whole window, this body."""
-    if node.until is not None and isinstance(node.formula, (typed.Temporal, typed.Until)):
-        return operands(node.formula)[-1]
-    return node.formula
+def readings_of(leaf: CauseNode, subject: Prepared, samples: int) -> tuple[SignalValue, ...]:
+    """Values that a predicate reads in the first `samples` samples, in the order of its text."""
+    found = []
+    signature, env = subject.compiled.signature, subject.record.env
+    for name, later in _in_order(leaf):
+        sample = leaf.sample + later
+        if name not in signature or not 0 <= sample < samples:
+            continue
+        value = float(env[name][sample, 0])
+        when = f" at {subject.moment(sample)}" if later else ""
+        text = f"{name} = {shown(value, signature[name])}{when}"
+        found.append(SignalValue(name, value, signature[name].unit.text, text))
+    for kept in leaf.frozen:
+        if isinstance(kept.num, ir.Const):
+            value = kept.unit.of_si(kept.num.value)
+            text = f"{kept.name} = {shown(value, Column(kept.name, kept.unit))}"
+            text += f" (frozen at {subject.moment(kept.sample)})"
+            found.append(SignalValue(kept.name, value, kept.unit.text, text, frozen=True))
+    return tuple(found)
 
 
 def shown(value: float, column: Column) -> str:

@@ -92,7 +92,8 @@ class TraceBuffer:
             return None
         sample = first + cause.sample
         time = float(sample) if step is None else self.t0 + sample * step
-        return replace(cause, start=worst.start, sample=sample, time=time)
+        violated = first + cause.violated
+        return replace(cause, start=worst.start, sample=sample, time=time, violated=violated, first=first)
 
     def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
         """Return (first sample, instant to explain, signals) of an excerpt that suffices to explain `worst`.
