@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from stlc.compile.ir.traverse import margin_unit
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.monitor.explain.report import explain_at
-from stlc.monitor.judgement import Judgement
+from stlc.monitor.explain.report import Cause, violations
 from stlc.monitor.verdict import Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
@@ -196,10 +195,13 @@ class Event:
     Attributes:
         requirement: name of the requirement.
         agent: number of the agent's trace.
-        sample: sample of the cause, at which the deciding predicate is false.
-        until: last sample up to which the predicate stays false.
+        sample: first sample at which the body of the outermost `always` is violated; without an `always`, the
+            requirement itself.
+        until: last sample up to which it stays violated.
         start: sample at which the requirement was evaluated, from which its time windows are counted.
-        because: cause in one line.
+        because: cause of the violation at `sample`, in one line.
+        cause: sample of the cause, at which the deciding predicate is evaluated. It lies before `sample` if
+            the requirement looks back, and after it if it looks ahead.
     """
 
     requirement: str
@@ -208,40 +210,26 @@ class Event:
     until: int
     start: int
     because: str
+    cause: int
 
 
 def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]:
-    """Violations by the first `agents` traces, in order of time.
-
-    The time of a violation is the time of its cause. Overlapping windows may be violated for the same cause.
-    It is then listed only once. The list contains at most `most` violations of each requirement.
-    """
+    """Violations by the first `agents` traces, in order of time; at most `most` of each requirement."""
     found: list[Event] = []
     for judgement in verdict:
         own: list[Event] = []
         for agent in range(min(agents, verdict.traces)):
-            own += _events(verdict, judgement, agent, most - len(own))
+            if judgement.scope is None or judgement.scope[agent]:
+                own += [
+                    Event(judgement.name, agent, each.first, each.last, *_told(each.cause))
+                    for each in violations(verdict, judgement.name, agent, most - len(own))
+                ]
         found += own
     return sorted(found, key=lambda event: (event.sample, event.agent))
 
 
-def _events(verdict: Verdict, judgement: Judgement, agent: int, most: int) -> list[Event]:
-    if judgement.scope is not None and not judgement.scope[agent]:
-        return []
-    starts = judgement.start + np.flatnonzero(judgement.fails[:, agent])
-    found: list[Event] = []
-    while len(starts) and len(found) < most:
-        start = int(starts[0])
-        cause = explain_at(verdict, judgement.name, agent, start)
-        if cause is None:
-            starts = starts[1:]
-            continue
-        if found and cause.sample <= found[-1].until + 1:
-            found[-1] = replace(found[-1], until=max(cause.sample, found[-1].until))
-        else:
-            found.append(Event(judgement.name, agent, cause.sample, cause.sample, start, cause.because))
-        starts = starts[starts > max(start, cause.sample)]
-    return found
+def _told(cause: Cause) -> tuple[int, str, int]:
+    return cause.start, cause.because, cause.sample
 
 
 def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[str] | None = None) -> Mask:

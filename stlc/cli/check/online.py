@@ -130,7 +130,7 @@ def _row(
     share = "" if tally.instants == 1 else percent(tally.share)
     why = ""
     if cause is not None:
-        at = f"t = {cause.time:.10g} s"
+        at = f"t = {cause.shown_time:.10g} s"
         where, why = beside(at, _moment(online, tally.worst) if tally.instants > 1 else at), cause.because
     elif tally.status == "violated":
         why = f"violated at {tally.fails:,} of {tally.instants:,} starts"

@@ -416,7 +416,7 @@ def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, floa
     alone = np.zeros(verdict.traces, dtype=bool)
     alone[row] = True
     causes = {name: explain(verdict.within(alone), name) for name in names}
-    return {name: None if cause is None else float(cause.time) for name, cause in causes.items()}
+    return {name: None if cause is None else cause.shown_time for name, cause in causes.items()}
 
 
 # ------------------------------------------------------------------------- JSON
