@@ -6,6 +6,8 @@ deploys the newest run of every specification (seed 0, with the paper's backup p
 comparison) and takes the instant with most interventions. The animation shows the ships of `ship_track.stl`
 under its scenario `shifted`: four ships of each of the seeds 0 to 9 are simulated, and the first seed is
 shown in which a ship violates safety without the guard while all starts are viable (a plan search succeeds).
+It ends soon after the last ship ran aground. That last picture is also the first one, so that a still of the
+animation shows its result.
 """
 
 from __future__ import annotations
@@ -31,12 +33,11 @@ from stlc.controller.sketch import (
     STONE,
     VIOLATED,
     WATER,
+    Scene,
     deciders,
-    numbers,
     outlines,
     plans,
     tails,
-    violations,
 )
 from stlc.files import write_atomic
 from stlc.rundir import SIMULATION, RunDir
@@ -59,7 +60,8 @@ MAX_BYTES = 700_000
 
 SHIPS, SEEDS = 4, range(10)
 SECONDS = 12.0
-BEHIND, AHEAD = 5.0, 17.0  # m of the river around the ships
+AFTER, HELD = 1.8, 2.5  # s of the animation after the last ship ran aground; s for which its result is shown
+BEHIND, AHEAD = 2.0, 2.0  # m of the river behind the first and ahead of the last place of a ship
 LARGE, BOLD, SMALL = 17, 14.5, 13  # font size in points: half as large on a telephone
 LEAD_BYTES = 950_000
 
@@ -107,7 +109,10 @@ def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
     assert without is not None
     assert guarded is not None
     path = folder / "guard.webp"
-    pictures = list(frames_in(lead_animation(without, guarded), range(without.frames), 100))
+    animation = lead_animation(without, guarded)
+    last = animation.frames - 1
+    pictures = list(frames_in(animation, [last, *range(last)], 100))
+    durations = [round(1000 * HELD), *[round(1000 * without.dt)] * last]
     for quality in range(80, 20, -8):
         buffer = io.BytesIO()
         pictures[0].save(
@@ -115,7 +120,7 @@ def lead(runs: Path, folder: Path, seed: int | None = None) -> Iterator[Path]:
             format="webp",
             save_all=True,
             append_images=pictures[1:],
-            duration=round(1000 * without.dt),
+            duration=durations,
             loop=0,
             quality=quality,
             method=5,
@@ -156,16 +161,22 @@ def unsafe_in(run: RunDir) -> list[Unsafe]:
 
 
 def lead_animation(without: RecordedScene, guarded: RecordedScene) -> Animation:
-    """Film of both runs, one above the other; the view follows the ships of both."""
-    middle = np.mean([seen.scene["ships"][..., 0].mean(1) for seen in (without, guarded)], 0)
+    """Film of both runs, one above the other, until soon after the last ship ran aground."""
     hits = [first_hits(seen) for seen in (without, guarded)]
     counts = [sum(np.isfinite(hit)) for hit in hits]
+    scenes = [_stopped(seen.scene, hit) for seen, hit in zip((without, guarded), hits, strict=True)]
+    last_hit = max(int(hit[np.isfinite(hit)].max(initial=0)) for hit in hits)
+    frames = min(without.frames, last_hit + round(AFTER / without.dt) + 1)
+    places = np.concatenate([scene["ships"][:frames, :, 0] for scene in scenes])
+    view = float(places.min()) - BEHIND, float(places.max()) + AHEAD
     words = f"{SHIPS} ships on a river the policy has not seen:\n{_sentence(*counts)}"
+
+    hull = sys.modules[without.world.__module__].HULL  # in metres, as the world has it
 
     def begin(figure: Any) -> Any:
         figure.set_layout_engine("none")
         figure.text(0.02, 0.975, words, fontsize=LARGE, weight="bold", color=INK, va="top", linespacing=1.25)
-        clock = figure.text(0.98, 0.05, "", fontsize=SMALL, color=INK, ha="right", va="center")
+        clock = figure.text(0.98, 0.94, "", fontsize=SMALL, color=INK, ha="right", va="center")
         panels, told = [], []
         for row, title in enumerate(("without the guard", "with the guard")):
             foot = 0.5 - 0.39 * row
@@ -174,22 +185,20 @@ def lead_animation(without: RecordedScene, guarded: RecordedScene) -> Animation:
                 figure.text(0.98, foot + 0.335, "", fontsize=BOLD, weight="bold", ha="right", va="center")
             )
             panels.append(figure.add_axes((0, foot, 1, 0.3)))
-        _legend(figure)
+        _legend(figure, view[1] - view[0])
 
         def turn(index: int) -> None:
             clock.set_text(f"{index * without.dt:.1f} s")
-            for axes, seen, hit, text in zip(panels, (without, guarded), hits, told, strict=True):
+            for axes, scene, hit, text in zip(panels, scenes, hits, told, strict=True):
                 clear_artists(axes)
-                _river(axes, seen, index, float(middle[index]), hit <= index)
+                _river(axes, scene, hull, index, view, hit <= index)
                 aground = int((hit <= index).sum())
-                text.set_text(f"{aground} aground" if aground else "none aground")
+                text.set_text(f"{aground or 'none'} of {SHIPS} aground")
                 text.set_color(VIOLATED if aground else MUTED)
 
         return turn
 
-    return Animation(
-        without.frames, without.dt, (7.8, 5.6), begin, words.replace("\n", " "), without.frames // 3
-    )
+    return Animation(frames, without.dt, (7.8, 5.6), begin, words.replace("\n", " "))
 
 
 def _sentence(without: int, guarded: int) -> str:
@@ -207,42 +216,64 @@ def first_hits(seen: RecordedScene) -> NDArray[np.float64]:
     return hits
 
 
-def _river(axes: Any, seen: RecordedScene, index: int, middle: float, aground: NDArray[np.bool_]) -> None:
-    """Draw the river around `middle`, in metres."""
-    left, right, half = middle - BEHIND, middle + AHEAD, float(seen.scene["half"][index])
+def _stopped(scene: Scene, hits: NDArray[np.float64]) -> Scene:
+    """The scene with ships that stay where they ran aground, at frames `hits`, and plan no more.
+
+    All plans in place of the policy's count as the guard's, of whichever of its stages they are.
+    """
+    found = {name: np.array(values) for name, values in scene.items()}
+    found["decision"] = np.minimum(found["decision"], 1)
+    for ship in np.flatnonzero(np.isfinite(hits)):
+        hit = int(hits[ship])
+        found["ships"][hit:, ship] = found["ships"][hit, ship]
+        for name in {"rejected", "taken"} & found.keys():
+            found[name][hit:, ship] = np.nan
+    return found
+
+
+def _river(
+    axes: Any,
+    scene: Scene,
+    hull: NDArray[np.float64],
+    index: int,
+    view: tuple[float, float],
+    aground: NDArray[np.bool_],
+) -> None:
+    """Draw a stretch of the river, in metres; a dot is the centre of a ship, which is what is judged."""
+    (left, right), half = view, float(scene["half"][index])
     axes.add_patch(Rectangle((left, -half - 1), right - left, 2 * half + 2, color=BANK, lw=0))
     axes.add_patch(Rectangle((left, -half), right - left, 2 * half, color=WATER, lw=0))
     axes.plot((-100, 400), (0, 0), color="white", lw=1.2, ls=(0, (8, 8)), zorder=1.5)
-    for x, y, r in seen.scene["obstacles"][index]:
+    for x, y, r in scene["obstacles"][index]:
         if left - r < x < right + r:
             axes.add_patch(Circle((x, y), r, color=STONE, lw=0, zorder=2))
-    ships = seen.scene["ships"]
-    tails(axes, ships[..., :2], seen.scene, index, frames=16)
-    plans(axes, seen.scene, index)
-    hull = sys.modules[seen.world.__module__].HULL  # in metres, as the world has it
-    outlines(axes, hull, ships[index], deciders(seen.scene, index, ships.shape[1]))
-    for x, y in ships[index][aground, :2]:
-        axes.plot(x, y, "o", ms=24, mfc="none", mec=VIOLATED, mew=1.2, zorder=3.2)
-    numbers(axes, ships[index, :, :2])
-    violations(axes, ships[index, :, :2], seen.scene, index)
+    ships = scene["ships"]
+    tails(axes, ships[..., :2], scene, index, frames=16)
+    plans(axes, scene, index)
+    outlines(axes, hull, ships[index][~aground], deciders(scene, index, ships.shape[1])[~aground])
+    outlines(axes, hull, ships[index][aground], np.zeros(0, dtype=np.int64), color=NOTE)
+    axes.plot(*ships[index, :, :2].T, "o", ms=4, color="white", mew=0, zorder=3.4)
+    axes.plot(*ships[index][aground, :2].T, "o", ms=24, mfc="none", mec=VIOLATED, mew=2.2, zorder=3.6)
     axes.set(xlim=(left, right), ylim=(-half - 0.35, half + 0.35), aspect="equal")
     axes.set_axis_off()
 
 
-def _legend(figure: Any) -> None:
+def _legend(figure: Any, metres: float) -> None:
+    """Draw the legend, and a scale bar; the picture is `metres` wide."""
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], marker="o", ls="", ms=10, mew=0, color=DECIDED[0], label="policy"),
-        Line2D([], [], color=DECIDED[1], lw=3, label="guard's plan"),
+        Line2D([], [], marker="s", ls="", ms=9, mew=0, color=DECIDED[0], label="policy"),
+        Line2D([], [], marker="s", ms=9, mew=0, color=DECIDED[1], lw=3, label="guard, its plan"),
         Line2D([], [], color=VIOLATED, lw=2.4, ls=(0, (2.5, 1.5)), label="rejected plan"),
-        Line2D([], [], marker="o", ls="", ms=11, mew=2.4, mfc="none", mec=VIOLATED, label="aground"),
+        Line2D([], [], marker="o", ls="", ms=11, mew=2.2, mfc="none", mec=VIOLATED, label="aground"),
+        Line2D([], [], marker="o", ls="", ms=6, mew=3, mfc="white", mec=NOTE, label="centre, judged"),
     ]
     figure.legend(
         handles=handles,
         loc="center left",
         bbox_to_anchor=(0.0, 0.05),
-        ncols=4,
+        ncols=5,
         fontsize=SMALL,
         handlelength=1.3,
         handletextpad=0.3,
@@ -250,8 +281,8 @@ def _legend(figure: Any) -> None:
         frameon=False,
         labelcolor=INK,
     )
-    axes = figure.add_axes((0.72, 0.02, 0.17, 0.07))
-    axes.set(xlim=(0, 0.17 * (BEHIND + AHEAD)), ylim=(-0.5, 1), aspect="equal")
+    axes = figure.add_axes((0.4, 0.8, 0.2, 0.07))
+    axes.set(xlim=(0, 0.2 * metres), ylim=(-0.5, 1), aspect="equal")
     axes.set_axis_off()
     axes.plot((0.4, 2.4), (0, 0), color=NOTE, lw=2)
     axes.text(2.6, 0, "2 m", fontsize=SMALL, color=NOTE, va="center")

@@ -126,23 +126,31 @@ def numbers(axes: Any, places: NDArray[np.float64]) -> None:
 
 
 def outlines(
-    axes: Any, shape: NDArray[np.float64], poses: NDArray[np.float64], who: NDArray[np.int64]
+    axes: Any,
+    shape: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    who: NDArray[np.int64],
+    *,
+    color: str | None = None,
 ) -> None:
-    """Draw agents as polygons.
+    """Draw agents as polygons, with a dot at the place in the state where no number marks it.
 
     Args:
         axes: matplotlib axes.
         shape: corners of the polygon relative to an agent, (points, 2): forward, left.
         poses: x, y and heading (rad) of each agent, (agents, 3).
         who: source of each agent's plan, (agents,), which determines the colour.
+        color: colour of all agents instead.
     """
     from matplotlib.collections import PolyCollection
 
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     turned = shape @ np.stack([np.stack([cos, sin], 1), np.stack([-sin, cos], 1)], 1)
-    colors = [DECIDED[source] for source in who]
+    colors = color or [DECIDED[source] for source in who]
     placed = poses[:, None, :2] + turned
     axes.add_collection(PolyCollection(placed, fc=colors, ec="white", lw=0.6, alpha=0.92, zorder=3))
+    if len(poses) > NUMBERED:
+        axes.plot(*poses[:, :2].T, "o", ms=1.6, mew=0, color="white", zorder=3.5)
 
 
 def segments(axes: Any, lines: NDArray[np.float64], color: str, width: float) -> None:
