@@ -6,6 +6,7 @@ A closed pipe (`stlc … | head`) is not an error: the remaining output is dropp
 from __future__ import annotations
 
 import os
+import re
 import sys
 import threading
 import time
@@ -198,10 +199,13 @@ def table(rows: Sequence[Sequence[str]], *, header: Sequence[str] = (), indent: 
     )
 
 
+_NUMBER = re.compile(r"[+-]?[\d,]*\.?\d+(?:e[+-]?\d+)?|[+-]inf")
+
+
 def _cell(text: str, width: int) -> str:
     number, _, unit = text.partition(" ") if text[:1] in ("+", "-") else (text, "", "")
-    digits = "" if " " in unit else number.lstrip("+-").replace(",", "").replace(".", "", 1)
-    return text.rjust(width) if digits.isdigit() else text.ljust(width)
+    is_number = " " not in unit and _NUMBER.fullmatch(number) is not None
+    return text.rjust(width) if is_number else text.ljust(width)
 
 
 # ------------------------------------------------------------------------- heartbeat

@@ -106,3 +106,10 @@ def test_a_table_is_aligned():
         "  give_way      violated   -12.25",
     ]
     assert table([]) == ""
+
+
+def test_numbers_of_every_notation_are_aligned_to_the_right():
+    cells = ("+1,000.000 m", "+2.0e-05 m", "+2.8e-04", "-inf", "+.5", "boundary", "[-1.000, +inf]", "-one m")
+    lines = table([(cell, "at") for cell in cells], indent="").splitlines()
+    assert [line.index("at") for line in lines] == [16] * len(cells)
+    assert [line[0] == " " for line in lines] == [True] * 5 + [False] * 3
