@@ -110,6 +110,8 @@ signal ready : bool
 def near(limit) = x > -limit
 def fast = v > 3
 def reckless = near(2 m) and fast
+def calm = not fast
+def soon = eventually[0 s, 2 s] ready
 """
 
 CASES = {
@@ -138,6 +140,23 @@ CASES = {
     "not_equal": ("always[0 s, 1 s] light != red", {"light": [1, 0]}),
     "false": ("false", {}),
     "clock": ("always@[1 s, 2 s] v < 4", {"v": [9, 1, 7]}),
+    "if_then": ("always (if x > -1.4 m then v < 2 else v > 5)", {"x": [-2, 0.72, -2], "v": [9, 3, 9]}),
+    "if_else": ("always (if x > -1.4 m then v < 2 else v > 5)", {"x": [-2, 0.72, -2], "v": [9, 1, 3]}),
+    "if_condition": ("if x > 0 m then v < 2 else v > 5", {"x": [0.5], "v": [9]}),
+    "not_if": ("not (if x > 0 m then v < 2 else v > 5)", {"x": [-2], "v": [9]}),
+    "xor": ("always (fast xor ready)", {"v": [1, 5, 5], "ready": [1, 0, 1]}),
+    "unless": ("always (v < 4 unless[0 s, 2 s] ready)", {"v": [1, 5, 6, 7], "ready": [0, 0, 0, 0]}),
+    "negated_definition": ("always calm", {"v": [1, 5, 2]}),
+    "window_in_definition": ("always soon", {"ready": [1, 0, 0, 0]}),
+    "not_equal_formulas": ("always ((v > 3) != ready)", {"v": [1, 5], "ready": [1, 1]}),
+    "freeze": (
+        "always (freeze x0 = x in historically[0 s, 2 s] x < x0 + 1 m)",
+        {"x": [1, 2, 2.5, 4, 1, 6]},
+    ),
+    "freeze_speed": (
+        "always (freeze v0 = v in next(v) < v0 + 5 km/h)",
+        {"v": [1, 2, 6, 6]},
+    ),
 }
 
 

@@ -2,8 +2,9 @@
 
 The value at the end of the path is the robustness of the requirement. Where it is said that it decides alone,
 a change of a signal there that brings its predicate closer to what is wanted raises the robustness. What is
-said beside an underlined part is so by the definition of that part, and the numbers told are those of the
-trace.
+said to be true or false, in a line of the tree, beside an underlined part or in the sentence, is so by the
+definition of the text that is printed there, read alone, and so is its robustness. The numbers told are those
+of the trace.
 """
 
 from __future__ import annotations
@@ -229,7 +230,7 @@ def _change(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
 
 
 def _margin(leaf: CauseNode, trace: reference.Trace) -> float:
-    ends = _Definition(trace).at(leaf.formula, leaf.sample, not leaf.holds)
+    ends = _Definition(trace).at(leaf.thawed, leaf.sample, not leaf.holds)
     assert ends is not None
     return -ends[0] if leaf.holds else ends[1]
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta
 from stlc.units import parse_unit
@@ -114,6 +115,27 @@ def test_an_instant_is_found_once_though_many_windows_hold_it():
 def test_violations_that_follow_one_another_are_one():
     (event,) = events_of(verdict_of([[1, 1, 3, 4, 5, 4, 1, 1, 1, 1]]), 1)
     assert (event.sample, event.until) == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("written", "row", "found"),
+    [
+        ("always historically[0 s, 1 s] x < 2", [1, 1, 5, 1, 1, 1, 1], [(2, 4, 2)]),
+        ("always (freeze k = x in historically[0 s, 1 s] x < k + 2)", [3, 3, 3, 2, 0, 3], [(4, 4, 2)]),
+        ("not eventually x > 2", [1, 3, 3, 1, 4], [(1, 2, 1), (4, 4, 4)]),
+        ("always (x > 2 -> eventually[0.5 s, 1 s] x < 0)", [1, 3, 1, 1, 3, 1, -1], [(1, 1, 2)]),
+        ("always x < 2 and always x > -2", [1, 3, -4, 1, 3], [(1, 2, 1), (4, 4, 4)]),
+        ("eventually x > 9", [1, 3, 2], [(0, 0, 1)]),
+        ("x > 3 or always x < 2", [1, 3, 2], [(0, 0, 1)]),
+        ("always always[0 s, 1 s] x < 2", [1, 1, 3, 1, 1, 1, 3, 1, 1], [(2, 2, 2), (6, 6, 6)]),
+    ],
+)
+def test_an_event_lies_where_the_requirement_is_violated_and_names_its_cause(written, row, found):
+    text = f"spec s\nsignal x\nrequire r: {written}\n"
+    verdict = Monitor(text, dt=0.5).check({"x": np.array(row, dtype=float)})
+    events = events_of(verdict, 1)
+    assert [(event.sample, event.until, event.cause) for event in events] == found
+    assert all(f"t = {event.cause / 2:g} s" in event.because for event in events)
 
 
 def test_every_sample_that_is_violated_lies_in_an_event():

@@ -136,6 +136,7 @@ def _record(cause: Cause) -> ViolationCause:
         "requirement": cause.judgement.name,
         "trace": cause.trace,
         "start": subject.time(cause.start - cause.first),
+        "violated": subject.time(cause.violated - cause.first),
         "because": cause.because,
         "tree": nodes,
     }

@@ -276,6 +276,7 @@ class ViolationCause(TypedDict):
     requirement: str
     trace: int
     start: Num
+    violated: Num
     because: str
     tree: list[CauseNodeRecord]
 

@@ -119,6 +119,12 @@ class CauseNode:
         return self.formula.span
 
     @property
+    def thawed(self) -> typed.Formula:
+        """The sub-formula of a predicate with its frozen values in place."""
+        values = {key: kept.num for key, kept in zip(_frozen_in(self), self.frozen, strict=True)}
+        return substitute_frozen(self.formula, values)
+
+    @property
     def leaf(self) -> CauseNode:
         """Node of the deciding predicate, reached by following `parts[main]` from node to node."""
         return self.parts[self.main].leaf if self.parts else self
@@ -272,8 +278,7 @@ class CauseFinder:
         """
         leaf = tree.leaf
         names = {name for name, _ in leaf.reads}
-        frozen = dict(zip(_frozen_in(leaf), leaf.frozen, strict=True))
-        own = replace(self, cache={}, frozen=frozen)._lowered(leaf.formula, not leaf.holds)
+        own = self._lowered(leaf.thawed, not leaf.holds)
         parts = set(_leaves_of(own))
         alike = (node for node in nodes(lowered) if isinstance(node, ir.Predicate) and node not in parts)
         shared = len(names) < len(leaf.reads) or any(columns_of(node.num) & names for node in alike)
