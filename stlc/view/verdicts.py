@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stlc.compile.ir.traverse import margin_unit
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.monitor.explain.report import Cause, violations
+from stlc.monitor.explain.report import violations
 from stlc.monitor.verdict import Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
@@ -217,19 +217,16 @@ def events_of(verdict: Verdict, agents: int, *, most: int = MOST) -> list[Event]
     """Violations by the first `agents` traces, in order of time; at most `most` of each requirement."""
     found: list[Event] = []
     for judgement in verdict:
-        own: list[Event] = []
+        name, left = judgement.name, most
         for agent in range(min(agents, verdict.traces)):
             if judgement.scope is None or judgement.scope[agent]:
-                own += [
-                    Event(judgement.name, agent, each.first, each.last, *_told(each.cause))
-                    for each in violations(verdict, judgement.name, agent, most - len(own))
-                ]
-        found += own
+                own = violations(verdict, name, agent, left)
+                left -= len(own)
+                for each in own:
+                    cause = each.cause
+                    told = cause.start, cause.because, cause.sample
+                    found.append(Event(name, agent, each.first, each.last, *told))
     return sorted(found, key=lambda event: (event.sample, event.agent))
-
-
-def _told(cause: Cause) -> tuple[int, str, int]:
-    return cause.start, cause.because, cause.sample
 
 
 def marks(events: Iterable[Event], frames: int, agents: int, names: Collection[str] | None = None) -> Mask:

@@ -276,32 +276,29 @@ class CauseFinder:
         Not if its value only moves with a step of a signal, as that of `floor(x) > 2`, which may change other
         predicates or instants that read the signal.
         """
-        leaf = tree.leaf
+        leaf, record = tree.leaf, self.record
         names = {name for name, _ in leaf.reads}
         own = self._lowered(leaf.thawed, not leaf.holds)
-        parts = set(_leaves_of(own))
-        alike = (node for node in nodes(lowered) if isinstance(node, ir.Predicate) and node not in parts)
-        shared = len(names) < len(leaf.reads) or any(columns_of(node.num) & names for node in alike)
-        return tree.path_moves and not (shared and self._steps(leaf, own))
+        others = {node for node in nodes(lowered) if isinstance(node, ir.Predicate)} - set(_leaves_of(own))
+        shared = len(names) < len(leaf.reads) or any(columns_of(other.num) & names for other in others)
+        if not tree.path_moves or not shared:
+            return tree.path_moves
 
-    def _steps(self, leaf: CauseNode, own: ir.Formula) -> bool:
-        """True if no small change of a signal moves the value of the predicate `leaf`, lowered as `own`."""
-        at, env = range(leaf.sample, leaf.sample + 1), self.record.env
+        def worth(env: Mapping[str, Floats]) -> float:
+            at = range(leaf.sample, leaf.sample + 1)
+            return float(replace(record, env=env).values([own], at, "upper", self.stop)[0][0, 0])
 
-        def worth(record: Record) -> float:
-            return float(record.values([own], at, "upper", self.stop)[0][0, 0])
-
-        before = worth(self.record)
-        for name, later in leaf.reads:
-            there = leaf.sample + later
-            if not 0 <= there < self.record.samples:
-                continue
-            for side in (1.0, -1.0):
-                column = env[name].copy()
-                column[there] += side * _SMALL * max(1.0, abs(column[there, 0]))
-                if worth(replace(self.record, env={**env, name: column})) > before:
-                    return False
-        return True
+        before = worth(record.env)
+        spots = [
+            (name, leaf.sample + later, side) for name, later in leaf.reads for side in (_SMALL, -_SMALL)
+        ]
+        for name, there, step in spots:
+            if 0 <= there < record.samples:
+                column = record.env[name].copy()
+                column[there] += step * max(1.0, abs(column[there, 0]))
+                if worth({**record.env, name: column}) > before:
+                    return True
+        return False
 
     def _equal(self, lowered: ir.Formula, worth: float) -> list[Spot]:
         """Predicates of `lowered` and instants at which they have the value `worth`, in order of time."""
@@ -489,7 +486,8 @@ class CauseFinder:
         if outer.op == "and":  # of the group that is farthest from holding, no operand has the needed value
             items = min(groups, key=lambda group: max(self._margin(*item) for item in group))
         else:  # of each group, the operand that is farthest from the needed value
-            items = sorted(map(self._least, groups), key=lambda item: _place(formula, item[0]))
+            order = {id(item): index for index, item in enumerate(formula.items)}
+            items = sorted(map(self._least, groups), key=lambda item: order[id(item[0])])
         if formula.op in ("->", "if") and len(items) > 1:
             return replace(node, **self._decision(formula.items[0], items))
         margins = np.array([self._margin(*item) for item in items])
@@ -619,10 +617,6 @@ def _merged(node: CauseNode) -> CauseNode:
 def _frozen_in(node: CauseNode) -> list[str]:
     """Keys of the frozen values that a predicate reads, in the order of their names."""
     return sorted(frozenset().union(*map(frozen_in, numbers(node.formula))))
-
-
-def _place(formula: typed.Logic, item: typed.Formula) -> int:
-    return next(index for index, each in enumerate(formula.items) if each is item)
 
 
 def _greatest_known(margins: Floats) -> int:
