@@ -59,6 +59,9 @@ class Function:
             share the derivative.
         of_each: for a function without `c` and `slopes`: name of the function applied to every argument, and
             name of the function that reduces the results (`norm1` is `abs`, then `add`).
+        singular: indices of the arguments by which the derivative may be infinite or NaN where the arguments
+            are finite: a quotient's by its divisor, a root's at 0. There the derivative counts as 0, in all
+            back ends with gradients.
         bounds: range of the result: a constant pair, or a function of the ranges of the arguments that raises
             ValueError, OverflowError or ZeroDivisionError where it is undefined.
         domain: function from the ranges of the arguments to True if all finite arguments in them give a
@@ -83,6 +86,7 @@ class Function:
     c: Callable[..., str] | None = None
     slopes: Callable[..., Sequence[str]] | Literal["shared"] | None = None
     of_each: tuple[str, str] | None = None
+    singular: tuple[int, ...] = ()
     bounds: RangeRule | Bounds | None = None
     domain: DomainRule | None = None
     exact: bool = False
@@ -283,10 +287,12 @@ def _smooth(
     """Return the table entry of a smooth function of one argument.
 
     `slope` is the C expression of its derivative, in the argument `{0}` and the result `{r}`. `kernel` is the
-    name of the function in NumPy, if it differs from `name`. `domain` is as in `Function`.
+    name of the function in NumPy, if it differs from `name`. `domain` is as in `Function`; where there is
+    one, the derivative is infinite or NaN at its ends and beyond.
     """
     fold, c, numpy = getattr(math, name), f"{name}({{0}})", kernel or name
-    return _function(name, doc, "plain", fold, c, (slope,), bounds, domain=domain, numpy=numpy, torch=name)
+    rest: dict[str, Any] = {"numpy": numpy, "torch": name, "singular": (0,) if domain else ()}
+    return _function(name, doc, "plain", fold, c, (slope,), bounds, domain=domain, **rest)
 
 
 def _variadic(name: str, doc: str, fold: Callable[..., Any], bounds: RangeRule, **rest: Any) -> Function:
@@ -316,6 +322,7 @@ _OPERATORS = (
         "({0} / {1})",
         ("(1.0 / {1})", "(-{r} / {1})"),
         _quotient,
+        singular=(1,),
         domain=_divides,
         whole=False,
     ),
@@ -327,6 +334,7 @@ _OPERATORS = (
         "floored_mod({0}, {1})",
         ("1.0", "(-rint(({0} - {r}) / {1}))"),
         _modulo,
+        singular=(1,),
         domain=_divides,
         numpy="mod",
         torch="remainder",
@@ -339,6 +347,7 @@ _OPERATORS = (
         "pow({0}, {1})",
         ("({1} * pow({0}, {1} - 1.0))", "({0} > 0.0 ? {r} * log({0}) : 0.0)"),
         _powers,
+        singular=(0, 1),
         domain=_has_power,
         whole=False,
     ),
@@ -429,9 +438,11 @@ _FUNCTIONS = (
         "sqrt",
         math.sqrt,
         "sqrt({0})",
-        ("({r} > 0.0 ? 0.5 / {r} : 0.0)",),
+        ("(0.5 / {r})",),
+        singular=(0,),
         domain=_has_root,
         numpy="sqrt",
+        torch="sqrt",
     ),
     _smooth("exp", "`exp(x)` of a plain number.", "{r}", None, domain=_has_exponential),
     _smooth(
@@ -477,6 +488,7 @@ _FUNCTIONS = (
         "atan2({0}, {1})",
         ("({1} / ({0} * {0} + {1} * {1}))", "(-{0} / ({0} * {0} + {1} * {1}))"),
         (-math.pi, math.pi),
+        singular=(0, 1),
         numpy="arctan2",
     ),
     _variadic(

@@ -19,6 +19,7 @@ from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.advance import emit_advance
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.numbers import Untranslatable
+from stlc.diagnostics import usage
 from stlc.dynamics.model.step import commands
 from stlc.native import (
     Adjoint,
@@ -230,7 +231,21 @@ class _Judged(torch.autograd.Function):
             ),
             threads=torch.get_num_threads(),
         )
-        return None, None, torch.from_numpy(gradient).to(u.dtype), None
+        return None, None, _Once.apply(torch.from_numpy(gradient).to(u.dtype), u), None  # type: ignore[no-untyped-call]
+
+
+class _Once(torch.autograd.Function):
+    """Autograd function: the gradient of `_Judged` by plans `u`, which has no gradient in turn."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, u: Tensor) -> Tensor:  # noqa: ARG004
+        return gradient
+
+    @staticmethod
+    def backward(ctx: Any, by_gradient: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG004
+        raise usage(
+            "compiled code gives no second derivatives", "take them in torch: `task.graph.robustness`"
+        )
 
 
 class NativeStep:

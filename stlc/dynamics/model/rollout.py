@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
@@ -83,8 +82,10 @@ class _Accumulated(torch.autograd.Function):
         return out
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG004
+        if torch.is_grad_enabled():  # the gradient is to be differentiated in turn
+            later = grad.flip(0).cumsum(0).flip(0)
+            return later[0], later[1:]
         below = grad.clone(memory_format=torch.contiguous_format)
         rows = below.unbind(0)
         for step in range(len(rows) - 2, -1, -1):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
 
 import pytest
 import torch
 
-from stlc.compile.backends.torch.extrema import choice, reduction
+from stlc.compile.backends.array.namespace import Sliding
+from stlc.compile.backends.torch.extrema import _Choice, _Reduction, by_kernel, choice, reduction
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.schedule.schedule import Pick
+from stlc.native import compiler
 
 SHAPES = [(2, 3), (40, 700)]
 
@@ -71,3 +74,59 @@ def test_a_constant_beyond_the_dtype_is_infinite() -> None:
     assert torch.equal(TORCH.full((2,), 1e200, like), torch.full((2,), torch.inf))
     assert torch.equal(TORCH.full((2,), -1e200, like), torch.full((2,), -torch.inf))
     assert TORCH.full((), 0.25, like).item() == 0.25
+
+
+def random(*shape: int) -> torch.Tensor:
+    source = torch.Generator().manual_seed(sum(shape))
+    return torch.randn(shape, generator=source, dtype=torch.float64, requires_grad=True)
+
+
+@pytest.mark.parametrize("pick", ["min", "max"])
+@pytest.mark.parametrize("window", [Sliding(9, 7, 3), Sliding(9, 9, 9), Sliding(9, 2, 40)])
+@pytest.mark.parametrize("operands", [1, 2])
+@pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
+def test_windows_of_the_kernel_have_derivatives_of_any_order(
+    operands: int, window: Sliding, pick: Pick
+) -> None:
+    given = [random(9, 3 + i)[:, :3] for i in range(operands)]
+
+    def squared(*arrays: torch.Tensor) -> torch.Tensor:
+        found = by_kernel(tuple(each**3 for each in arrays), pick, window)
+        assert found is not None
+        return found
+
+    assert torch.autograd.gradcheck(squared, given)
+    assert torch.autograd.gradgradcheck(squared, given)
+
+
+@pytest.mark.parametrize("pick", ["min", "max"])
+def test_extrema_have_second_derivatives(pick: Pick) -> None:
+    items = [random(3, 2 + i)[:, :2] for i in range(3)]
+    assert torch.autograd.gradgradcheck(lambda *xs: _Choice.apply(pick, *(x**3 for x in xs)), items)
+    assert torch.autograd.gradgradcheck(lambda x: _Reduction.apply(x**3, pick), random(5, 2))
+
+
+@pytest.mark.parametrize("k", [3.0, -3.0])
+def test_smooth_extrema_have_derivatives_of_any_order(k: float) -> None:
+    a, b = random(3, 2), random(3, 3)[:, :2]
+    for function, given in (
+        (lambda x: TORCH.softmax(x, k), (a,)),
+        (lambda x, y: TORCH.softmax2(x, y, k), (a, b)),
+    ):
+        assert torch.autograd.gradcheck(function, given)
+        assert torch.autograd.gradgradcheck(function, given)
+
+        def slope(*xs: torch.Tensor, function: Callable[..., torch.Tensor] = function) -> torch.Tensor:
+            (found,) = torch.autograd.grad(function(*xs).sum(), xs[0], create_graph=True)
+            return found
+
+        assert torch.autograd.gradgradcheck(slope, given)
+
+
+def test_second_derivatives_are_finite_where_a_branch_is_singular() -> None:
+    x = torch.tensor([0.0, 2.0], dtype=torch.float64, requires_grad=True)
+    y = torch.maximum(-x, 2.0 - TORCH.guarded.div(torch.ones(()), x))
+    (slope,) = torch.autograd.grad((y**2).sum(), x, create_graph=True)
+    (bent,) = torch.autograd.grad(slope.sum(), x)
+    assert slope.tolist() == [0.0, 2 * 1.5 / 4]
+    assert bent.tolist() == [2.0, 2 / 16 - 2 * 1.5 * 2 / 8]

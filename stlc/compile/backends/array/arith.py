@@ -106,7 +106,7 @@ class ArrayProgram:
             registers.append(value)
             return len(registers) - 1
 
-        inputs, code = [], []
+        inputs, code, guarded = [], [], tape.guarded()
         for register in _needed(tape, outputs.values()):
             instr = tape.code[register]
             if instr.kernel == "input":
@@ -118,7 +118,8 @@ class ArrayProgram:
                 for arg in instr.args
             ]
             args += [place(param) for param in instr.params]
-            code.append((self._kernel(instr, ops, switch), tuple(args), register))
+            library = ops.guarded if register in guarded else ops
+            code.append((self._kernel(instr, library, switch), tuple(args), register))
         numbers = {name: value for name, value in outputs.items() if isinstance(value, float)}
         arrays = {name: value for name, value in outputs.items() if isinstance(value, int)}
         return _Bound(inputs, code, registers, arrays, numbers)

@@ -12,11 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple, final
+from typing import Literal, NamedTuple, TypeAlias, final, get_args
 
 from stlc import native
 from stlc.compile.backends.array.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick
+
+Direction: TypeAlias = Literal["values", "pull", "push"]
+"""Results of a kernel: values, gradients of the operands, or changes of the values."""
 
 _SOURCE = Path(__file__).with_name("windows.c")
 _TYPES = {"float32": ("float", "int32_t", 4), "float64": ("double", "int64_t", 8)}
@@ -50,24 +53,26 @@ class WindowKernel:
 
     Attributes:
         library: compiled C library for the dtype of the operands.
+        operands: 1 for extrema, 2 for `until` and `release`.
         pick: "max" for the maximum and `until`; "min" for the minimum and `release`.
         window: layout of the windows.
         traces: length of the batch axis.
     """
 
     library: ctypes.CDLL
+    operands: int
     pick: Pick
     window: Sliding
     traces: int
 
-    def run(self, arrays: Sequence[Strided], operands: int, *, back: bool) -> None:
-        """Compute extrema or `until`; if `back`, compute the gradients of the operands instead.
+    def run(self, arrays: Sequence[Strided], direction: Direction = "values") -> None:
+        """Compute extrema or `until`, or their derivatives.
 
         Args:
-            arrays: the operands, then the array that receives the values. If `back`, the operands, then the
-                gradients of the values, then for each operand the array that receives its gradient.
-            operands: 1 for extrema, 2 for `until` and `release`.
-            back: whether to compute gradients.
+            arrays: the operands; then for "pull" the gradient of the values, for "push" a change of each
+                operand; then the arrays that receive the results: the values, the gradient of each operand,
+                or the change of the values.
+            direction: which of these are computed.
 
         Raises:
             MemoryError: working memory cannot be allocated.
@@ -78,8 +83,8 @@ class WindowKernel:
             numbers += (array.time, array.batch)
         places = (ctypes.c_void_p * len(arrays))(*[array.address for array in arrays])
         shape = (ctypes.c_int64 * len(numbers))(*numbers)
-        call = self.library.slide_all if operands == 1 else self.library.until_all
-        if call(places, shape, self.pick == "max", back):
+        call = self.library.slide_all if self.operands == 1 else self.library.until_all
+        if call(places, shape, self.pick == "max", get_args(Direction).index(direction)):
             raise MemoryError
 
 
@@ -108,7 +113,7 @@ def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sl
     if room > max(_ROOM, window.rows * traces * size):
         return None
     library = _library(dtype, vector)
-    return None if library is None else WindowKernel(library, pick, window, traces)
+    return None if library is None else WindowKernel(library, operands, pick, window, traces)
 
 
 @cache

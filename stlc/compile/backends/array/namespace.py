@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, final
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias, final
 
 from stlc.compile.schedule.schedule import Pick
 
@@ -49,12 +49,20 @@ class Ops(Protocol):
 
     name: str
 
+    @property
+    def guarded(self) -> Ops:
+        """The same operations with gradients that are finite where values are infinite or NaN.
+
+        A derivative that is not finite counts as 0. Libraries without gradients return themselves.
+        """
+
     # arithmetic: one array operation each
     add: Callable[[Array, Array], Array]
     sub: Callable[[Array, Array], Array]
     mul: Callable[[Array, Array], Array]
     div: Callable[[Array, Array], Array]
     abs: Callable[[Array], Array]
+    sqrt: Callable[[Array], Array]
     exp: Callable[[Array], Array]
     expm1: Callable[[Array], Array]
     log: Callable[[Array], Array]
@@ -78,9 +86,6 @@ class Ops(Protocol):
     minimum: Callable[..., Array]
     """Elementwise minimum of two arrays; `out=` receives the result without a gradient."""
     maximum: Callable[..., Array]
-
-    def sqrt(self, x: Array) -> Array:
-        """Square root; its gradient at 0 is 0, so that the gradient of a distance of 0 is finite."""
 
     def pow(self, a: Array | float, b: Array | float) -> Array:
         """`a ^ b`."""
@@ -126,7 +131,10 @@ class Ops(Protocol):
         """Elements of `yes` where `mask` is True, else of `no`; one of the two may be a float."""
 
     def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
-        """`no + weight (yes - no)`, exact if `weight` is 0 or 1; one of `no` and `yes` may be a float."""
+        """`no + weight (yes - no)`, exact if `weight` is 0 or 1; one of `no` and `yes` may be a float.
+
+        Where `no` or `yes` is infinite or NaN, guarded operations return the nearer of both.
+        """
 
     def margin(self, x: Array) -> Array:
         """`x` as the margin of a predicate: of intervals, any number where `x` may be undefined."""
@@ -231,6 +239,11 @@ class FloatConstants:
     """Base of array libraries in which a Python float is the fastest constant, whatever the array."""
 
     __slots__ = ()
+
+    @property
+    def guarded(self) -> Self:
+        """Return the library itself."""
+        return self
 
     def kind(self, like: Array) -> Hashable:  # noqa: ARG002
         """Return None for every array, so that all arrays share converted constants."""

@@ -71,7 +71,9 @@ class NumpyOps(FloatConstants):
 
     def lerp(self, no: Array | float, yes: Array | float, weight: Array) -> Array:
         span = yes - no
-        return np.where(weight < 0.5, no + weight * span, yes - span * (1.0 - weight))
+        finite, less = np.isfinite(span), weight < 0.5
+        mixed = np.where(less, no + weight * span, yes - span * (1.0 - weight))
+        return np.where(finite, mixed, np.where(less, no, yes))
 
     def infinite(self, mask: Mask, like: Array) -> Array:
         return np.where(mask, np.inf, -np.inf).astype(like.dtype)
@@ -176,7 +178,7 @@ def _by_kernel(operands: Sequence[Array], pick: Pick, window: Sliding) -> Array 
     if kernel is None:
         return None
     out = np.empty((window.count, first.shape[1]), first.dtype)
-    kernel.run([_strided(each) for each in (*operands, out)], len(operands), back=False)
+    kernel.run([_strided(each) for each in (*operands, out)])
     return out
 
 

@@ -15,9 +15,29 @@ from typing import TypeAlias
 import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir.functions import FUNCTIONS
 
 Operand: TypeAlias = int | float
 """An int is the register that an instruction writes; a float is a constant."""
+
+
+_TRUTHS = frozenset({"gt", "ge", "both", "either", "number", "settle"})
+"""Operations whose results are truth values, finite whatever the operands are."""
+
+_FLAT = _TRUTHS | {
+    "add",
+    "sub",
+    "axpy",
+    "minimum",
+    "maximum",
+    "clamp",
+    "where",
+    "floor",
+    "ceil",
+    "round",
+    "pick",
+}
+"""Operations whose derivatives are finite whatever the operands are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +81,23 @@ class GradientTape:
         if isinstance(operand, float) or self.code[operand].kernel != kernel:
             return None
         return self.code[operand].args
+
+    def guarded(self) -> set[int]:
+        """Return the registers whose derivatives by the operands may be infinite or NaN.
+
+        These are the results of partial functions, such as a quotient, and of what is computed from them.
+        """
+        unbounded: set[int] = set()
+        found: set[int] = set()
+        for register, (kernel, args) in enumerate((each.kernel, each.args) for each in self.code):
+            operands = {arg for arg in args if isinstance(arg, int)}
+            singular = FUNCTIONS[kernel].singular if kernel in FUNCTIONS else ()
+            if any(isinstance(args[i], int) or args[i] == 0.0 for i in singular) or unbounded & operands:
+                if kernel not in (*_TRUTHS, "indicator"):
+                    unbounded.add(register)
+                if kernel not in _FLAT and not (kernel == "mul" and isinstance(args[1], float)):
+                    found.add(register)
+        return found
 
     # ------------------------------------------------------------ arithmetic
 
@@ -198,6 +235,8 @@ class GradientTape:
     def _clamp(self, x: int, low: float, high: float) -> Operand:
         if low == high:
             return low
+        if (low, high) == (-math.inf, math.inf):
+            return x
         bounds = (None if low == -math.inf else low, None if high == math.inf else high)
         return self.emit("clamp", x, params=bounds)
 

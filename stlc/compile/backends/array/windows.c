@@ -19,6 +19,8 @@
 #define CHUNK 4096 /* windows that are taken at a time, at least */
 #endif
 
+enum { VALUES, PULL, PUSH }; /* what is computed: values, gradients of the operands, changes of the values */
+
 typedef REAL Values __attribute__((vector_size(BYTES)));
 typedef INDEX Rows __attribute__((vector_size(BYTES)));
 typedef struct { Values value; Rows from; } Best;
@@ -41,19 +43,25 @@ static inline Best better(Best a, Best b, int max)
     return (Best){(Values)(((Rows)b.value & take) | ((Rows)a.value & ~take)), (b.from & take) | (a.from & ~take)};
 }
 
-/* Either the value is written to a row of `to`, or the gradient of that row is added where it came from. */
-static inline void emit(Best found, Values *row, REAL *to, int back)
+/* The value is written to a row, or the gradient of the row is added where it came from, or a change is taken
+   from there. */
+static inline void emit(Best found, Values *row, REAL *at, int how)
 {
-    if (!back) {
+    if (how == VALUES) {
         *row = found.value;
         return;
     }
-    for (int64_t lane = 0; lane < LANES; lane++)
-        to[found.from[lane] * LANES + lane] += (*row)[lane];
+    for (int64_t lane = 0; lane < LANES; lane++) {
+        REAL *there = at + found.from[lane] * LANES + lane;
+        if (how == PULL)
+            *there += (*row)[lane];
+        else
+            (*row)[lane] = *there;
+    }
 }
 
 static inline __attribute__((always_inline)) void
-slide(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max, int back)
+slide(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max, int how)
 {
     for (int64_t begin = 0; begin < s.count; begin += s.width) {
         int64_t stop = least(begin + s.width, s.rows), last = least(begin + s.width, s.count);
@@ -64,13 +72,13 @@ slide(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max
             int64_t t = j + s.width - 1;
             if (j > begin && t < s.rows)
                 head = better(head, at(x, t, t), max);
-            emit(better(tails[j - begin], head, max), rows + j, (REAL *)to, back);
+            emit(better(tails[j - begin], head, max), rows + j, (REAL *)to, how);
         }
     }
 }
 
 static inline __attribute__((always_inline)) void
-until(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max, int back)
+until(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max, int how)
 {
     const Values *left = x, *right = x + s.apart;
     for (int64_t begin = 0; begin < s.count; begin += s.width) {
@@ -90,7 +98,7 @@ until(Sliding s, const Values *x, Values *rows, Values *to, Best *tails, int max
                 reach = better(reach, better(at(right, t, s.apart + t), head, !max), max);
             }
             Best later = better(tails[2 * (j - begin) + 1], reach, !max);
-            emit(better(tails[2 * (j - begin)], later, max), rows + j, (REAL *)to, back);
+            emit(better(tails[2 * (j - begin)], later, max), rows + j, (REAL *)to, how);
         }
     }
 }
@@ -161,37 +169,38 @@ static Sliding chunk_at(Sliding all, int64_t begin, int64_t some, int64_t apart)
     return (Sliding){least(count + all.width - 1, all.rows - begin), count, all.width, apart};
 }
 
-/* `arrays` are operands, values or their gradient, and with `back` the gradients of the operands. */
+/* `arrays` are the operands; their changes (PUSH) or the gradient of the values (PULL); and the results. */
 static inline __attribute__((always_inline)) int
-judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int back)
+judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int how)
 {
     Sliding all = {shape[0], shape[1], least(shape[2], shape[0]), 0};
-    const int64_t *stride = shape + 4, *mine = stride + 2 * operands;
+    int beside = how == PUSH ? 2 * operands : operands; /* the array of one row per window */
+    const int64_t *stride = shape + 4, *mine = stride + 2 * beside;
     int64_t some = least(all.count, 8 * all.width > CHUNK ? 8 * all.width : CHUNK);
     int64_t apart = least(some + all.width - 1, all.rows), block = least(all.width, apart);
-    int64_t room = operands * apart * (1 + back) + some + 2 * operands * block;
+    int64_t room = operands * apart * (how == VALUES ? 1 : 2) + some + 2 * operands * block;
     Values *memory = aligned_alloc(BYTES, (size_t)room * BYTES);
     if (!memory)
         return 1;
-    Values *x = memory, *to = x + operands * apart, *rows = to + back * operands * apart;
+    Values *x = memory, *to = x + operands * apart, *rows = to + (how == VALUES ? 0 : operands * apart);
     for (int64_t first = 0; first < shape[3]; first += LANES) {
         int64_t lanes = least(shape[3] - first, LANES);
-        if (back)
+        if (how == PULL)
             memset(to, 0, (size_t)(operands * apart) * BYTES);
         for (int64_t begin = 0; begin < all.count; begin += some) {
             Sliding s = chunk_at(all, begin, some, apart);
             int last = begin + s.count == all.count;
-            for (int i = 0; i < operands; i++) {
+            for (int i = 0; i < (how == PUSH ? 2 : 1) * operands; i++) {
                 const int64_t *its = stride + 2 * i;
                 load(arrays[i] + first * its[1] + begin * its[0], its, s.rows, lanes, x + i * apart);
             }
-            REAL *values = arrays[operands] + first * mine[1] + begin * mine[0];
-            if (back)
+            REAL *values = arrays[beside] + first * mine[1] + begin * mine[0];
+            if (how == PULL)
                 load(values, mine, s.count, lanes, rows);
-            walk(s, x, rows, to, (Best *)(rows + some), max, back);
-            if (!back)
+            walk(s, x, rows, to, (Best *)(rows + some), max, how);
+            if (how != PULL)
                 store(rows, mine, s.count, lanes, values);
-            for (int i = 0; back && i < operands; i++) {
+            for (int i = 0; how == PULL && i < operands; i++) {
                 const int64_t *its = mine + 2 + 2 * i;
                 REAL *gradient = arrays[operands + 1 + i] + first * its[1] + begin * its[0];
                 int64_t done = last ? s.rows : s.count, left = s.rows - done;
@@ -209,18 +218,17 @@ judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int
     return 0;
 }
 
+#define JUDGED(OPERANDS, WALK, HOW) \
+    (max ? judge(arrays, shape, OPERANDS, WALK, 1, HOW) : judge(arrays, shape, OPERANDS, WALK, 0, HOW))
+
 /* Both return other than 0 where there is no memory. `max` asks for the maximum, and for `until`; else for the
    minimum, and for `release`. */
-int slide_all(REAL **arrays, const int64_t *shape, int max, int back)
+int slide_all(REAL **arrays, const int64_t *shape, int max, int how)
 {
-    if (back)
-        return max ? judge(arrays, shape, 1, slide, 1, 1) : judge(arrays, shape, 1, slide, 0, 1);
-    return max ? judge(arrays, shape, 1, slide, 1, 0) : judge(arrays, shape, 1, slide, 0, 0);
+    return how == VALUES ? JUDGED(1, slide, VALUES) : how == PULL ? JUDGED(1, slide, PULL) : JUDGED(1, slide, PUSH);
 }
 
-int until_all(REAL **arrays, const int64_t *shape, int max, int back)
+int until_all(REAL **arrays, const int64_t *shape, int max, int how)
 {
-    if (back)
-        return max ? judge(arrays, shape, 2, until, 1, 1) : judge(arrays, shape, 2, until, 0, 1);
-    return max ? judge(arrays, shape, 2, until, 1, 0) : judge(arrays, shape, 2, until, 0, 0);
+    return how == VALUES ? JUDGED(2, until, VALUES) : how == PULL ? JUDGED(2, until, PULL) : JUDGED(2, until, PUSH);
 }

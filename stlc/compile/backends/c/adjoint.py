@@ -32,7 +32,7 @@ static inline double decay(double x) {
   power.bits = ((int64_t)n + 1023) << 52;
   return p * power.value;
 }
-/* x, or 0 where a branch that is not taken is infinite or NaN. */
+/* x, or 0 where it is infinite or NaN, as in a branch that is not taken. */
 static inline double finite(double x) { return fabs(x) < INFINITY ? x : 0.0; }
 /* Slope of (1 + tanh(slope z)) / 2. */
 static inline double bump(double z, double slope) {

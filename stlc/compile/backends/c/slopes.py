@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
-from stlc.compile.backends.c.numbers import NumberWriter
+from stlc.compile.backends.c.numbers import NumberWriter, literal
 from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
@@ -16,20 +16,9 @@ from stlc.compile.ir.functions import FUNCTIONS
 Slope = tuple[str, str]
 """Register, and the C expression of the derivative with respect to it."""
 
+NOUGHT = literal(0.0)
 FLAT = "0.0"
 """The derivative of a step function."""
-SINGULAR = {
-    "div": 1,
-    "mod": 1,
-    "pow": 0,
-    "sqrt": 0,
-    "log": 0,
-    "log10": 0,
-    "asin": 0,
-    "acos": 0,
-    "atan2": 0,
-}
-"""Function whose value or slope may be infinite or NaN -> index of the argument that makes it so."""
 COUNTED = "(double)"
 """Start of the C expression of the elapsed time, a leaf without a gradient."""
 LESS = {"min": "<", "max": ">"}
@@ -39,8 +28,8 @@ LESS = {"min": "<", "max": ">"}
 class SlopeWriter(NumberWriter):
     """Writer of expressions that records the partial derivatives of each register (C variable).
 
-    A branch that is not taken, such as `a / y` in `if y > 0.1 then a / y else a`, may be infinite or NaN. So
-    no gradient passes to it, nor to its operands, and the step between the branches then has no slope.
+    A branch that is not taken, such as `a / y` in `y > 0.1 -> a / y < 2`, may be infinite or NaN. A gradient
+    that would be infinite or NaN counts as 0, and the step between branches then has no slope.
 
     Args:
         place: returns the C expression of a leaf (signal, call, or frozen value).
@@ -54,7 +43,6 @@ class SlopeWriter(NumberWriter):
         self._slopes: dict[str, tuple[Slope, ...]] = {}
         self._inputs: dict[str, str] = {}
         self._constants: set[str] = set()
-        self._optional: set[str] = set()
         self._unbounded: set[str] = set()
 
     def backward(self, seeds: Mapping[str, str]) -> tuple[list[str], dict[str, str]]:
@@ -71,20 +59,11 @@ class SlopeWriter(NumberWriter):
         """
         registers = list(self._texts.values())
         lines = [f"double d{name} = {seeds.get(name, '0.0')};" for name in registers]
-        optional = set(self._optional)
         for name in reversed(registers):
-            slopes = self._slopes.get(name, ())
-            if name in optional & self._unbounded:
-                optional.update(of for of, _ in slopes)
-                slopes = tuple((of, self._limited(name, slope)) for of, slope in slopes)
-            lines += [f"d{of} += d{name} * {slope};" for of, slope in slopes]
+            sift = "finite" if name in self._unbounded else ""
+            lines += [f"d{of} += {sift}(d{name} * {slope});" for of, slope in self._slopes.get(name, ())]
         gathered = {f"g{place}": f"d{name}" for name, place in self._inputs.items()}
         return lines, gathered
-
-    def _limited(self, name: str, slope: str) -> str:
-        """C expression of a slope by which a gradient of 0 may be multiplied."""
-        plain = slope in ("1.0", "(-1.0)") or "(double)" in slope or " == " in slope
-        return slope if plain else f"(d{name} == 0.0 ? 0.0 : {slope})"
 
     def gradients(self, outputs: Iterable[tuple[ir.Num, str]]) -> list[str]:
         """Return C statements that compute expressions and propagate gradients to the signals in them.
@@ -110,21 +89,25 @@ class SlopeWriter(NumberWriter):
         return register
 
     def _indicator(self, cond: ir.Formula, sharpness: float | None) -> str:
-        margin = self.margin(cond) if self._soft else ""
+        bump = [self._bump(cond)] if self._soft else []
         register = super()._indicator(cond, sharpness)
-        self._remember(register, [(margin, f"bump({margin}, slope)")] if self._soft else [])
+        self._remember(register, bump)
         return register
 
+    def _bump(self, cond: ir.Formula) -> Slope:
+        """Margin of a condition, and the derivative of its truth value by the margin."""
+        margin = self.margin(cond)
+        return margin, f"{'finite' if margin in self._unbounded else ''}(bump({margin}, slope))"
+
     def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:
-        margin, taken = self.margin(cond) if self._soft else "", f"(double){self.truth(cond)}"
+        bump, taken = self._bump(cond) if self._soft else None, f"(double){self.truth(cond)}"
         register = super()._choice(cond, yes, no)
         slopes, step = [(yes, taken), (no, f"(1.0 - {taken})")], f"({yes} - {no})"
-        self._optional |= {yes, no}
         if self._unbounded & {yes, no}:
             self._unbounded.add(register)
             step = f"finite{step}"
-        if self._soft:
-            slopes.append((margin, f"({step} * bump({margin}, slope))"))
+        if bump is not None:
+            slopes.append((bump[0], f"({step} * {bump[1]})"))
         self._remember(register, slopes)
         return register
 
@@ -132,9 +115,11 @@ class SlopeWriter(NumberWriter):
         register = super()._apply(name, args)
         if not any(map(self._varies, args)):
             self._constants.add(register)
-        if self._unbounded.intersection(args) or (name in SINGULAR and self._varies(args[SINGULAR[name]])):
+        function = FUNCTIONS[name]
+        critical = [args[i] for i in function.singular]
+        if self._unbounded.intersection(args) or any(map(self._varies, critical)) or NOUGHT in critical:
             self._unbounded.add(register)
-        derivative = FUNCTIONS[name].slopes
+        derivative = function.slopes
         if name == "clip":
             slopes = self._clipped(*args)
         elif callable(derivative):

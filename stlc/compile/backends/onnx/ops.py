@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import TypeAlias, cast, final
+from typing import Self, TypeAlias, cast, final
 
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
@@ -53,6 +53,11 @@ class OnnxOps:
     """
 
     name = "onnx"
+
+    @property
+    def guarded(self) -> Self:
+        """Return the library itself, since it has no gradients."""
+        return self
 
     # operators of ONNX, elementwise
     add, sub, mul, div, pow = map(_binary, ("Add", "Sub", "Mul", "Div", "Pow"))

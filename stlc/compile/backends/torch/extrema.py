@@ -3,6 +3,8 @@
 The backward passes of torch spend most of their time on boolean masks. Here a mask consists of numbers 0 and
 1, and the gradient overwrites it in the same memory. Windows are computed by the C kernel
 (`stlc.compile.backends.array.kernel`), or, for small arrays, by gathering all windows into one array.
+
+Every backward pass is itself differentiable: a selection is linear in what it selects.
 """
 
 from __future__ import annotations
@@ -13,10 +15,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
-from stlc.compile.backends.array.kernel import Strided, WindowKernel, window_kernel
+from stlc.compile.backends.array.kernel import Direction, Strided, WindowKernel, window_kernel
 from stlc.compile.backends.array.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick, dual, neutral
 
@@ -45,9 +46,8 @@ class _Choice(torch.autograd.Function):
         return out
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        out, *items = ctx.saved_tensors
+        out, *items = (each.detach() for each in ctx.saved_tensors)
         grads: list[Tensor] = []
         left = grad
         for item in items[:-1]:
@@ -68,9 +68,8 @@ class _Reduction(torch.autograd.Function):
         return out
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        x, out = ctx.saved_tensors
+        x, out = (each.detach() for each in ctx.saved_tensors)
         share = torch.empty_like(x)
         torch.eq(x, out, out=share)
         return share.mul_(grad / share.sum(dim=0, keepdim=True)), None
@@ -112,17 +111,43 @@ class _Windows(torch.autograd.Function):
     def forward(ctx: Any, kernel: WindowKernel, *operands: Tensor) -> Tensor:
         ctx.kernel = kernel
         ctx.save_for_backward(*operands)
-        out = _like(operands[0], kernel.window.count)
-        kernel.run([_strided(each) for each in (*operands, out)], len(operands), back=False)
-        return out
+        return _run(kernel, "values", operands, kernel.window.count)[0]
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        operands, kernel = ctx.saved_tensors, ctx.kernel
-        out = [_like(operand, kernel.window.rows) for operand in operands]
-        kernel.run([_strided(each) for each in (*operands, grad, *out)], len(operands), back=True)
-        return None, *out
+        return None, *_Pulled.apply(ctx.kernel, grad, *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+
+
+class _Pulled(torch.autograd.Function):
+    """Autograd function: gradients of the operands of `_Windows` from the gradient of its values."""
+
+    @staticmethod
+    def forward(ctx: Any, kernel: WindowKernel, grad: Tensor, *operands: Tensor) -> tuple[Tensor, ...]:
+        ctx.kernel = kernel
+        ctx.save_for_backward(*operands)
+        return _run(kernel, "pull", (*operands, grad), kernel.window.rows)
+
+    @staticmethod
+    def backward(ctx: Any, *changes: Tensor) -> tuple[Tensor | None, ...]:
+        operands = ctx.saved_tensors
+        change = _Pushed.apply(ctx.kernel, *operands, *changes)  # type: ignore[no-untyped-call]
+        return None, change, *[None] * len(operands)
+
+
+class _Pushed(torch.autograd.Function):
+    """Autograd function: changes of the values of `_Windows` under changes of its operands."""
+
+    @staticmethod
+    def forward(ctx: Any, kernel: WindowKernel, *arrays: Tensor) -> Tensor:
+        ctx.kernel = kernel
+        ctx.save_for_backward(*arrays[: len(arrays) // 2])
+        return _run(kernel, "push", arrays, kernel.window.count)[0]
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        operands = ctx.saved_tensors
+        pulled = _Pulled.apply(ctx.kernel, grad, *operands)  # type: ignore[no-untyped-call]
+        return None, *[None] * len(operands), *pulled
 
 
 def by_kernel(operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor | None:
@@ -145,8 +170,14 @@ def by_kernel(operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor
     return out
 
 
-def _strided(x: Tensor) -> Strided:
-    return Strided(x.data_ptr(), *x.stride())
+def _run(
+    kernel: WindowKernel, direction: Direction, arrays: Sequence[Tensor], rows: int
+) -> tuple[Tensor, ...]:
+    """Run the kernel on `arrays`; return the arrays of `rows` rows that it fills."""
+    operands = kernel.operands
+    out = tuple(_like(each, rows) for each in arrays[: operands if direction == "pull" else 1])
+    kernel.run([Strided(x.data_ptr(), *x.stride()) for x in (*arrays, *out)], direction)
+    return out
 
 
 def _like(x: Tensor, rows: int) -> Tensor:

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from stlc.compile.backends.array.namespace import Mask, Ops, Sliding
 from stlc.compile.backends.torch.extrema import (
@@ -24,90 +23,90 @@ from stlc.compile.backends.torch.extrema import (
     small_extrema,
     small_until,
 )
+from stlc.compile.backends.torch.guarded import lerp, sifted
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.schedule.schedule import Pick
-
-
-class _SafeSqrt(torch.autograd.Function):
-    """Autograd function: square root whose gradient at 0 is 0."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        root = torch.sqrt(x)
-        ctx.save_for_backward(root)
-        return root
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        (root,) = ctx.saved_tensors
-        return torch.where(root > 0, grad / (2.0 * root), 0.0)
 
 
 class _MaskedRows(torch.autograd.Function):
     """Autograd function: copy of an array in which some rows are replaced by a constant.
 
-    The replaced rows have no gradient.
+    `runs` are ranges of rows, in order, and whether they stay. The replaced rows have no gradient.
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, keep: NDArray[np.bool_], value: float) -> Tensor:
-        edges = (0, *(np.flatnonzero(np.diff(keep)) + 1).tolist(), len(keep))
-        ctx.runs = [(slice(a, b), bool(keep[a])) for a, b in pairwise(edges)]
-        return _masked(x, ctx.runs, value)
+    def forward(ctx: Any, x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
+        ctx.runs = runs
+        out = torch.empty_like(x)
+        for rows, stay in runs:
+            out[rows] = x[rows] if stay else value
+        return out
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return _masked(grad, ctx.runs, 0.0), None, None
-
-
-def _masked(x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
-    out = torch.empty_like(x)
-    for rows, stay in runs:
-        out[rows] = x[rows] if stay else value
-    return out
+        return _MaskedRows.apply(grad, ctx.runs, 0.0), None, None  # type: ignore[no-untyped-call]
 
 
 class _SmoothMax(torch.autograd.Function):
-    """Autograd function: `log(sum(exp(k x))) / k` over axis 0, which is kept with length 1.
+    """Autograd function: `log(sum(exp(k x))) / k` over axis 0, which is kept with length 1, and its gradient.
 
-    Infinite values have gradient 0 and cause no NaN.
+    The gradient is the second result, so that it can be differentiated in turn. Infinite values have gradient
+    0 and cause no NaN.
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, k: float) -> Tensor:
+    def forward(ctx: Any, x: Tensor, k: float) -> tuple[Tensor, Tensor]:
         top = x.amax(dim=0, keepdim=True) if k > 0 else x.amin(dim=0, keepdim=True)
         unbounded = torch.isinf(top)
         shares = ((x - top.masked_fill(unbounded, 0.0)) * k).clamp_max_(0.0).exp_()
         total = shares.sum(dim=0, keepdim=True)
-        ctx.save_for_backward(shares.div_(total.masked_fill(unbounded, torch.inf)))
-        return top + total.log_() / k
+        shares.div_(total.masked_fill(unbounded, torch.inf))
+        ctx.k = k
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(shares)
+        return top + total.log_() / k, shares
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, grad: Tensor | None, by_shares: Tensor | None) -> tuple[Tensor | None, None]:
         (shares,) = ctx.saved_tensors
-        return grad * shares, None
+        total = None if grad is None else grad * shares
+        if by_shares is not None:
+            moved = shares * by_shares
+            bent = ctx.k * (moved - shares * moved.sum(dim=0, keepdim=True))
+            total = bent if total is None else total + bent
+        return total, None
 
 
 class _SmoothMax2(torch.autograd.Function):
-    """Autograd function: `log(exp(k a) + exp(k b)) / k` for operands of the same shape."""
+    """Autograd function: `log(exp(k a) + exp(k b)) / k` for operands of the same shape, and its gradients.
+
+    The gradients are the other results, as for `_SmoothMax`.
+    """
 
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, k: float) -> Tensor:
+    def forward(ctx: Any, a: Tensor, b: Tensor, k: float) -> tuple[Tensor, Tensor, Tensor]:
         top = torch.maximum(a, b) if k > 0 else torch.minimum(a, b)
         unbounded = torch.isinf(top)
         gap = (a - b).masked_fill_(unbounded, torch.inf)
-        share = torch.sigmoid(gap * k)
-        ctx.save_for_backward(share.masked_fill(unbounded, 0.0), (1.0 - share).masked_fill_(unbounded, 0.0))
-        return top + torch.log1p(torch.exp(gap.abs_() * -abs(k))) / k
+        left = torch.sigmoid(gap * k)
+        right = (1.0 - left).masked_fill_(unbounded, 0.0)
+        left.masked_fill_(unbounded, 0.0)
+        ctx.k = k
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(left, right)
+        return top + torch.log1p(torch.exp(gap.abs_() * -abs(k))) / k, left, right
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(
+        ctx: Any, grad: Tensor | None, by_left: Tensor | None, by_right: Tensor | None
+    ) -> tuple[Tensor | None, Tensor | None, None]:
         left, right = ctx.saved_tensors
-        return grad * left, grad * right, None
+        by_a, by_b = (None, None) if grad is None else (grad * left, grad * right)
+        for part, sign in ((by_left, ctx.k), (by_right, -ctx.k)):
+            if part is not None:
+                bent = part * left * right * sign
+                by_a, by_b = (bent, -bent) if by_a is None else (by_a + bent, by_b - bent)
+        return by_a, by_b, None
 
 
 @lru_cache(maxsize=4096)
@@ -134,6 +133,11 @@ class TorchOps:
 
     name = "torch"
 
+    @property
+    def guarded(self) -> Ops:
+        """The same operations with gradients that are finite where values are infinite or NaN."""
+        return _GUARDED
+
     add = staticmethod(operator.add)
     sub = staticmethod(operator.sub)
     mul = staticmethod(operator.mul)
@@ -149,10 +153,6 @@ class TorchOps:
     both = staticmethod(operator.and_)
     either = staticmethod(operator.or_)
     where = staticmethod(torch.where)
-
-    def sqrt(self, x: Tensor) -> Tensor:
-        root: Tensor = _SafeSqrt.apply(x)  # type: ignore[no-untyped-call]
-        return root
 
     def atan2(self, a: Tensor | float, b: Tensor | float) -> Tensor:
         return torch.atan2(*_pair(a, b))
@@ -253,13 +253,13 @@ class TorchOps:
 
     def softmax(self, x: Tensor, k: float) -> Tensor:
         """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) over axis 0, which is kept with length 1."""
-        out: Tensor = _SmoothMax.apply(x, k)  # type: ignore[no-untyped-call]
-        return out
+        out, _ = _SmoothMax.apply(x, k)  # type: ignore[no-untyped-call]
+        return out  # type: ignore[no-any-return]
 
     def softmax2(self, a: Tensor, b: Tensor, k: float) -> Tensor:
         """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) of two arrays of the same shape."""
-        out: Tensor = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
-        return out
+        out, _, _ = _SmoothMax2.apply(a, b, k)  # type: ignore[no-untyped-call]
+        return out  # type: ignore[no-any-return]
 
     def kind(self, like: Tensor) -> Hashable:
         """Return (dtype, device) of `like`; arrays with equal keys can share converted constants."""
@@ -298,7 +298,9 @@ class TorchOps:
         if torch.compiler.is_exporting():
             mask = torch.from_numpy(keep).view(-1, *(1,) * (x.ndim - 1))
             return torch.where(mask, x, value)
-        out: Tensor = _MaskedRows.apply(x, keep, value)  # type: ignore[no-untyped-call]
+        edges = (0, *(np.flatnonzero(np.diff(keep)) + 1).tolist(), len(keep))
+        runs = [(slice(a, b), bool(keep[a])) for a, b in pairwise(edges)]
+        out: Tensor = _MaskedRows.apply(x, runs, value)  # type: ignore[no-untyped-call]
         return out
 
     def columns(self, x: Tensor) -> Sequence[Tensor]:
@@ -318,3 +320,22 @@ for _function in FUNCTIONS.values():
         setattr(TorchOps, _function.name, staticmethod(getattr(torch, _function.torch)))
 
 TORCH: Ops = cast("Ops", TorchOps())
+
+
+class _GuardedOps:
+    """Torch operations with gradients that are finite where values are infinite or NaN."""
+
+    def __getattr__(self, name: str) -> Any:
+        found = sifted(getattr(TORCH, name))
+        setattr(self, name, found)
+        return found
+
+    def lerp(self, no: Tensor | float, yes: Tensor | float, weight: Tensor) -> Tensor:
+        return lerp(*_pair(no, yes), weight)
+
+    def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
+        """Return 1 where a condition holds, else 0; a condition whose margin is NaN does not hold."""
+        return TORCH.straight_through(torch.nan_to_num(rho, -torch.inf, torch.inf, -torch.inf), strict, slope)
+
+
+_GUARDED = cast("Ops", _GuardedOps())
