@@ -11,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.compile.backends.array.arith import ArrayProgram
+from stlc.compile.backends.array.interval import Intervals
+from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
@@ -230,3 +232,20 @@ def test_a_temporal_formula_is_no_condition() -> None:
 def test_division_by_zero_is_quiet() -> None:
     out = ArrayProgram({"out": op("div", X, op("sub", Y, Y))})({"x": np.ones(1), "y": np.ones(1)}, NUMPY)
     assert math.isinf(out["out"][0])
+
+
+def test_large_recordings_are_computed_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Outputs are those of one pass: also constants, columns of two traces, and intervals."""
+    monkeypatch.setattr("stlc.compile.backends.array.arith._ROOM", 50)
+    env = {name: np.random.default_rng(i).normal(0, 1, (37, 2)) for i, name in enumerate(NAMES)}
+    program = ArrayProgram(
+        {"a": op("add", op("sin", X), op("mul", Y, Z)), "b": ir.Const(2.0), "c": op("abs", X)}
+    )
+    found = program(env, NUMPY)
+    np.testing.assert_array_equal(found["a"], np.sin(env["x"]) + env["y"] * env["z"])
+    assert (found["b"] == np.full((37, 2), 2.0)).all()
+    boxes = program({name: Intervals(value, value + 1.0) for name, value in env.items()}, INTERVALS)
+    assert boxes["c"].shape == (37, 2)
+    assert ((boxes["c"].low <= found["c"]) & (found["c"] <= boxes["c"].high)).all()
+    mixed = ArrayProgram({"a": op("add", X, Y)})({"x": env["x"], "y": env["y"][:1]}, NUMPY)
+    np.testing.assert_array_equal(mixed["a"], env["x"] + env["y"][:1])

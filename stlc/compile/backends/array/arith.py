@@ -31,6 +31,9 @@ ExternFunction: TypeAlias = Callable[..., Sequence[Array]]
 _TAKES_FLOATS = frozenset({"pow"})
 """Kernels that take a constant as a Python float."""
 
+_ROOM = 1 << 24
+"""Numbers in all registers of a program beyond which a recording is computed in blocks of samples."""
+
 
 class ArrayProgram:
     """Program that computes several numeric expressions from arrays.
@@ -44,7 +47,8 @@ class ArrayProgram:
     arrays must broadcast. If an expression reads a signal some samples earlier or later, the shifted signal
     is a separate array; the attribute `shifted` lists the names of such arrays. The call returns one array
     per output. A constant output has the shape of the first array in the dictionary. Common sub-expressions
-    are computed once.
+    are computed once. Large arrays of NumPy and of intervals are computed in blocks along axis 0, so that the
+    memory for intermediate results is bounded.
     """
 
     def __init__(
@@ -78,8 +82,16 @@ class ArrayProgram:
         bound = self._bound.get(key)
         if bound is None:
             bound = self._bound[key] = self._bind(ops, switch, like)
+        shapes = {
+            tuple(env[name].shape) for name, _ in bound.inputs if not isinstance(env[name], (int, float))
+        }
         with ops.quiet():
+            if ops.name in ("numpy", "intervals") and len(shapes) == 1:
+                return bound.run_in_blocks(env, ops, next(iter(shapes)))
             return bound.run(env, ops)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_bound": {}}
 
     def operations(self, *, exact: bool = True) -> int:
         """Number of array operations per call.
@@ -162,7 +174,22 @@ class _Bound:
     arrays: dict[str, int]
     numbers: dict[str, float]
 
+    def run_in_blocks(self, env: Mapping[str, Array], ops: Ops, shape: tuple[int, ...]) -> dict[str, Array]:
+        """Run on arrays that all have the shape `shape`, in blocks along axis 0 if they are large."""
+        numbers = math.prod(shape) * len(self.code)
+        if numbers <= _ROOM or not shape:
+            return self.run(env, ops)
+        size = max(shape[0] * _ROOM // numbers, 1)
+        whole = {name: value for name, value in env.items() if isinstance(value, (int, float))}
+        arrays = {name: env[name] for name, _ in self.inputs if name not in whole}
+        parts = [
+            self.run(whole | {name: value[first : first + size] for name, value in arrays.items()}, ops)
+            for first in range(0, shape[0], size)
+        ]
+        return {name: ops.cat([part[name] for part in parts]) for name in parts[0]}
+
     def run(self, env: Mapping[str, Array], ops: Ops) -> dict[str, Array]:
+        """Run on the arrays `env`; return the outputs by name."""
         registers = self.registers.copy()
         for name, register in self.inputs:
             value = env[name]
