@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -208,11 +209,18 @@ def world_type(decl: SystemDecl) -> WorldType:
     return cast(WorldType, ModelWorld) if decl.test.world is None else _load(decl.test.world)
 
 
+_TEXT = "__stlc_text__"
+"""Attribute of a loaded module: path and content of its file. While they are the same, it is loaded once."""
+
+
 def _load(reference: WorldRef) -> WorldType:
-    path, name = reference.path, reference.name
+    path = reference.path
     if not path.is_file():
         raise _refused(reference, f"there is no file `{path}`")
-    module_name = f"stlc_world_{path.stem}"
+    module_name, text = f"stlc_world_{path.stem}", path.read_bytes()
+    known = sys.modules.get(module_name)
+    if known is not None and getattr(known, _TEXT, None) == (path, text):
+        return _world_in(known, reference)
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
         raise _refused(reference, f"`{path}` is not a Python file")
@@ -223,6 +231,12 @@ def _load(reference: WorldRef) -> WorldType:
     except Exception as error:
         del sys.modules[module_name]
         raise _refused(reference, f"importing `{path}` fails", f"{type(error).__name__}: {error}") from error
+    setattr(module, _TEXT, (path, text))
+    return _world_in(module, reference)
+
+
+def _world_in(module: ModuleType, reference: WorldRef) -> WorldType:
+    path, name = reference.path, reference.name
     found = getattr(module, name, None)
     if not isinstance(found, type):
         guess = closest(name, [key for key, value in vars(module).items() if isinstance(value, type)])

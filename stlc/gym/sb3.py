@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from stlc.diagnostics import not_installed, usage
+from stlc.gym.pictures import Picture
 from stlc.gym.spaces import Floats
 from stlc.gym.vector import SpecVectorEnv
 
@@ -95,6 +96,10 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
             }
             for seen, earned, rho, satisfied, state in rows
         ]
+
+    def get_images(self) -> Sequence[Picture]:
+        """Pictures of all environments, which must have been made with `render_mode="rgb_array"`."""
+        return self.env.render()
 
     def close(self) -> None:
         """Close the environments."""

@@ -19,9 +19,11 @@ from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.environments import MOST, Environments, require_reward, reward_at_end
 from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import Task
-from stlc.controller.world import world_type
+from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import usage
+from stlc.gym.pictures import MODES, Picture, Pictures, RenderMode, snapshot
 from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation
+from stlc.view.scene import DrawScene
 
 Reward: TypeAlias = Literal["robustness", "accuracy", "task", "dense"]
 """Name of a reward. `dense` rewards add up to the robustness of the episode less that of its first state."""
@@ -56,12 +58,16 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         normalised: whether observations and actions are scaled to [-1, 1], which most learners expect.
         time: whether the elapsed share of the episode is observed; None: only if the episode terminates.
         world: whether the agent moves in the world of the system; None: only in longer episodes.
+        render_mode: `rgb_array`: `render` returns pictures, drawn by the world, or of the agent in the plane
+            of its first two states.
+
+    A copy (`copy.deepcopy`) or a pickle continues the episode; the task is shared by copies.
 
     Raises UsageError (U101) if no reward is named `reward`, if it is `task` and the system declares no
     reward, or if `world` is False for an episode longer than a plan.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
+    metadata = {"render_modes": MODES}  # noqa: RUF012 - as gymnasium declares it
 
     def __init__(
         self,
@@ -72,6 +78,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         normalised: bool = False,
         time: bool | None = None,
         world: bool | None = None,
+        render_mode: RenderMode | None = None,
     ) -> None:
         if reward not in get_args(Reward):
             raise usage(f"there is no reward `{reward}`", f"rewards: {', '.join(get_args(Reward))}")
@@ -90,6 +97,9 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self._formulas = [rule.formula for rule in task.rules]
         in_world = self.steps > task.horizon if world is None else world
         self._motion: _Motion = _InWorld(task, self.steps) if in_world else _OnModel(task)
+        self.render_mode, dt = render_mode, task.system.dt
+        self.metadata = {"render_modes": MODES, "render_fps": max(round(1.0 / dt), 1)}
+        self._pictures = Pictures(render_mode, self._motion.draw, dt)
         self._driven: list[Tensor] = []
         self._seeded = False
         self._rho = 0.0
@@ -113,6 +123,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         given = (options or {}).get("state")
         x = self._motion.begin(None if given is None else initial_state(self.task, given, 1))
         self._driven = [x]
+        self._pictured(first=True)
         info = self._told(judged=self.reward == "dense")
         self._rho = info.get("rho", 0.0)
         return self._seen(), info
@@ -129,10 +140,22 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         x, u = self._driven[-1], torch.as_tensor(held).reshape(1, -1)
         plan = self.task.system.planned(x, u)
         self._driven.append(self._motion.advance(x, plan, len(self._driven)))
+        self._pictured(first=False)
         over = len(self._driven) > self.steps
         info = self._told(judged=over or self.reward == "dense")
         whole = self.steps <= self.task.horizon
         return self._seen(), self._earned(x, plan, info), over and whole, over and not whole, info
+
+    def render(self) -> Picture:  # type: ignore[override]
+        """Picture of the present instant, (height, width, 3) uint8.
+
+        Raises UsageError (U101) if the environment was made without `render_mode`, or before `reset`.
+        """
+        return self._pictures.shown()
+
+    def _pictured(self, *, first: bool) -> None:
+        if self.render_mode is not None:
+            self._pictures.add(self._motion.snapshot(), first=first)
 
     def _earned(self, before: Tensor, plan: Tensor, info: Mapping[str, Any]) -> float:
         """Reward of the last step, from the state `before`, (1, n), under the controls `plan`, (1, m).
@@ -190,6 +213,13 @@ class _Motion(Protocol):
     def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:
         """State after step number `step` under the controls `plan`, (1, m)."""
 
+    @property
+    def draw(self) -> DrawScene:
+        """Function that draws a frame of a scene: of snapshots, stacked over time."""
+
+    def snapshot(self) -> Mapping[str, NDArray[Any]]:
+        """Arrays from which a picture of the present instant is drawn, name -> array."""
+
     def seen(self, x: Tensor, step: int) -> Tensor:
         """State `x` as the agent measures it at `step`, with sensor noise if there is any."""
 
@@ -197,16 +227,23 @@ class _Motion(Protocol):
 class _OnModel:
     """Motion of the agent on the model of the system, without disturbances."""
 
+    draw = staticmethod(ModelWorld.draw)
+
     def __init__(self, task: Task) -> None:
         self._episodes = Environments(task, 1, generator=torch.Generator(), ahead=AHEAD)
         self.seed = self._episodes.seed
 
     def begin(self, state: Tensor | None) -> Tensor:
         self._episodes.reset(state)
-        return self._episodes.states
+        self._x = self._episodes.states
+        return self._x
 
     def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:  # noqa: ARG002
-        return self._episodes.step(plan).states
+        self._x = self._episodes.step(plan).states
+        return self._x
+
+    def snapshot(self) -> Mapping[str, NDArray[Any]]:
+        return snapshot(self._episodes.task, self._x)
 
     def seen(self, x: Tensor, step: int) -> Tensor:  # noqa: ARG002
         return x
@@ -217,7 +254,15 @@ class _InWorld:
 
     def __init__(self, task: Task, steps: int) -> None:
         self._task, self._steps, self._type = task, steps, world_type(task.system.decl)
+        self.draw = self._type.draw
         self._random = np.random.default_rng()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Make the motion anew first, which loads the file of its world."""
+        return _InWorld, (self._task, self._steps), vars(self)
+
+    def snapshot(self) -> Mapping[str, NDArray[Any]]:
+        return self._worlds.snapshot()
 
     def seed(self, seed: int) -> None:
         self._random = np.random.default_rng(seed)
@@ -244,6 +289,7 @@ def make(
     normalised: bool = False,
     time: bool | None = None,
     world: bool | None = None,
+    render_mode: RenderMode | None = None,
 ) -> SpecEnv:
     """Make the environment of a specification file and a system file.
 
@@ -257,4 +303,12 @@ def make(
     """
     task = load_task(spec, system, hint="give `system`")
     require_controls(task)
-    return SpecEnv(task, steps=steps, reward=reward, normalised=normalised, time=time, world=world)
+    return SpecEnv(
+        task,
+        steps=steps,
+        reward=reward,
+        normalised=normalised,
+        time=time,
+        world=world,
+        render_mode=render_mode,
+    )

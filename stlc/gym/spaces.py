@@ -47,10 +47,13 @@ class SpaceBounds:
     def physical(self, given: NDArray[np.float32], *, unit: bool) -> NDArray[np.float64]:
         """Convert values (…, k) to physical units and clip them to the bounds.
 
-        `unit`: whether the given values are normalised to [-1, 1].
+        `unit`: whether the given values are normalised to [-1, 1]. Raises UsageError (U101) for NaN.
         """
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         value = np.asarray(given, dtype=np.float64)
+        if np.isnan(value).any():
+            place = tuple(map(int, np.argwhere(np.isnan(value))[0]))
+            raise usage(f"the action is NaN at index {', '.join(map(str, place))}", "give finite actions")
         return np.clip(low + 0.5 * (value + 1.0) * (high - low) if unit else value, low, high)
 
     def shown(self, value: NDArray[np.float32], *, unit: bool) -> Floats:

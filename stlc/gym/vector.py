@@ -16,7 +16,9 @@ from stlc.controller.problem.environments import MOST, Environments, Transition
 from stlc.controller.problem.environments import Reward as EpisodeReward
 from stlc.controller.problem.load import load_task, require_controls
 from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.controller.world import ModelWorld
 from stlc.diagnostics import usage
+from stlc.gym.pictures import MODES, Picture, Pictures, RenderMode, snapshot
 from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation
 
 AHEAD = 1024
@@ -47,6 +49,10 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             the observations of the next initial states, and `info["final_obs"]` and `info["final_info"]` hold
             observations and info of the end. With `NEXT_STEP` the last step returns the final observations;
             the following step ignores its actions, begins the next episodes and gives the reward 0.
+        render_mode: `rgb_array`: `render` returns pictures of the agents in the plane of their first two
+            states.
+
+    A copy (`copy.deepcopy`) or a pickle continues the episodes; the task is shared by copies.
 
     Raises UsageError (U101) if no reward is named `reward`, if it is `task` and the system declares no
     reward, or if another argument is wrong.
@@ -61,6 +67,7 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         normalised: bool = False,
         time: bool = True,
         autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
+        render_mode: RenderMode | None = None,
     ) -> None:
         if num_envs < 1:
             raise usage(f"there are no {num_envs} environments", "give at least 1")
@@ -70,7 +77,12 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             )
         self.task, self.reward, self.normalised, self.time = task, reward, normalised, time
         self.num_envs, self.autoreset = num_envs, AutoresetMode(autoreset)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset}
+        self.render_mode, dt = render_mode, task.system.dt
+        self.metadata = {
+            **{"render_modes": MODES, "render_fps": max(round(1.0 / dt), 1)},
+            "autoreset_mode": self.autoreset,
+        }
+        self._pictures = [Pictures(render_mode, ModelWorld.draw, dt) for _ in range(num_envs)]
         self._episodes = Environments(
             task, num_envs, reward=reward, generator=torch.Generator(), ahead=max(AHEAD, num_envs)
         )
@@ -113,7 +125,21 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self._begun, self._next = True, None
         state = given.get("state")
         start = None if state is None else initial_state(self.task, state, self.num_envs)
-        return self._shown(self._episodes.reset(start)), self._told(self._episodes.states)
+        seen = self._shown(self._episodes.reset(start))
+        self._pictured(first=True)
+        return seen, self._told(self._episodes.states)
+
+    def render(self) -> tuple[Picture, ...]:
+        """Pictures of all environments at the present instant, (height, width, 3) uint8 each.
+
+        Raises UsageError (U101) if the environments were made without `render_mode`, or before `reset`.
+        """
+        return tuple(each.shown() for each in self._pictures)
+
+    def _pictured(self, *, first: bool) -> None:
+        if self.render_mode is not None:
+            for pictures, state in zip(self._pictures, self._episodes.states.split(1), strict=True):
+                pictures.add(snapshot(self.task, state), first=first)
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Floats, NDArray[np.float64], Flags, Flags, Info]:
         """Advance all environments by one step under `actions`, (N, m).
@@ -127,9 +153,11 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         none: Flags = np.zeros(self.num_envs, dtype=np.bool_)
         if self._next is not None:
             seen, self._next = self._shown(self._next), None
+            self._pictured(first=True)
             return seen, np.zeros(self.num_envs), none, none.copy(), self._told(self._episodes.states)
         moved = self._episodes.step(self._plans(actions))
         reward, done = moved.reward.double().numpy(), moved.done.numpy()
+        self._pictured(first=moved.verdicts is not None)
         if moved.verdicts is None:
             return self._shown(moved.final), reward, done, none, self._told(moved.states)
         final, end = self._shown(moved.final), self._at_end(moved, moved.verdicts)
@@ -200,6 +228,7 @@ def make_vec(
     normalised: bool = False,
     time: bool = True,
     autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
+    render_mode: RenderMode | None = None,
 ) -> SpecVectorEnv:
     """Make many environments of a specification file and a system file.
 
@@ -214,4 +243,12 @@ def make_vec(
     """
     task = load_task(spec, system, hint="give `system`")
     require_controls(task)
-    return SpecVectorEnv(task, num_envs, reward=reward, normalised=normalised, time=time, autoreset=autoreset)
+    return SpecVectorEnv(
+        task,
+        num_envs,
+        reward=reward,
+        normalised=normalised,
+        time=time,
+        autoreset=autoreset,
+        render_mode=render_mode,
+    )

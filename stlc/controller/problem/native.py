@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -251,12 +252,21 @@ class _Once(torch.autograd.Function):
 class NativeStep:
     """Native functions for one exact step of a system, its observation and its declared reward, on the CPU.
 
+    Copies share the compiled functions; pickles build or load them anew.
+
     Attributes:
         compiled: library of the compiled functions.
     """
 
-    def __init__(self, compiled: Advance) -> None:
+    def __init__(self, compiled: Advance, system: System, *, rewarded: bool) -> None:
         self.compiled = compiled
+        self._system, self._rewarded = system, rewarded
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(NativeStep.of, rewarded=self._rewarded), (self._system,)
 
     @classmethod
     def of(cls, system: System, *, rewarded: bool) -> NativeStep | None:
@@ -272,9 +282,10 @@ class NativeStep:
         except Untranslatable:
             return None
         library = load(text)
-        return (
-            None if library is None else cls(Advance(library, seen=system.observed_count, rewarded=rewarded))
-        )
+        if library is None:
+            return None
+        advance = Advance(library, seen=system.observed_count, rewarded=rewarded)
+        return cls(advance, system, rewarded=rewarded)
 
     def advance(self, x: Tensor, u: Tensor, share: float) -> tuple[Tensor, Tensor, Tensor | None]:
         """Advance states by one step, and return the new states, observations and rewards.

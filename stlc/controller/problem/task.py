@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
@@ -134,6 +134,9 @@ class Task:
     def __deepcopy__(self, memo: object) -> Self:
         """Return the task itself, which is immutable: a copied network belongs to the same task."""
         return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Task, (self.compiled, self.plain)
 
     @classmethod
     def of(

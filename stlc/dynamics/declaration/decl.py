@@ -5,12 +5,15 @@ Expressions are in the compiler's intermediate representation (IR). Nothing here
 
 from __future__ import annotations
 
+import copyreg
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir.discretize import Grid
@@ -39,6 +42,14 @@ _HASHED_AS = {
     **{"Indicator": "Ind", "Predicate": "Atom", "BoolOp": "Join"},
 }
 """Earlier class names of nodes, used in hashes so that those of existing runs stay valid."""
+
+
+def _read_only(entries: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(entries)
+
+
+copyreg.pickle(MappingProxyType, lambda found: (_read_only, (dict(found),)))
+"""Declarations can be pickled: their read-only mappings as dictionaries."""
 
 
 @dataclass(frozen=True)

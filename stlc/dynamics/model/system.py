@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -64,6 +65,13 @@ class System:
         self.signature = decl.signature.extended(*self.added)
         self.initial = InitialStates(decl.init, decl.signature.names)
         self._steppers: dict[bool, Stepper] = {}
+
+    def __deepcopy__(self, memo: object) -> Self:
+        """Return the system itself, which is immutable."""
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return System, (self.decl, self.timers, self.parameters)
 
     @classmethod
     def load(
