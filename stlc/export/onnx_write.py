@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 import torch
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 # ----------------------------------------------------------------------------------------------- files
 
 
+Precision: TypeAlias = Literal["float64", "float32"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 OPSET = 18
 """The operator set of ONNX 1.13 (2022), which all later runtimes support."""
 IR_VERSION = 8
@@ -50,19 +52,22 @@ def require_onnx() -> None:
         raise not_installed("`--to onnx` needs the packages `onnx` and `onnxruntime`", "onnx") from None
 
 
-def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) -> bytes:
+def model_of(
+    name: str, outputs: Mapping[str, Value], facts: Mapping[str, str], real: Precision = "float64"
+) -> bytes:
     """Return the content of an ONNX file with the graph that computes `outputs`.
 
     Args:
         name: name of the graph.
         outputs: name -> value, in order.
         facts: metadata of the file, key -> text.
+        real: element type that takes the place of float64, in all values and constants.
     """
     from onnx import checker, helper
 
     sheet = next(iter(outputs.values())).sheet
     model = helper.make_model(
-        _graph(sheet, name, list(outputs.items())),
+        _graph(sheet, name, list(outputs.items()), real),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="stlc",
@@ -74,10 +79,10 @@ def model_of(name: str, outputs: Mapping[str, Value], facts: Mapping[str, str]) 
     return data
 
 
-def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) -> GraphProto:
+def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]], real: Precision) -> GraphProto:
     """ONNX graph called `name`, with those nodes of `sheet` on which `outputs` depend.
 
-    `outputs`: public name -> value, as pairs.
+    `outputs`: public name -> value, as pairs. `real` takes the place of float64.
     """
     from onnx import helper, numpy_helper
 
@@ -86,33 +91,39 @@ def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]]) ->
     read = {each for node in nodes for each in node.reads} | {value.name for _, value in shown}
     renamed = [helper.make_node("Identity", [value.name], [outside]) for outside, value in shown]
     return helper.make_graph(
-        [*map(_node, nodes), *renamed],
+        [*(_node(node, real) for node in nodes), *renamed],
         name,
-        [_declared(each, each.name) for each in sheet.inputs],
-        [_declared(value, outside) for outside, value in shown],
-        [numpy_helper.from_array(array, key) for key, array in sheet.constants.items() if key in read],
+        [_declared(each, each.name, real) for each in sheet.inputs],
+        [_declared(value, outside, real) for outside, value in shown],
+        [
+            numpy_helper.from_array(array.astype(real) if array.dtype == np.float64 else array, key)
+            for key, array in sheet.constants.items()
+            if key in read
+        ],
     )
 
 
-def _node(node: GraphNode) -> NodeProto:
+def _node(node: GraphNode, real: Precision) -> NodeProto:
     from onnx import helper
 
     made = helper.make_node(node.op, list(node.inputs), list(node.outputs))
     for key, value in node.attributes:
         if isinstance(value, GraphBody):
             prefix = value.sheet.prefix
-            graph = _graph(value.sheet, key, [(f"{prefix}o{i}", out) for i, out in enumerate(value.outputs)])
+            outputs = [(f"{prefix}o{i}", out) for i, out in enumerate(value.outputs)]
+            graph = _graph(value.sheet, key, outputs, real)
             made.attribute.append(helper.make_attribute(key, graph))
         else:
-            made.attribute.append(helper.make_attribute(key, value))
+            double = node.op == "Cast" and value == KINDS["float64"]
+            made.attribute.append(helper.make_attribute(key, KINDS[real] if double else value))
     return made
 
 
-def _declared(value: Value, name: str) -> ValueInfoProto:
+def _declared(value: Value, name: str, real: Precision) -> ValueInfoProto:
     from onnx import helper
 
     shape = ["batch" if length == BATCH else length for length in value.shape]
-    return helper.make_tensor_value_info(name, KINDS[value.kind], shape)
+    return helper.make_tensor_value_info(name, KINDS[real if value.kind == "float64" else value.kind], shape)
 
 
 # ---------------------------------------------------------------------------------------- a controller
@@ -130,18 +141,18 @@ class Latency:
     p99: float
 
 
-def write_onnx(run: Run, folder: Path) -> None:
+def write_onnx(run: Run, folder: Path, real: Precision = "float64") -> None:
     """Write `decide.onnx`, `follow.onnx`, `judge.onnx` and `controller.json`, and up to two more files.
 
     `fall.onnx` is written if the specification has safety requirements. `continue.onnx` is written if the
-    policy tries changed copies of a plan that violates the specification.
+    policy tries changed copies of a plan that violates the specification. Numbers are of the type `real`.
 
     Raises:
         UsageError: U101, a part of the task has no ONNX form.
         MissingError: R301, `onnx` or `onnxruntime` is not installed.
     """
     require_onnx()
-    task, facts = run.task, _facts(run)
+    task, facts = run.task, {**_facts(run), "precision": real}
     graphs: dict[str, Callable[[], dict[str, Value]]] = {
         DECIDE: lambda: deciding(task, run.network),
         FOLLOW: lambda: following(task, run.network),
@@ -158,7 +169,7 @@ def write_onnx(run: Run, folder: Path) -> None:
         except Untranslatable as error:
             message = f"this task has no form as an ONNX graph: {error}"
             raise UsageError(Diagnostic("U101", message, help=("take --to torch instead",))) from error
-        data = model_of(Path(name).stem, outputs, {"stlc": dumps(facts)})
+        data = model_of(Path(name).stem, outputs, {"stlc": dumps(facts)}, real)
         (folder / name).write_bytes(data)
         digests[name] = sha256(data)
     (folder / FACTS).write_text(dumps({**facts, "files": digests}, indent=1) + "\n", encoding="utf-8")

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import torch
 
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.export import c_header
 from stlc.export.c_header import public, weights
-from stlc.export.onnx_write import Latency, timed, write_onnx
+from stlc.export.onnx_write import PRECISIONS, Latency, Precision, timed, write_onnx
 from stlc.export.programs import recorded, recorded_guard
 from stlc.export.verify import (
+    EXACT,
+    SINGLE,
     Agreement,
     Unchecked,
     agreement,
@@ -76,7 +78,20 @@ def target_of(word: str) -> Target:
     )
 
 
-def export(run: Run, target: Target, folder: Path) -> Exported:
+def precision_of(word: str, target: Target) -> Precision:
+    """Return the element type called `word`.
+
+    Raises UsageError (U101) for an unknown name, or for float32 with a target other than onnx.
+    """
+    for precision in PRECISIONS:
+        if precision == word:
+            if precision == "float32" and target != "onnx":
+                raise usage(f"`--to {target}` computes in float64", "take --to onnx for float32")
+            return precision
+    raise usage(f"there is no precision `{word}`", f"one of {', '.join(PRECISIONS)}")
+
+
+def export(run: Run, target: Target, folder: Path, precision: Precision = "float64") -> Exported:
     """Export the controller of a run, and verify it by a comparison with the run.
 
     An export that cannot be verified, such as C without a compiler, is written all the same; the result says
@@ -86,6 +101,7 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
         run: a run with a checkpoint.
         target: the form of the export.
         folder: destination; existing files of the same names are replaced, except for those in `EXAMPLES`.
+        precision: element type of all numbers of ONNX graphs. The verification of float32 is less strict.
 
     Raises:
         RunError: R105, the export disagrees with the run; nothing is written.
@@ -95,7 +111,7 @@ def export(run: Run, target: Target, folder: Path) -> Exported:
     with tempfile.TemporaryDirectory() as name:
         beside = Path(name)
         try:
-            (found, latency), unchecked = _WRITERS[target](run, beside), ""
+            (found, latency), unchecked = _WRITERS[target](run, beside, precision), ""
         except Unchecked as why:
             found, latency, unchecked = None, None, why.why
         texts = {path.name: path.read_bytes() for path in sorted(beside.iterdir()) if path.name != BUILT}
@@ -118,7 +134,7 @@ EXAMPLES = ("main.c", "Makefile")
 Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 
-def _torch(run: Run, folder: Path) -> Checked:
+def _torch(run: Run, folder: Path, precision: Precision) -> Checked:  # noqa: ARG001
     """Write `decide.pt2`, `backup.pt2` and `controller.json`; compare the programs with the run.
 
     `controller.json` describes the inputs and outputs of the programs.
@@ -135,7 +151,7 @@ def _torch(run: Run, folder: Path) -> Checked:
     return fresh.worst(guarded), None
 
 
-def _onnx(run: Run, folder: Path) -> Checked:
+def _onnx(run: Run, folder: Path, precision: Precision) -> Checked:
     """Write the ONNX graphs of `stlc.export.onnx_graphs`, and `controller.json`.
 
     The graphs are then compared with the run, and the decision times of the runtime are measured.
@@ -143,16 +159,17 @@ def _onnx(run: Run, folder: Path) -> Checked:
     Raises:
         RunError: R105, the graphs disagree with the run.
     """
-    write_onnx(run, folder)
+    write_onnx(run, folder, precision)
     graphs = Graphs(read_facts(folder))
-    fresh = agreement(run.policy, by_onnx(graphs), states=STATES)
-    kept = previous_plan_agreement(run.policy, graphs, states=STATES)
-    guarded = backup_agreement(run.policy, backup_by_onnx(graphs), states=GUARDED)
-    off = same_verdicts(run.task, graphs, states=STATES // 4)
+    within = SINGLE if precision == "float32" else EXACT
+    fresh = agreement(run.policy, by_onnx(graphs), states=STATES, within=within)
+    kept = previous_plan_agreement(run.policy, graphs, states=STATES, within=within)
+    guarded = backup_agreement(run.policy, backup_by_onnx(graphs), states=GUARDED, within=within)
+    off = same_verdicts(run.task, graphs, states=STATES // 4, within=within)
     return fresh.worst(kept, off).worst(guarded), timed(run.task, folder)
 
 
-def _c(run: Run, folder: Path) -> Checked:
+def _c(run: Run, folder: Path, precision: Precision) -> Checked:  # noqa: ARG001
     """Write the C header, its weights, an example program and its Makefile.
 
     The example program is then compiled and compared with the run.
@@ -180,7 +197,11 @@ def _c(run: Run, folder: Path) -> Checked:
     return agreement(run.policy, program("policy"), states=STATES).worst(guarded), None
 
 
-_WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c": _c, "onnx": _onnx}
+_WRITERS: Mapping[Target, Callable[[Run, Path, Precision], Checked]] = {
+    "torch": _torch,
+    "c": _c,
+    "onnx": _onnx,
+}
 
 
 def _facts(run: Run) -> dict[str, object]:

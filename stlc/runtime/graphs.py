@@ -14,6 +14,8 @@ from stlc.diagnostics import Diagnostic, MissingError, RunError
 from stlc.runtime.facts import CONTINUE, DECIDE, FALL, FOLLOW, JUDGE, Facts
 
 Numbers: TypeAlias = NDArray[np.float64]
+_KINDS: Mapping[str, type] = {"tensor(double)": np.float64, "tensor(float)": np.float32}
+"""Element type of an input, as onnxruntime writes it -> that of NumPy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +147,16 @@ class Graphs:
             raise _misfit(name, str(error)) from error
 
     def _run(self, session: Any, **feeds: Numbers) -> dict[str, Numbers]:
-        """Outputs of a graph by name, checked against the description. Raises RunError, R106."""
+        """Outputs of a graph by name, checked against the description. Raises RunError, R106.
+
+        Numbers are float64 here, and what the graph declares inside.
+        """
         try:
+            kinds = {each.name: _KINDS[each.type] for each in session.get_inputs()}
+            given = {name: values.astype(kinds[name], copy=False) for name, values in feeds.items()}
             names = [each.name for each in session.get_outputs()]
-            found = dict(zip(names, session.run(names, feeds), strict=True))
+            outputs = zip(names, session.run(names, given), strict=True)
+            found = {name: x.astype(np.float64) if x.dtype == np.float32 else x for name, x in outputs}
         except Exception as error:
             raise _misfit("a graph", str(error)) from error
         facts, rows = self.facts, len(feeds["state"])

@@ -12,8 +12,9 @@ import torch
 from helpers.exported import exported, run_of, untrained
 
 from stlc.diagnostics import MissingError, RunError, UsageError
-from stlc.export.verify import same_verdicts
-from stlc.export.write import export
+from stlc.export.verify import SINGLE, same_verdicts
+from stlc.export.write import export, precision_of
+from stlc.runtime import Controller
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 
@@ -35,6 +36,30 @@ def test_every_benchmark_has_graphs(spec: str, system: str, tmp_path: Path) -> N
     assert done.agreement is not None
     assert done.agreement.rho <= 1e-9
     assert done.agreement.ties <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("spec", "system"), BENCHMARKS)
+def test_every_benchmark_has_graphs_in_float32(spec: str, system: str, tmp_path: Path) -> None:
+    done = export(run_of(spec, system, tmp_path), "onnx", tmp_path / "out", "float32")
+    assert done.agreement is not None
+
+
+def test_graphs_in_float32_hold_no_float64(tmp_path: Path) -> None:
+    run = run_of("traffic", "car", tmp_path)
+    done = export(run, "onnx", tmp_path / "out", "float32")
+    assert done.agreement is not None
+    assert 0.0 < done.agreement.rho <= SINGLE.rho
+    assert json.loads((done.folder / "controller.json").read_text())["precision"] == "float32"
+    for name in done.files:
+        if name.endswith(".onnx"):
+            assert "DOUBLE" not in onnx.printer.to_text(onnx.load(done.folder / name)).upper()
+    controller, state = Controller.load(done.folder), run.task.sample(1, seed=2, dtype=torch.float64)
+    decision = controller.decide(state[0].numpy())
+    (wanted,) = run.policy.plan(state)
+    assert decision.control == pytest.approx(wanted[0].numpy(), abs=1e-4)
+    with pytest.raises(UsageError, match="float64"):
+        precision_of("float32", "c")
 
 
 def test_the_files_say_what_they_are(tmp_path: Path) -> None:

@@ -15,7 +15,10 @@ from stlc.escape import visible
 
 
 @command(
-    "stlc export latest --to c", "stlc export latest --to onnx -o controller", "stlc export latest --to torch"
+    "stlc export latest --to c",
+    "stlc export latest --to onnx -o controller",
+    "stlc export latest --to onnx --precision float32",
+    "stlc export latest --to torch",
 )
 def export(
     run: RunArgument = "latest",
@@ -24,6 +27,10 @@ def export(
         Path | None,
         typer.Option("--output", "-o", "--out", metavar="DIR", help="By default in the run's folder."),
     ] = None,
+    precision: Annotated[
+        str,
+        typer.Option(metavar="TYPE", help="Numbers of ONNX graphs: float64, or float32 for other runtimes."),
+    ] = "float64",
     runs: RunsOption = Path("runs"),
 ) -> Answer[ExportedRun]:
     """Export a trained controller, monitor included.
@@ -36,12 +43,13 @@ def export(
     """
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write
-    from stlc.export.write import target_of
+    from stlc.export.write import precision_of, target_of
 
     target = target_of(to)
+    real = precision_of(precision, target)
     opened = Run.open(run, root=runs)
     shown = output or Path(opened.dir.shown) / "export" / target
-    done = write(opened, target, shown)
+    done = write(opened, target, shown, real)
     found, taken = done.agreement, done.latency
 
     def show() -> None:
@@ -51,6 +59,7 @@ def export(
             say(
                 f"checked in {found.states} random states, the backup policy in {found.guarded}: "
                 f"plans within {found.plan:.1e} of a range, robustness within {found.rho:.1e}"
+                f"{'' if real == 'float64' else ', in float32'}"
             )
         if taken is not None:
             say(

@@ -250,7 +250,7 @@ def arranged(monkeypatch, machine):
             case "R402":
                 monkeypatch.setattr("stlc.controller.policies.policy.BestOfKPolicy.candidates", no_number)
             case "R105":
-                monkeypatch.setattr("stlc.export.verify.PLAN", -1.0)  # nothing agrees as well as that
+                monkeypatch.setattr("stlc.export.verify._distance", lambda *_: float("inf"))  # nothing agrees
             case "R404":
                 path = Path("specs/cart.stl")
                 path.write_text(path.read_text().replace("abs(x) < 0.1 m", "x > 100 m"))
