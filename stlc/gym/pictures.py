@@ -38,7 +38,7 @@ class Pictures:
             raise usage(f"there is no render_mode `{mode}`", 'render_mode="rgb_array" gives pictures')
         self._mode, self._draw, self._dt = mode, draw, dt
         self._seen: list[Mapping[str, NDArray[Any]]] = []
-        self._shape: tuple[int, ...] = ()
+        self._size: tuple[int, int] | None = None
 
     def add(self, snapshot: Mapping[str, NDArray[Any]], *, first: bool) -> None:
         """Add the snapshot of an instant, name -> array; the `first` one of an episode begins it anew."""
@@ -64,9 +64,9 @@ class Pictures:
         animation = scene_animation(scene, SceneOptions(self._draw, self._dt))
         last = len(self._seen) - 1
         (image,) = frames_in(animation, range(last, last + 1), DPI)
-        self._shape = self._shape or (image.height, image.width, 3)
-        if image.size != self._shape[1::-1]:
-            image = image.resize(self._shape[1::-1], Image.Resampling.LANCZOS)
+        self._size = self._size or image.size
+        if image.size != self._size:
+            image = image.resize(self._size, Image.Resampling.LANCZOS)
         return np.asarray(image)
 
 

@@ -146,7 +146,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         whole = self.steps <= self.task.horizon
         return self._seen(), self._earned(x, plan, info), over and whole, over and not whole, info
 
-    def render(self) -> Picture:  # type: ignore[override]
+    def render(self) -> Picture:
         """Picture of the present instant, (height, width, 3) uint8.
 
         Raises UsageError (U101) if the environment was made without `render_mode`, or before `reset`.

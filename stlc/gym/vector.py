@@ -138,8 +138,8 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     def _pictured(self, *, first: bool) -> None:
         if self.render_mode is not None:
-            for pictures, state in zip(self._pictures, self._episodes.states.split(1), strict=True):
-                pictures.add(snapshot(self.task, state), first=first)
+            for pictures, state in zip(self._pictures, self._episodes.states, strict=True):
+                pictures.add(snapshot(self.task, state[None]), first=first)
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Floats, NDArray[np.float64], Flags, Flags, Info]:
         """Advance all environments by one step under `actions`, (N, m).

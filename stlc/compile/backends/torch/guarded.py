@@ -26,6 +26,8 @@ class _Sifted(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ARG004
+        if not torch.is_grad_enabled():
+            return torch.nan_to_num(grad, 0.0, 0.0, 0.0), None
         return _Sifted.apply(grad, True), None  # type: ignore[no-untyped-call]
 
 

@@ -335,7 +335,8 @@ class _GuardedOps:
 
     def straight_through(self, rho: Tensor, strict: bool, slope: float) -> Tensor:
         """Return 1 where a condition holds, else 0; a condition whose margin is NaN does not hold."""
-        return TORCH.straight_through(torch.nan_to_num(rho, -torch.inf, torch.inf, -torch.inf), strict, slope)
+        known: Tensor = torch.nan_to_num(rho, -torch.inf, torch.inf, -torch.inf)
+        return TORCH.straight_through(known, strict, slope)  # type: ignore[no-any-return]
 
 
 _GUARDED = cast("Ops", _GuardedOps())
