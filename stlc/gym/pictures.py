@@ -51,8 +51,6 @@ class Pictures:
 
         Raises UsageError (U101) if no pictures are wanted, or no episode has begun.
         """
-        from PIL import Image
-
         if self._mode is None:
             raise usage(
                 "this environment was made without render_mode", 'make it with render_mode="rgb_array"'
@@ -66,7 +64,7 @@ class Pictures:
         (image,) = frames_in(animation, range(last, last + 1), DPI)
         self._size = self._size or image.size
         if image.size != self._size:
-            image = image.resize(self._size, Image.Resampling.LANCZOS)
+            image = image.resize(self._size)
         return np.asarray(image)
 
 
