@@ -75,6 +75,63 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     return json_text(json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False))
 
 
+Shape: TypeAlias = Any
+"""Shape of JSON data: a type (`float` is any number), `Any`, `[shape]` for a list, a tuple for a list of that
+length, or a mapping from keys to shapes. A key with `?` may be missing or null; `*` are all other keys."""
+_DEEPEST, _LARGEST = 100, 1e100
+_NOUNS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
+
+
+def conforming(text: str | bytes, shape: Shape) -> Any:
+    """Parse JSON that stlc has stored, and that anybody may have changed, and check its shape.
+
+    Raises:
+        ValueError: the text is no JSON in UTF-8, nests more than 100 deep, holds a number that is not finite
+            or beyond 1e100, or is of another shape. The message names the key.
+        RecursionError: the text is nested too deeply to be read.
+    """
+    value = loads(text if isinstance(text, str) else text.decode("utf-8"))
+    _require_plain(value, "", _DEEPEST)
+    _require_shape(value, shape, "")
+    return value
+
+
+def _require_plain(value: Json, key: str, depth: int) -> None:
+    if depth < 0:
+        raise ValueError(f"`{key[:60]}` is nested more than {_DEEPEST} deep")
+    if isinstance(value, dict | list):
+        for name, item in value.items() if isinstance(value, dict) else enumerate(value):
+            _require_plain(item, f"{key}.{name}" if key else str(name), depth - 1)
+    elif isinstance(value, int | float) and not abs(value) <= _LARGEST:
+        raise ValueError(f"`{key}` is not finite, or is too large")
+
+
+def _require_shape(value: Json, shape: Shape, key: str) -> None:
+    where = f"`{key}`" if key else "it"
+    if isinstance(shape, dict):
+        if not isinstance(value, dict):
+            raise ValueError(f"{where} is no JSON object")
+        for name, inner in shape.items():
+            plain_name = name.removesuffix("?")
+            others = [other for other in value if not {other, f"{other}?"} & shape.keys()]
+            for each in others if plain_name == "*" else [plain_name]:
+                if value.get(each) is None and name.endswith("?"):
+                    continue
+                if each not in value:
+                    raise ValueError(f"{where} has no `{each}`")
+                _require_shape(value[each], inner, f"{key}.{each}" if key else each)
+    elif isinstance(shape, list | tuple):
+        length = len(shape) if isinstance(shape, tuple) else None
+        if not isinstance(value, list) or length not in (None, len(value)):
+            raise ValueError(f"{where} is no list" + (f" of {length}" if length else ""))
+        for number, item in enumerate(value):
+            _require_shape(item, shape[number if length else 0], f"{key}.{number}")
+    elif shape is not Any:
+        accepted = shape | int if shape in (float, float | str) else shape
+        if not isinstance(value, accepted) or (isinstance(value, bool) and shape is not bool):
+            raise ValueError(f"{where} is {value!r:.40}, not {_NOUNS.get(shape, 'of its kind')}")
+
+
 _ESCAPES = re.compile(r"(\\\\|\\u[dD][89abAB]..\\u[dD][c-fC-F]..)|\\u[dD][89a-fA-F]..|[\ud800-\udfff]")
 
 
