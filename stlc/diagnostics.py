@@ -273,6 +273,8 @@ CODES: dict[str, str] = {
     "R107": "a state that an exported controller cannot decide in",
     "R108": "a file that is no certificate, or a damaged one",
     "R109": "a run that another process is training",
+    "R110": "a link, a pipe, a device or a too large file in the folder of a run",
+    "R111": "Python that a run names, and that the command does not run",
     "R201": "no room on the disk, or a file that cannot be written",
     "R202": "not enough memory",
     "R301": "a package that is not installed",

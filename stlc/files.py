@@ -12,15 +12,18 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import takewhile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
-from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError, os_reason
+from stlc.diagnostics import Diagnostic, MissingError, RunError, SpecError, UsageError, os_reason
 from stlc.escape import operand, shell
 from stlc.registry import closest
 from stlc.source import Source
 from stlc.stopping import leaving
 
 MAX_BYTES = 10_000_000
+RECORD = "run.json"
+"""Name of the record of a run; a folder with this file is a run."""
 _INSTALLED = Path(__file__).parent / "library"
 LIBRARY = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1]
 """Folder of the installed data files, laid out as the source tree (in an editable install, that tree)."""
@@ -33,28 +36,82 @@ _MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")
 # ----------------------------------------------------------------------- reading
 
 
-def read_source(path: Path | str) -> Source:
+def read_source(path: Path | str, root: str = "") -> Source:
     """Read a text file in UTF-8; `-` is the standard input.
 
+    Args:
+        path: path of the file.
+        root: folder that names in the text do not leave; see `Source.root`.
+
     Raises:
-        UsageError: U102, there is no such file, or it cannot be opened.
+        UsageError: U102, there is no such file, it cannot be opened, or it is a named pipe or a device.
         SpecError: E003, the file is a 3-D mesh (also `.stl`), another binary file, or not UTF-8; E005, it is
             larger than `MAX_BYTES`.
     """
     name = str(path)
     if name == "-":
-        return _decode("<stdin>", sys.stdin.buffer.read(MAX_BYTES + 1))
+        return decoded("<stdin>", sys.stdin.buffer.read(MAX_BYTES + 1))
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+        data = read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         raise UsageError(_missing(path)) from None
     except OSError as error:
-        raise UsageError(Diagnostic("U102", f"cannot read `{name}`: {os_reason(error)}")) from None
+        raise (_too_large(name) if error.errno == errno.EFBIG else unreadable(path, error)) from None
     except ValueError:  # a zero byte in the name
         raise UsageError(Diagnostic("U102", f"no file can be called {name!r}")) from None
-    return _decode(name, data)
+    return decoded(name, data, root)
+
+
+def read_regular(path: Path, most: int) -> bytes:
+    """Read a file of at most `most` bytes. Raises OSError as `opened_regular` does; EFBIG: it is larger."""
+    with opened_regular(path) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it is larger than {most // 1_000_000} MB", str(path))
+    return data
+
+
+def opened_regular(path: Path) -> BinaryIO:
+    """Open a regular file, or a pipe that this process has inherited (`/dev/fd/63`), for reading.
+
+    Anything else could wait for ever, or never end.
+
+    Raises:
+        OSError: the path is a folder, a named pipe, a device or a socket, or cannot be opened.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISFIFO(mode) and not os.path.lexists(real(path)):
+        os.set_blocking(descriptor, True)
+    elif not stat.S_ISREG(mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, f"it is {_noun(mode)}, not a file", str(path))
+    return open(descriptor, "rb")  # noqa: PTH123 - of a descriptor
+
+
+def _noun(mode: int) -> str:
+    nouns = {stat.S_IFIFO: "a pipe", stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFREG: "a file"}
+    return nouns.get(stat.S_IFMT(mode), "a device")
+
+
+def require_regular(path: Path) -> None:
+    """Check that `path` is a regular file, for readers that open it by its name.
+
+    Raises:
+        OSError: it cannot be opened, or is something else; see `opened_regular`.
+    """
+    opened_regular(path).close()
+
+
+def unreadable(path: Path, error: OSError) -> UsageError:
+    """Return the error U102 for a file that cannot be read."""
+    advice = ("`-` stands for the standard input",) if error.errno == errno.EINVAL else ()
+    return UsageError(Diagnostic("U102", f"cannot read `{path}`: {os_reason(error)}", help=advice))
+
+
+def _too_large(name: str) -> SpecError:
+    return SpecError(Diagnostic("E005", f"`{name}` is larger than {MAX_BYTES // 1_000_000} MB"))
 
 
 def _missing(path: Path) -> Diagnostic:
@@ -69,9 +126,10 @@ def _siblings(folder: Path) -> list[str]:
     return []
 
 
-def _decode(name: str, data: bytes) -> Source:
+def decoded(name: str, data: bytes, root: str = "") -> Source:
+    """Return the content of a text file as a source. Raises SpecError (E003, E005), as `read_source` does."""
     if len(data) > MAX_BYTES:
-        raise SpecError(Diagnostic("E005", f"`{name}` is larger than {MAX_BYTES // 1_000_000} MB"))
+        raise _too_large(name)
     if _is_binary_mesh(data):
         raise SpecError(_mesh(name, None))
     try:
@@ -80,7 +138,7 @@ def _decode(name: str, data: bytes) -> Source:
         raise SpecError(_not_utf8(name, data, error)) from None
     if "\0" in text:
         raise SpecError(Diagnostic("E003", f"`{name}` is a binary file, not a text"))
-    source = Source(name, text)
+    source = Source(name, text, root)
     if _MESH.match(text):
         raise SpecError(_mesh(name, source))
     return source
@@ -249,12 +307,13 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
 
     Raises:
         UsageError: U102, it is in neither place; the message lists both.
+        RunError: R110, it is in the folder of a run, and a link leads there.
     """
     folders = [Path(), runs / "latest"]
     for folder in folders:
         path = folder / name
         if path.is_file() or _is_bag(path):
-            return path
+            return of_run(path)
     if Path(name).is_dir():
         advice = f"name its traces: '{Path(name) / '*'}'"
         raise UsageError(Diagnostic("U102", f"`{name}` is a folder, not a trace", help=(advice,)))
@@ -329,14 +388,94 @@ def _shown(path: Path) -> str:
     return f"installed: {path.name}" if SYSTEMS in path.parents else str(path)
 
 
-def beside(home: Path, name: str) -> Path:
-    """Return the path of the file `name`, to which a file in the folder `home` refers.
+def named_in(source: Source, name: str, *, copied: bool = False) -> Path:
+    """Return the path of the file `name`, to which a text refers, relative to the folder of the text.
 
-    For `systems/car.yaml` it is `home/systems/car.yaml`. If that file does not exist but `home/car.yaml`
-    does, the latter is returned, because run folders hold copies of the files without their subfolders.
+    A text of a run (`Source.root`) refers to files in the folder of the run alone. This folder holds copies
+    of the files without their subfolders: if there is no `systems/car.yaml`, it is `car.yaml`.
+
+    Args:
+        source: the text.
+        name: path of the file as it is written in the text.
+        copied: whether any folder may hold copies without their subfolders.
+
+    Raises:
+        RunError: R110, the name leads over a link in the folder of the run, or to something else than a file.
     """
+    home = Path(source.name).parent
     there, here = home / name, home / Path(name).name
-    return here if here.is_file() and not there.is_file() else there
+    if not source.root:
+        return here if copied and here.is_file() and not there.is_file() else there
+    root, there = Path(source.root), Path(os.path.normpath(there))
+    inside = there.is_relative_to(root) and os.path.lexists(there)
+    return within(root, (there if inside else root / Path(name).name).relative_to(root).as_posix())
+
+
+def within(root: Path, name: str, most: int | None = None, *, folders: bool = False) -> Path:
+    """Return the path of the file `name` in the folder `root` of a run, if no link leads elsewhere.
+
+    The file need not exist.
+
+    Args:
+        root: the folder, whose own path may go over links.
+        name: path of the file, relative to `root`.
+        most: largest size of the file in bytes; None for any.
+        folders: whether only the folders on the way are checked.
+
+    Raises:
+        RunError: R110, a folder on the way or the file itself is a link, the file is no regular file or too
+            large, or the name leads out of the folder.
+    """
+    path, parts = root, PurePosixPath(name).parts
+    if not parts or PurePosixPath(name).is_absolute() or ".." in parts or "\0" in name:
+        raise refused(root / name, "the name leads out of the folder of the run")
+    for number, part in enumerate(parts[:-1] if folders else parts, 1):
+        path, last = path / part, number == len(parts)
+        try:
+            found = path.lstat()
+        except FileNotFoundError:
+            break
+        except OSError as error:
+            raise refused(path, os_reason(error)) from None
+        if not (stat.S_ISREG if last else stat.S_ISDIR)(found.st_mode):
+            raise refused(path, f"it is {_noun(found.st_mode)}")
+        if last and most is not None and found.st_size > most:
+            raise refused(path, f"it is larger than {most // 1_000_000} MB")
+    return root.joinpath(*parts)
+
+
+def run_folder(path: Path) -> Path | None:
+    """Return the nearest folder of a run at or above `path`; None if there is none."""
+    return next((folder for folder in (path, *path.parents) if (folder / RECORD).is_file()), None)
+
+
+def of_run(path: Path) -> Path:
+    """Return the path of a file that the user names; of a run, `within` it. Raises RunError (R110)."""
+    folder = run_folder(path)
+    return path if folder in (None, path) else within(folder, path.relative_to(folder).as_posix())
+
+
+def place(root: Path, name: str) -> Path:
+    """Return the path at which a file is to be written in the folder `root`; missing folders are created.
+
+    A link, a pipe or a device of that name is removed, so that nothing is written where it leads.
+
+    Raises:
+        RunError: R110, a folder on the way is a link, or the name leads out of the folder.
+        MissingError: R201, a folder cannot be created.
+    """
+    path = within(root, name, folders=True)
+    with reported(f"write `{path}`"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
+            path.unlink()
+    return path
+
+
+def refused(path: Path, why: str) -> RunError:
+    """Return the error R110: a file of a run is not read or written."""
+    advice = ("a run has regular files and folders alone: remove it, or copy what it leads to",)
+    return RunError(Diagnostic("R110", f"`{path}` is not a file of the run: {why}", help=advice))
 
 
 @contextmanager

@@ -9,10 +9,17 @@ from functools import cached_property
 
 @dataclass(frozen=True)
 class Source:
-    """A text, and its name in messages: the path of its file as the user gave it."""
+    """A text, and its name in messages: the path of its file as the user gave it.
+
+    Attributes:
+        name: path of the file.
+        text: the whole text.
+        root: folder that names in the text do not leave, the folder of a run; "" if they may lead anywhere.
+    """
 
     name: str
     text: str = field(repr=False)
+    root: str = field(default="", repr=False, compare=False)
 
     @cached_property
     def line_starts(self) -> tuple[int, ...]:

@@ -15,7 +15,7 @@ import pytest
 
 from stlc import files
 from stlc.cli.framework.render import render_text
-from stlc.diagnostics import MissingError, SpecError, StlcError, UsageError
+from stlc.diagnostics import MissingError, RunError, SpecError, StlcError, UsageError
 from stlc.files import (
     MAX_BYTES,
     atomic_path,
@@ -24,9 +24,14 @@ from stlc.files import (
     find_trace,
     has_wildcard,
     matching_traces,
+    named_in,
+    place,
+    read_regular,
     read_source,
+    within,
     write_atomic,
 )
+from stlc.source import Source
 
 ROOT = Path(__file__).resolve().parent.parent
 FULL = Path("/dev/full")
@@ -364,3 +369,82 @@ def test_a_system_file_is_no_specification(name):
     assert "is a system file" in finding(caught).message
     option, word = shlex.split(finding(caught).help[0].partition(", and ")[2])
     assert (option, word) == ("--system", name if not name.startswith("-") else f"./{name}")
+
+
+# ------------------------------------------------------------------ regular files, within a folder
+
+
+def test_what_could_wait_or_never_end_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.stl")
+    for name, noun in (("pipe.stl", "a pipe"), ("/dev/zero", "a device"), (".", "a folder")):
+        with pytest.raises(UsageError, match=f"cannot read .*it is {noun}"):
+            read_source(tmp_path / name)
+    (tmp_path / "main.stl").write_text('import "pipe.stl" as p\nsignal x\nrequire r: x > 0\n')
+    from stlc.compile.frontend.modules import library_of
+    from stlc.grammar.parse.parser import parse
+
+    with pytest.raises(SpecError, match="it is a pipe"):
+        library_of(parse(read_source(tmp_path / "main.stl")))
+
+
+def test_a_pipe_of_the_shell_is_read() -> None:
+    reader, writer = os.pipe()
+    with os.fdopen(writer, "w") as end:
+        end.write("spec piped\n")
+    try:
+        assert read_source(f"/dev/fd/{reader}").text == "spec piped\n"
+    finally:
+        os.close(reader)
+
+
+def test_a_name_in_a_run_stays_in_its_folder(tmp_path: Path) -> None:
+    root, outside = tmp_path / "run", tmp_path / "outside"
+    for path in (root / "sub/a.py", root / "b.py", outside / "a.py", outside / "c.py"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    text = Source(str(root / "system.yaml"), "", root=str(root))
+    assert named_in(text, "sub/a.py") == root / "sub/a.py"
+    assert named_in(text, "../outside/b.py") == named_in(text, str(outside / "b.py")) == root / "b.py"
+    assert named_in(text, "../outside/c.py") == root / "c.py"  # which does not exist
+    (root / "c.py").symlink_to(outside / "c.py")
+    (root / "far").symlink_to(outside)
+    for name in ("c.py", "../outside/c.py", "far/a.py", "..", "sub"):
+        with pytest.raises(RunError, match="R110"):
+            named_in(text, name)
+    free = Source(str(root / "system.yaml"), "")
+    assert named_in(free, "../outside/c.py").resolve() == outside / "c.py"
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", "a/../../x", "", "a\0b"])
+def test_a_name_that_leads_out_is_refused(tmp_path: Path, name: str) -> None:
+    for door in (within, place):
+        with pytest.raises(RunError, match="leads out of the folder"):
+            door(tmp_path, name)
+
+
+def test_nothing_is_written_where_a_link_leads(tmp_path: Path) -> None:
+    root, outside = tmp_path / "run", tmp_path / "outside"
+    root.mkdir()
+    outside.mkdir()
+    (outside / "keys").write_text("mine")
+    (root / "report.html").symlink_to(outside / "keys")
+    (root / "new").symlink_to(outside / "new")
+    (root / "eval").symlink_to(outside)
+    os.mkfifo(root / "pipe")
+    for name in ("report.html", "new", "pipe", "deep/er/file"):
+        write_atomic(place(root, name), "content")
+        assert not (root / name).is_symlink()
+        assert (root / name).read_text() == "content"
+    with pytest.raises(RunError, match="it is a link"):
+        place(root, "eval/simulate.json")
+    assert [path.name for path in outside.iterdir()] == ["keys"]
+    assert (outside / "keys").read_text() == "mine"
+
+
+def test_a_file_of_a_run_has_a_largest_size(tmp_path: Path) -> None:
+    (tmp_path / "x").touch()
+    os.truncate(tmp_path / "x", 10**12)
+    with pytest.raises(RunError, match="larger than 3 MB"):
+        within(tmp_path, "x", 3_000_000)
+    with pytest.raises(OSError, match="larger than 3 MB"):
+        read_regular(tmp_path / "x", 3_000_000)

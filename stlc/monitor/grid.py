@@ -17,6 +17,7 @@ from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.files import find_system
 from stlc.grammar import ast
+from stlc.source import Source
 from stlc.trace import Trace, as_fraction
 
 if TYPE_CHECKING:
@@ -75,14 +76,15 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
     return Times(None if dt is None else as_fraction(dt), None if horizon is None else as_fraction(horizon))
 
 
-def _declared(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
+def _declared(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
     from stlc.dynamics.declaration.load import load_system_decl
 
-    decl = load_system_decl(find_system(name, Path(spec.source.name)), overrides)
+    found = name if isinstance(name, Source) else find_system(name, Path(spec.source.name))
+    decl = load_system_decl(found, overrides)
     return Times(decl.dt, decl.dt * decl.horizon), decl
 
 
-def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
+def system_of(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, Interface]:
     """Return what the system file `name` declares: time step and horizon, and signals and functions.
 
     The file is searched for beside the specification. `overrides`: name of a constant -> its value, as text.
@@ -100,9 +102,11 @@ def system_of(name: str, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[
 def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
     """Time step and horizon of the system that a specification names; None without one or without its file.
 
+    None also for a specification that was stored with a run or a trace, and is not beside its files.
+
     `overrides`: name of a constant -> its value, as text.
     """
-    if spec.system is None:
+    if spec.system is None or spec.library is not None:
         return None
     try:
         find_system(spec.system, Path(spec.source.name))

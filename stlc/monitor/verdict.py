@@ -64,8 +64,8 @@ class Monitor:
         dt: time step of the signals in seconds. By default, it is taken from the trace or from the system.
         horizon: horizon `T` of the planning window in seconds. By default, it is taken from the system or
             from the trace.
-        system: path or name of a system file; the specification is then checked against it. Without it, the
-            system that the specification names supplies a missing `dt` or `T`.
+        system: path, name or text of a system file; the specification is then checked against it. Without
+            it, the system that the specification names supplies a missing `dt` or `T`.
         overrides: name of a constant -> its value, as text.
 
     Signals are NumPy arrays or torch tensors by name, (time,) or (…, time). A vector is one array (…, time,
@@ -81,7 +81,7 @@ class Monitor:
         spec: ast.Spec | str | Path,
         dt: Seconds | None = None,
         horizon: Seconds | None = None,
-        system: str | Path | None = None,
+        system: str | Path | Source | None = None,
         overrides: Mapping[str, str] | None = None,
     ) -> None:
         if isinstance(spec, Path) or (
@@ -93,7 +93,8 @@ class Monitor:
         self._overrides = dict(overrides or {})
         self._system, self._interface = Times(), None
         if system is not None:
-            self._system, self._interface = system_of(str(system), self.spec, self._overrides)
+            found = system if isinstance(system, Source) else str(system)
+            self._system, self._interface = system_of(found, self.spec, self._overrides)
         self._resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
         self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}

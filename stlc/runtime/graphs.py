@@ -153,7 +153,9 @@ class Graphs:
         """
         try:
             kinds = {each.name: _KINDS[each.type] for each in session.get_inputs()}
-            given = {name: values.astype(kinds[name], copy=False) for name, values in feeds.items()}
+            given: dict[str, Any] = {
+                name: values.astype(kinds[name], copy=False) for name, values in feeds.items()
+            }
             names = [each.name for each in session.get_outputs()]
             outputs = zip(names, session.run(names, given), strict=True)
             found = {name: x.astype(np.float64) if x.dtype == np.float32 else x for name, x in outputs}

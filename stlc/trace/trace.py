@@ -18,10 +18,20 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.escape import shell
+from stlc.files import require_regular
 from stlc.signature import Kind, Signature
 from stlc.trace.clocks import ClockSetting, clocked
 from stlc.trace.enums import Words, in_numbers, wordless
-from stlc.trace.formats.registry import FORMATS, SUFFIXES, WRITTEN, format_of, needed, suffix_of, unreadable
+from stlc.trace.formats.registry import (
+    FORMATS,
+    SUFFIXES,
+    WRITTEN,
+    format_of,
+    needed,
+    opened,
+    suffix_of,
+    unreadable,
+)
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.meta import TraceMeta
 from stlc.trace.recording import ALL, CLOCK, EXTRA, Clock, ClockGroup, Recording, Wanted, absent, fit
@@ -214,6 +224,9 @@ def read_recording(path: Path, wanted: Wanted = ALL) -> Recording:
     if guessed and path.is_file() and not is_zipfile(path):
         why = f"its suffix is none of {' '.join(SUFFIXES)}"
         raise unreadable(path, why, advice="give it the suffix of its format")
+    if not path.is_dir():
+        with opened(path):
+            require_regular(path)
     found: Recording = format_of(path).function("read")(path, wanted)
     return found
 

@@ -273,24 +273,25 @@ def monitor_of(source: Source, question: Question, carried: Carried | None = Non
     `carried` is what a trace stores: imported files and new values of constants. It is used only if the
     specification is also taken from the trace, that is, if `question` names no specification file.
     """
-    library: Mapping[str, str] = {}
+    library: Mapping[str, str] | None = None
     changed = question.overrides
     if carried is not None and question.spec is None:
         library, changed = carried.library, {**carried.overrides, **changed}
-    return _monitor(source, tuple(library.items()), question.system, tuple(changed.items()))
+    stored = None if library is None else tuple(library.items())
+    return _monitor(source, stored, question.system, tuple(changed.items()))
 
 
 @lru_cache(maxsize=8)
 def _monitor(
     source: Source,
-    library: tuple[tuple[str, str], ...],
+    library: tuple[tuple[str, str], ...] | None,
     system: str | None,
     overrides: tuple[tuple[str, str], ...],
 ) -> Monitor:
     from stlc.grammar.parse.parser import parse
     from stlc.monitor.verdict import Monitor
 
-    parsed = replace(parse(source), library=dict(library) or None)
+    parsed = replace(parse(source), library=None if library is None else dict(library))
     return Monitor(parsed, system=system, overrides=dict(overrides))
 
 

@@ -35,7 +35,8 @@ from stlc.cli.framework.options import (
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, MissingError, UsageError, usage
+from stlc.diagnostics import Diagnostic, MissingError, SpecError, usage
+from stlc.files import read_source
 from stlc.registry import closest, guard_named
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ RUNS = Path("runs")
     "stlc falsify specs/arch/transmission.stl --require AT1",
     "stlc falsify latest --guard paper --simulations 2000",
     "stlc falsify specs/arch/transmission.stl --replay counterexamples/AT1.json",
+    drives=True,
 )
 def falsify(
     target: Annotated[
@@ -474,10 +476,8 @@ def _stored(path: Path) -> dict[str, Any]:
         UsageError: U102, there is no such file; U101, it is not a counterexample.
     """
     try:
-        found = json_text.loads(path.read_text(encoding="utf-8"))
-    except OSError:
-        raise UsageError(Diagnostic("U102", f"there is no file `{path}`")) from None
-    except (ValueError, RecursionError):
+        found = json_text.loads(read_source(path).text)
+    except (SpecError, ValueError, RecursionError):
         found = None
     wrong = usage(f"`{path}` is not a counterexample", "a file that `stlc falsify` wrote")
     keys: dict[str, Any] = {

@@ -10,6 +10,7 @@ from pathlib import Path
 import typer
 
 from stlc.escape import shell
+from stlc.files import read_source
 
 _REQUIRE = re.compile(r"\brequire\s+(`[^`\n]+`|[^\W\d]\w*)\s*:")
 _COMMENT = re.compile(r"(#|//).*")
@@ -65,7 +66,7 @@ def _named(context: typer.Context) -> Iterator[Path]:
 def _specification(path: Path) -> str:
     """The text of a specification file, or of the specification stored in a trace."""
     if path.suffix in (".stl", ".stlc"):
-        return path.read_text(encoding="utf-8")
+        return read_source(path).text
     from stlc.files import find_trace
     from stlc.trace import read_recording
 

@@ -160,6 +160,8 @@ class _Loader:
             return Source(f"lib/{file_of(key)}", self.library[key])
         if key == STD:
             return read_source(_STD_FILE)
+        if self.library is not None:
+            raise _refused(written, f"the text of `{written.target}` was not stored with this specification")
         try:
             return read_source(self.home / key)
         except UsageError as error:

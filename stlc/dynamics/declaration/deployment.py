@@ -39,6 +39,7 @@ from stlc.dynamics.schema.record import (
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
+from stlc.files import named_in
 from stlc.grammar import ast
 from stlc.runtime.prefixes import SAMPLES, SAMPLINGS, Sampling
 from stlc.source import Span
@@ -202,7 +203,7 @@ def _world(cx: Context, node: Node, _label: str) -> WorldRef | None:
     if not file.endswith(".py") or not name.isidentifier():
         cx.reader.wrong(node, "`world`", "a Python file and a class", "write `traffic_grid.py:TrafficGrid`")
         return None
-    return WorldRef(Path(node.span.source.name).parent / file, name, node.span)
+    return WorldRef(named_in(node.span.source, file), name, node.span)
 
 
 @reads({"type": ["string", "null"]})
@@ -217,8 +218,7 @@ def _judge(cx: Context, node: Node, _label: str) -> JudgeRef | None:
     if not text.endswith(SPECS):
         cx.reader.wrong(node, "`judge`", "the path of a specification", "write `../specs/driving_rules.stl`")
         return None
-    folder = Path(node.span.source.name).parent
-    return JudgeRef(Path(os.path.normpath(folder / text)), text, node.span)
+    return JudgeRef(Path(os.path.normpath(named_in(node.span.source, text))), text, node.span)
 
 
 @reads(items_of({"type": "string"}))

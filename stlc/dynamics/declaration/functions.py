@@ -14,6 +14,7 @@ from stlc.dynamics.robots.kinematics import chain, position, read_urdf
 from stlc.dynamics.schema.names import Context
 from stlc.dynamics.schema.record import OF, TEXT, key, read, word
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node
+from stlc.files import named_in
 from stlc.source import Span
 from stlc.units import parse_unit
 
@@ -124,7 +125,7 @@ def _python(entry: Entry, keys: FunctionKeys, where: str, cx: Context) -> Functi
         return None
     module: str | Path = match["module"]
     if match["module"].endswith(".py"):
-        module = Path(place.source.name).parent / match["module"]
+        module = named_in(place.source, match["module"])
     return FunctionDecl(entry.key.text, module, match["attribute"], keys.arrays, place)
 
 
@@ -135,7 +136,7 @@ def _kinematics(entry: Entry, keys: FunctionKeys, cx: Context) -> FunctionDecl |
     is unusable or no joint moves the link.
     """
     file, tip, place = keys.file or "", keys.tip or "", entry.place("file")
-    path = Path(place.source.name).parent / file
+    path = named_in(place.source, file)
     try:
         joints = chain(read_urdf(path), tip, keys.base)
         if all(joint.kind == "fixed" for joint in joints):

@@ -36,7 +36,7 @@ from stlc.dynamics.schema.record import (
     section,
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Sequence
-from stlc.files import beside
+from stlc.files import named_in
 from stlc.signature import Column
 from stlc.source import Span
 
@@ -427,4 +427,4 @@ def _file(node: Node, columns: tuple[Column, ...], cx: Context) -> FileDecl | No
 
     if Path(text).suffix.lower() not in SUFFIXES:
         cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(SUFFIXES)}")
-    return FileDecl(beside(Path(node.span.source.name).parent, text), columns, node.span)
+    return FileDecl(named_in(node.span.source, text, copied=True), columns, node.span)

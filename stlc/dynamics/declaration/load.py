@@ -72,7 +72,7 @@ from stlc.dynamics.schema.record import (
     section,
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, load_node, load_yaml
-from stlc.files import beside, read_source, real
+from stlc.files import named_in, read_source, real
 from stlc.registry import closest
 from stlc.signature import Signature
 from stlc.source import Source
@@ -130,11 +130,11 @@ def system_schema() -> Json:
     return {**found, "anyOf": [{"required": required}, {"required": [_EXTENDS]}]}
 
 
-def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None = None) -> SystemDecl:
+def load_system_decl(path: Path | str | Source, overrides: MappingType[str, str] | None = None) -> SystemDecl:
     """Load the declaration of a system file.
 
     Args:
-        path: path of the file.
+        path: path of the file, or its text.
         overrides: new values by dotted key (`train.lr`), or by the name of a constant, parameter or top-level
             field; any other name without a dot is ignored here, because it may belong to the specification.
 
@@ -143,7 +143,8 @@ def load_system_decl(path: Path | str, overrides: MappingType[str, str] | None =
         SpecError: the file is not text.
         SystemFileError: the file is invalid; carries all findings.
     """
-    return parse_system(read_source(path), Path(path), overrides or {})
+    source = path if isinstance(path, Source) else read_source(path)
+    return parse_system(source, Path(source.name), overrides or {})
 
 
 def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
@@ -205,16 +206,13 @@ def _declaration(
     flow += sampled.flow
     _report_idle(found.control, cx, flow, jumps)
     spec = reader.text(found.spec, "`spec`")
-    folder = path.parent
-    if found.spec is not None and found.spec.span.source != reader.source:
-        folder = Path(found.spec.span.source.name).parent
     clamped = [each for each in names.columns if each.kind == "real" and each.fact]
     return SystemDecl(
         name=reader.name(found.name, "`name`") or path.stem,
         doc=" ".join((reader.text(found.doc, "`doc`") or "").split()),
         path=path,
         source=reader.source,
-        spec=Path(os.path.normpath(folder / spec)) if spec else None,
+        spec=Path(os.path.normpath(named_in(found.spec.span.source, spec))) if found.spec and spec else None,
         **asdict(named.clock),
         constants=MappingProxyType(names.constants),
         signature=Signature(tuple(names.columns)),
@@ -392,7 +390,7 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
         text = reader.text(node, f"`{_EXTENDS}`")
         if text is None:
             break
-        path = beside(Path(node.span.source.name).parent, text)
+        path = named_in(node.span.source, text, copied=True)
         again = real(path) in seen
         if again or len(chain) > MAX_FILES:
             why = "leads back to itself" if again else f"goes through more than {MAX_FILES} files"
@@ -400,7 +398,7 @@ def extended(root: Mapping, reader: Reader) -> tuple[Mapping, tuple[Source, ...]
             break
         seen.add(real(path))
         try:
-            source = read_source(path)
+            source = read_source(path, node.span.source.root)
             chain.append(load_yaml(source, sink=reader.findings))
         except StlcError as error:
             reader.report("S209", f"`{text}` cannot be read", node.span, error.diagnostics[0].message)

@@ -33,6 +33,7 @@ from stlc.dynamics.robots.functions import load_functions
 from stlc.dynamics.scenarios.scenario import truth, under
 from stlc.files import find_system
 from stlc.native import check_plans
+from stlc.source import Source
 
 HARD = Hard()
 PROBED = 1000
@@ -75,13 +76,18 @@ class System:
 
     @classmethod
     def load(
-        cls, path: Path | str, overrides: Mapping[str, str] | None = None, *, scenario: str | None = None
+        cls,
+        path: Path | str | Source,
+        overrides: Mapping[str, str] | None = None,
+        *,
+        scenario: str | None = None,
     ) -> System:
-        """Load a system file, by path or by name (`stlc.files.find_system`), and apply a scenario.
+        """Load a system file, by path, by name (`stlc.files.find_system`) or as a text; apply a scenario.
 
         Raises UsageError if it does not exist, SystemFileError if it is invalid.
         """
-        decl = load_system_decl(find_system(str(path)), overrides or {})
+        found = path if isinstance(path, Source) else find_system(str(path))
+        decl = load_system_decl(found, overrides or {})
         return cls(decl if scenario is None else under(decl, scenario))
 
     @cached_property

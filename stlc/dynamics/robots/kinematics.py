@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.model.algebra import Assignments
+from stlc.files import MAX_BYTES, read_regular
 
 Doubles: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["revolute", "prismatic", "fixed"]
-MAX_BYTES = 10_000_000
 _SNAP = 1e-9
 """Tolerance within which an entry of a rotation is rounded to an integer: files round pi / 2."""
 _KINDS: Mapping[str, Kind] = {
@@ -81,10 +81,8 @@ def chain(text: str, tip: str, base: str | None = None) -> tuple[Joint, ...]:
 
 
 def read_urdf(path: Path) -> str:
-    """Return the text of a URDF file. Raises OSError, or ValueError if it is too large or not UTF-8."""
-    if path.stat().st_size > MAX_BYTES:
-        raise ValueError(f"it is larger than {MAX_BYTES // 1_000_000} MB")
-    return path.read_text(encoding="utf-8")
+    """Return the text of a URDF file. Raises OSError (also: it is too large), or ValueError if not UTF-8."""
+    return read_regular(path, MAX_BYTES).decode("utf-8")
 
 
 def robot_of(text: str) -> ElementTree.Element:

@@ -17,6 +17,7 @@ from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.deployment import ErrorsDecl, ScenarioDecl
 from stlc.dynamics.declaration.load import load_system_decl, parse_system
 from stlc.registry import closest
+from stlc.source import Source
 
 DISTURBED = ("mismatch-5", "mismatch-10", "mismatch-20", "disturb", "noise")
 """Standard scenarios that the documentation measures."""
@@ -66,7 +67,7 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
     raise UsageError(Diagnostic("U101", f"there is no scenario `{name}`", help=help_))
 
 
-def scenario_constants(path: Path, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
+def scenario_constants(path: Path | Source, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
     """Return the constants that the scenario `name` of the system file `path` changes: name -> new value.
 
     The new value is a text. The constants change in the specification as well as in the system.

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.lib.format as npy
 
 from stlc.diagnostics import Diagnostic, TraceError
-from stlc.files import atomic_path
+from stlc.files import atomic_path, opened_regular
 from stlc.signature import Column
 from stlc.trace.formats.arrays import Array, Arrays, no_letters
 from stlc.trace.formats.registry import damage, opened, require_room, unreadable
@@ -41,7 +41,7 @@ _ZIP_MAGIC = (b"PK\x03\x04", b"PK\x05\x06")
 def read(path: Path, wanted: Wanted = ALL) -> Recording:
     """Read the arrays that are kept; no other is unpacked. Raises UsageError (U102) or TraceError (E603)."""
     with opened(path):
-        file = path.open("rb")
+        file = opened_regular(path)
     found, extras = Arrays(wanted), dict[str, Array]()
     total = 0
     with file, damage(path):
@@ -61,6 +61,28 @@ def read(path: Path, wanted: Wanted = ALL) -> Recording:
                     else:
                         found.add(name, member.whole())
     return found.recording(path, meta=meta, columns=columns, extras=extras)
+
+
+def read_arrays(path: Path) -> dict[str, Array]:
+    """Read all arrays of an archive, by name. Raises UsageError (U102) or TraceError (E603), as `read`."""
+    with opened(path):
+        file = opened_regular(path)
+    found: dict[str, Array] = {}
+    total = 0
+    with file, damage(path):
+        _check_magic(path, file)
+        with zipfile.ZipFile(file) as archive:
+            if len(archive.infolist()) > MAX_ARRAYS:
+                raise unreadable(path, f"it holds more than {MAX_ARRAYS} arrays")
+            for info in archive.infolist():
+                with ExitStack() as stack:
+                    member = ArchiveMember(path, archive, info, stack)
+                    if member.refused:
+                        raise unreadable(path, f"`{info.filename}` {member.refused}")
+                    total += member.size
+                    require_room(path, total)
+                    found[info.filename.removesuffix(".npy")] = member.whole()
+    return found
 
 
 def _check_magic(path: Path, file: IO[bytes]) -> None:
