@@ -21,7 +21,7 @@ ROOMS = (
     {"escape"},
     {"registry", "units", "jsontext"},
     {"signature"},
-    {"rundir", "files", "provenance", "cache", "toolchain", "native", "trace"},
+    {"rundir", "files", "foreign", "provenance", "cache", "toolchain", "native", "trace"},
     {"grammar"},
     {"compile"},
     {"runtime"},

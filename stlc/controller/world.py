@@ -7,10 +7,7 @@ subject to the `events` of the system file.
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -20,7 +17,8 @@ from torch import Tensor
 
 from stlc.controller.deployment.disturbance import Events
 from stlc.controller.sketch import DECIDED, Scene, deciders
-from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.diagnostics import Diagnostic, RunError, SystemFileError
+from stlc.foreign import module_at
 from stlc.registry import closest
 
 if TYPE_CHECKING:
@@ -205,38 +203,21 @@ def world_type(decl: SystemDecl) -> WorldType:
 
     Raises:
         SystemFileError: S206, the file or the class cannot be loaded or is not a world.
+        RunError: R111, a run names it, and the command does not drive.
     """
     return cast(WorldType, ModelWorld) if decl.test.world is None else _load(decl.test.world)
 
 
-_TEXT = "__stlc_text__"
-"""Attribute of a loaded module: path and content of its file. While they are the same, it is loaded once."""
-
-
 def _load(reference: WorldRef) -> WorldType:
-    path = reference.path
-    if not path.is_file():
-        raise _refused(reference, f"there is no file `{path}`")
-    module_name, text = f"stlc_world_{path.stem}", path.read_bytes()
-    known = sys.modules.get(module_name)
-    if known is not None and getattr(known, _TEXT, None) == (path, text):
-        return _world_in(known, reference)
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None or spec.loader is None:
-        raise _refused(reference, f"`{path}` is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[module_name]
-        raise _refused(reference, f"importing `{path}` fails", f"{type(error).__name__}: {error}") from error
-    setattr(module, _TEXT, (path, text))
-    return _world_in(module, reference)
-
-
-def _world_in(module: ModuleType, reference: WorldRef) -> WorldType:
     path, name = reference.path, reference.name
+    try:
+        module = module_at(path, f"stlc_world_{path.stem}", reference.span)
+    except RunError:
+        raise
+    except FileNotFoundError as error:
+        raise _refused(reference, str(error)) from None
+    except Exception as error:
+        raise _refused(reference, f"importing `{path}` fails", f"{type(error).__name__}: {error}") from error
     found = getattr(module, name, None)
     if not isinstance(found, type):
         guess = closest(name, [key for key, value in vars(module).items() if isinstance(value, type)])

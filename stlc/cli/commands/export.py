@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from stlc.cli.framework.documents import ExportCheck, ExportedRun, record
-from stlc.cli.framework.options import RunArgument, RunsOption
+from stlc.cli.framework.options import PythonOption, RunArgument, RunsOption
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
+from stlc.foreign import driving
 
 
 @command(
@@ -31,6 +32,7 @@ def export(
         str,
         typer.Option(metavar="TYPE", help="Numbers of ONNX graphs: float64, or float32 for other runtimes."),
     ] = "float64",
+    python: PythonOption = False,
     runs: RunsOption = Path("runs"),
 ) -> Answer[ExportedRun]:
     """Export a trained controller, monitor included.
@@ -47,9 +49,12 @@ def export(
 
     target = target_of(to)
     real = precision_of(precision, target)
-    opened = Run.open(run, root=runs)
-    shown = output or Path(opened.dir.shown) / "export" / target
-    done = write(opened, target, shown, real)
+    with driving(python):
+        opened = Run.open(run, root=runs)
+        if output is None:
+            opened.dir.place(f"export/{target}/controller.json")  # no folder on the way is a link
+        shown = output or Path(opened.dir.shown) / "export" / target
+        done = write(opened, target, shown, real)
     found, taken = done.agreement, done.latency
 
     def show() -> None:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     'stlc plan specs/reach_n_avoid.stl --from "x=1, v=0" --budget 50ms',
     "stlc plan specs/ship_safe.stl --starts 1000 --method cem --option population=500",
     "stlc plan specs/ship_safe.stl --target max --tube mismatch-10",
+    drives=True,
 )
 def plan(
     spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],

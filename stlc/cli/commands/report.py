@@ -5,26 +5,32 @@ from __future__ import annotations
 from pathlib import Path
 
 from stlc.cli.framework.documents import WrittenReport, verdict_record
-from stlc.cli.framework.options import RunArgument, RunsOption
+from stlc.cli.framework.options import PythonOption, RunArgument, RunsOption
 from stlc.cli.framework.output import PULSE, Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
+from stlc.foreign import driving
 
 
 @command("stlc report latest")
-def report(run: RunArgument = "latest", runs: RunsOption = Path("runs")) -> Answer[WrittenReport]:
+def report(
+    run: RunArgument = "latest", python: PythonOption = False, runs: RunsOption = Path("runs")
+) -> Answer[WrittenReport]:
     """Write a self-contained report.html with the pictures of a run.
 
     The report is written to the run's folder. It shows training curves, signals with the robustness of each
-    requirement, and the animation of a simulation, if available. The page needs no network.
+    requirement, and the animation of a simulation, if available. The page needs no network. A world that is
+    Python of the run draws its scenes only with --python.
     """
     from stlc.rundir import RunDir
+    from stlc.view.contents import simulation_of
     from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended
     from stlc.view.report import write_report
 
     folder = RunDir.open(run, runs)
-    with PULSE.doing("drawing the report"):
+    with PULSE.doing("drawing the report"), driving(python):
         write_report(folder)
+    world = (simulation_of(folder) or {}).get("world")
     path = f"{folder.shown}/report.html"
     record = folder.record()
     learning = learning_of_run(folder, Commands.of(folder.shown, guard=recommended(record)))
@@ -33,6 +39,8 @@ def report(run: RunArgument = "latest", runs: RunsOption = Path("runs")) -> Answ
         result["verdict"] = verdict_record(learning)
 
     def show() -> None:
+        if world and not python:
+            say(f"the scene is drawn by {visible(world)}, Python of the run: `--python` runs it")
         for line in driven_lines(record.get("result") or {}):
             say(line)
         if learning is not None:

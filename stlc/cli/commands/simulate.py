@@ -62,6 +62,7 @@ SCENARIOS = "eval/scenarios.json"
     "stlc simulate specs/ship_track.stl --backup --scenario all",
     "stlc simulate --backup --seeds 0 --live --robustness robustness.jsonl",
     "stlc simulate fall.stl --plant ball.yaml --seeds 0..19",
+    drives=True,
 )
 def simulate(
     run: RunArgument = "latest",
@@ -449,7 +450,7 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
 
     last = list(found.values())[-1]
     save_trace_of(run, last.recording, order.setting, order.record, rules=rules)
-    save_scene(run.dir.path / SCENE, last.recording.scene)
+    save_scene(run.dir.place(SCENE), last.recording.scene)
     beside = found["none"].recording if "none" in found and len(found) > 1 else None
     save_unguarded(run, beside, order.setting, rules)
     decl = run.task.system.decl

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     "stlc train --resume latest --budget 5min",
     "stlc train specs/traffic.stl --seeds 0..2 --jobs 2",
     "stlc train specs/traffic.stl specs/ship_safe.stl --seeds 0..2 --cluster auto",
+    drives=True,
 )
 def train(
     spec: Annotated[

@@ -16,6 +16,7 @@ from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
     MOST_SEED,
     FailUnderOption,
+    PythonOption,
     RunsOption,
     SystemOption,
     parse_clock,
@@ -25,6 +26,7 @@ from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics, tab
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, usage
 from stlc.escape import visible
+from stlc.foreign import driving
 
 if TYPE_CHECKING:
     from stlc.controller.verification.around import Around
@@ -75,6 +77,7 @@ def verify(
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that prove.")] = 1,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of the sampled states.")] = 0,
     fail_under: FailUnderOption = None,
+    python: PythonOption = False,
     runs: RunsOption = Path("runs"),
 ) -> Answer[Verified]:
     """Prove plans or closed loops on boxes of states.
@@ -109,7 +112,8 @@ def verify(
         name, source = folder.shown, PolicySource(folder.path)
     else:
         name, source = run, _LoopSource(run, system, controller, period, continuous)
-    subject = source.load()
+    with driving(python):
+        subject = source.load()
     with nullcontext() if jobs == 1 else SharedExaminer(source, LocalProcesses(jobs, fresh=True)) as shared:
         tick = clock_of(measured)
         if shared is not None and measured == "processor":

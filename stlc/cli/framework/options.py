@@ -91,6 +91,9 @@ DriveStepsOption = Annotated[
     int | None, typer.Option(min=1, help="Steps of each drive; by default the system's.")
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
+PythonOption = Annotated[
+    bool, typer.Option("--python", help="Run the Python that the run names: of a run that you trust.")
+]
 PicturesOption = Annotated[bool, typer.Option(help="Draw pictures and the report.")]
 SetOption = Annotated[
     list[str] | None,

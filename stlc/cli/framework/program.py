@@ -27,6 +27,7 @@ from stlc.cli.framework.errors import report as report_error
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, UsageError
+from stlc.foreign import driving
 from stlc.version import __version__
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -36,15 +37,17 @@ _MARKED: dict[str, tuple[str, ...]] = {}
 """`module:function` of a command -> its examples."""
 
 
-def command(*examples: str) -> Callable[[F], F]:
+def command(*examples: str, drives: bool = False) -> Callable[[F], F]:
     """Return a decorator that marks a function as the command of its module.
 
     `examples` are command lines for the help text. The first paragraph of the function's docstring is the
     summary of the help text; the other paragraphs follow the examples. Each field of a dataclass parameter
-    becomes an option; see `flat`.
+    becomes an option; see `flat`. If `drives`, the command runs the Python that the files of a run name.
     """
 
     def mark(function: F) -> F:
+        if drives:
+            function = driving(True)(function)
         _MARKED[f"{function.__module__}:{function.__name__}"] = examples
         return function
 
@@ -215,7 +218,7 @@ class Program:
         QUIET.set(bool({"-q", "--quiet"} & {*front}))
         stopped: list[int] = []
         try:
-            with _stoppable() as stopped, noticing():
+            with _stoppable() as stopped, noticing(), driving(False):
                 name = rest[0] if rest else ""
                 if name in self.moved:
                     finding = Diagnostic("U101", f"there is no command `{name}`", help=(self.moved[name],))

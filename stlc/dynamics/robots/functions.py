@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from types import ModuleType
 from typing import Any, final
 
 import numpy as np
@@ -19,6 +17,7 @@ from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.init import FileDecl
+from stlc.foreign import module_at, require_driving
 from stlc.registry import closest
 
 
@@ -27,6 +26,7 @@ def load_functions(decl: SystemDecl) -> Mapping[str, InterfaceFunction]:
 
     Raises:
         SystemFileError: S208, a module or a function cannot be loaded.
+        RunError: R111, a run names them, and the command does not drive.
     """
     return {
         function.name: function if function.body is not None else PythonFunction(function, _loaded(function))
@@ -53,8 +53,13 @@ def function_files(decl: SystemDecl) -> dict[str, Path]:
 
 
 def _loaded(decl: FunctionDecl) -> Callable[..., Array]:
+    require_driving(decl.span)
+    where = decl.module
     try:
-        module = _module(decl.module)
+        if isinstance(where, str):
+            module = importlib.import_module(where)
+        else:
+            module = module_at(where, f"stlc_functions_{where.stem}", decl.span)
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         raise _refused(decl, f"`{decl.module}` cannot be imported", reason) from error
@@ -64,19 +69,6 @@ def _loaded(decl: FunctionDecl) -> Callable[..., Array]:
         advice = (f"did you mean `{near}`?",) if near else ()
         raise _refused(decl, f"`{decl.module}` has no function `{decl.attribute}`", help_=advice)
     return found  # type: ignore[no-any-return]
-
-
-def _module(where: str | Path) -> ModuleType:
-    if isinstance(where, str):
-        return importlib.import_module(where)
-    if not where.is_file():
-        raise FileNotFoundError(f"there is no file `{where}`")
-    spec = importlib.util.spec_from_file_location(f"stlc_functions_{where.stem}", where)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def _refused(

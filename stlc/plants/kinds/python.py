@@ -27,6 +27,7 @@ from typing import Any, final
 import numpy as np
 
 from stlc.dynamics.schema.record import TEXT, integer, key, number, word
+from stlc.foreign import module_at
 from stlc.plants.kinds import AbsentError, FaultError, Floats, Layout, PlantKind, UnfitError, vector
 from stlc.registry import did_you_mean
 
@@ -85,17 +86,7 @@ def _target(text: str, layout: Layout) -> Callable[..., Any]:
 def _module(where: str, layout: Layout) -> ModuleType:
     if not where.endswith(".py"):
         return importlib.import_module(where)
-    path = layout.path(where)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file `{path}`")
-    name = f"stlc_plant_{Path(where).stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+    return module_at(layout.path(where), f"stlc_plant_{Path(where).stem}")
 
 
 def _form(target: Callable[..., Any]) -> str:
