@@ -23,6 +23,7 @@ sys.path.insert(0, str(TOOLS))
 import fuzz  # noqa: E402
 from fuzzing import bombs as fuzz_bombs  # noqa: E402
 from fuzzing import grammar as fuzz_grammar  # noqa: E402
+from fuzzing import hostile as fuzz_hostile  # noqa: E402
 from fuzzing import inputs as fuzz_inputs  # noqa: E402
 from fuzzing import valid as fuzz_valid  # noqa: E402
 from fuzzing.laws import HangError, laws, stage  # noqa: E402
@@ -81,12 +82,14 @@ def test_a_hang_is_noticed() -> None:
         endless()
 
 
-LIGHT = tuple(kind for kind in fuzz_inputs.KINDS if kind not in ("run", "bomb"))
+LIGHT = tuple(kind for kind in fuzz_inputs.KINDS if kind not in ("run", "hostile", "bomb"))
 """Kinds that need no training, and nothing that takes long to make."""
 
 
-def run(count: int, seed: int, kinds: tuple[str, ...] = LIGHT) -> list[fuzz.Outcome]:
-    outcomes, _ = fuzz.fuzz(count, seed, fuzz.Limits(SECONDS, 1024), kinds=kinds)
+def run(
+    count: int, seed: int, kinds: tuple[str, ...] = LIGHT, seconds: float = SECONDS
+) -> list[fuzz.Outcome]:
+    outcomes, _ = fuzz.fuzz(count, seed, fuzz.Limits(seconds, 1024), kinds=kinds)
     assert [(outcome.index, outcome.fault) for outcome in outcomes if outcome.fault] == []
     assert len(outcomes) == count
     return outcomes
@@ -95,6 +98,34 @@ def run(count: int, seed: int, kinds: tuple[str, ...] = LIGHT) -> list[fuzz.Outc
 def test_random_inputs_through_the_program() -> None:
     kinds = {outcome.kind for outcome in run(60, seed=3)}
     assert {"text", "spec", "system", "trace", "stream", "csv", "bag"} <= kinds
+
+
+def test_run_folders_of_strangers() -> None:
+    run(24, seed=5, kinds=("hostile",), seconds=10.0)
+
+
+@pytest.mark.slow
+def test_many_run_folders_of_strangers() -> None:
+    run(5000, seed=6, kinds=("hostile",), seconds=10.0)
+
+
+def test_what_happens_outside_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in (fuzz_hostile.OUTSIDE, "runs"):
+        (tmp_path / name).mkdir()
+    (tmp_path / fuzz_hostile.OUTSIDE / "secret").write_text(fuzz_hostile.SECRET)
+    (tmp_path / "runs" / "f.py").write_text("")
+    with fuzz_hostile.watched(drives=False) as wrong:
+        secret = (tmp_path / fuzz_hostile.OUTSIDE / "secret").read_text()
+        (tmp_path / fuzz_hostile.OUTSIDE / "new").write_text("")
+        (tmp_path / "runs" / "report.html").write_text(secret)
+        exec(compile("", str(tmp_path / "runs" / "f.py"), "exec"))
+    told = " ".join(wrong)
+    for words in ("open ", "exec ", "outside has changed", "a secret is in runs/report.html"):
+        assert words in told
+    with fuzz_hostile.watched(drives=True) as wrong:
+        exec(compile("", str(tmp_path / "runs" / "f.py"), "exec"))
+    assert wrong == ["a secret is in runs/report.html"]
 
 
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parents[1] / "tests")]
 
 from fuzzing import foreign as fuzz_foreign  # noqa: E402
+from fuzzing import hostile as fuzz_hostile  # noqa: E402
 from fuzzing import inputs as fuzz_inputs  # noqa: E402
 from fuzzing import runs as fuzz_runs  # noqa: E402
 from fuzzing import valid as fuzz_valid  # noqa: E402
@@ -45,6 +46,9 @@ EVERY = 5000
 """Number of inputs between intermediate tables."""
 PATIENCE = 180
 """Wall-clock seconds without an outcome after which a worker counts as hung in foreign code."""
+
+WAIT = 100
+"""Wall-clock seconds after which a command counts as waiting for ever."""
 
 ANSWERS = frozenset(range(6))
 SKIPPED = -2
@@ -96,6 +100,8 @@ def lay(folder, given):
         path = Path(folder) / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
+    with contextlib.chdir(folder):
+        fuzz_hostile.lay_odd(given.odd)
 
 
 def run_one(plan, index, limits):
@@ -105,9 +111,13 @@ def run_one(plan, index, limits):
         return Outcome(index, given.kind, SKIPPED, 0.0, missing=given.missing)
     lay(".", given)
     started = time.process_time()
-    code, text, noise = _call(given.arguments, limits, given.typed) if given.arguments else _read(limits)
+    watch = contextlib.nullcontext([]) if given.drives is None else fuzz_hostile.watched(given.drives)
+    with watch as wrong, stage("the command waits and", WAIT, real=True):
+        code, text, noise = _call(given.arguments, limits, given.typed) if given.arguments else _read(limits)
     seconds = time.process_time() - started
-    fault = _fault(code, text, noise)
+    fault = "; ".join(dict.fromkeys(wrong)) or _fault(code, text, noise)
+    if given.drives is not None and fuzz_hostile.SECRET in text:
+        fault = "a secret is printed"
     if not fault and given.arguments and seconds > limits.seconds:
         fault = f"took {seconds:.1f} s"
     return Outcome(index, given.kind, code, seconds, fault)
@@ -183,7 +193,7 @@ def worker(plan, indices, limits, results):
                 outcome.fault = outcome.fault or f"took {(peak() - base) >> 10} MB"
             results.send(outcome)
             for path in folder.iterdir():
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
     finally:
         results.send(peak())
         os.chdir("/")
@@ -208,7 +218,7 @@ def import_everything(kinds=()):
     """
     limits = Limits(60.0, 0)
     missing = [*fuzz_foreign.prepare(), *fuzz_valid.prepare(tuple(set(FORMATS) & set(kinds or FORMATS)))]
-    if not kinds or "run" in kinds:
+    if not kinds or {"run", "hostile"} & {*kinds}:
         missing += fuzz_runs.prepare()
     Path("a.stl").write_text(SMALL)
     Path("t.npz").write_bytes(small_trace())

@@ -13,6 +13,7 @@ from fuzzing.bombs import specifications, systems
 from fuzzing.files import extended, imports
 from fuzzing.foreign import foreign
 from fuzzing.grammar import specification
+from fuzzing.hostile import hostile
 from fuzzing.mutation import WORDS, corpus, mutated, soup
 from fuzzing.runs import a_run
 from fuzzing.specs import SMALL, SYSTEM, TRAINED, monster
@@ -33,6 +34,10 @@ class Input:
     files: dict[str, bytes] = field(default_factory=dict)
     typed: bytes = b""
     """The standard input."""
+    odd: dict[str, str] = field(default_factory=dict)
+    """Links, pipes and sparse files in the folder; see `fuzzing.hostile`."""
+    drives: bool | None = None
+    """Whether the command may run Python of a run, if what it reads, writes and runs is watched."""
     missing: str = ""
     """Name of a missing package that the input needs, or ""."""
 
@@ -247,6 +252,12 @@ def _run(rng: random.Random) -> Input:
     return Input("run", arguments, files)
 
 
+def _hostile(rng: random.Random) -> Input:
+    """The folder of a run of a stranger."""
+    found = hostile(rng)
+    return Input("hostile", found.arguments, found.files, odd=found.odd, drives=found.drives)
+
+
 # -------------------------------------------------------------------------- command lines
 
 
@@ -283,6 +294,7 @@ def _line(rng: random.Random) -> Input:
 KINDS: dict[str, tuple[Callable[[random.Random], Input], int]] = {
     **{"text": (_text, 20), "spec": (_spec, 15), "system": (_system, 18), "trace": (_trace, 12)},
     **{"files": (_files, 3), "line": (_line, 3), "stream": (_stream, 8), "run": (_run, 5)},
+    "hostile": (_hostile, 3),
     **{form: (_of(form), 1 if form == "bomb" else 2) for form in FORMATS},
 }
 """Maker and weight of each kind of input."""

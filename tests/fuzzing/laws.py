@@ -79,19 +79,20 @@ class HangError(BaseException):
 
 
 @contextmanager
-def stage(name: str, limit: float):
-    """Raise HangError within the block after `limit` seconds of processor time."""
+def stage(name: str, limit: float, *, real: bool = False):
+    """Raise HangError within the block after `limit` seconds of processor time, or of real time."""
+    number, timer = (signal.SIGALRM, signal.ITIMER_REAL) if real else (signal.SIGPROF, signal.ITIMER_PROF)
 
     def alarm(_number, _frame):
         raise HangError(f"{name} takes more than {limit:g} s")
 
-    before = signal.signal(signal.SIGPROF, alarm)
-    signal.setitimer(signal.ITIMER_PROF, limit)
+    before = signal.signal(number, alarm)
+    signal.setitimer(timer, limit)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, before)
+        signal.setitimer(timer, 0)
+        signal.signal(number, before)
 
 
 @cache

@@ -16,6 +16,7 @@ from fuzzing.valid import battered
 RUN = "runs/small/0001-seed"
 _TRAIN = "train a.stl --system b.yaml --steps 6 --batch 8 --held-out 10 --no-pictures --name seed"
 _DRIVE = "simulate --backup --seeds 0 --steps 4 --agents 2 --no-pictures"
+_CERTIFY = "certify latest --max-drives 4 --steps 2 --agents 2"
 
 COMMANDS = (
     *("runs show latest", "runs show latest --json", "runs list", "runs list --json", "runs diff latest 1"),
@@ -42,11 +43,12 @@ def run_files() -> dict[str, bytes]:
         folder = Path(name)
         (folder / "a.stl").write_text(TRAINED)
         (folder / "b.yaml").write_text(SYSTEM)
-        for line in (_TRAIN, _DRIVE):
-            command = [sys.executable, "-m", "stlc", *line.split()]
-            done = subprocess.run(command, cwd=folder, env=_surroundings(), check=False, capture_output=True)
-            if done.returncode:
-                raise RuntimeError(done.stderr.decode("utf-8", "replace"))
+        lines = [line.split() for line in (_TRAIN, _DRIVE, _CERTIFY)]
+        code = f"from stlc.cli.framework.app import main\nprint([main(line) for line in {lines}])"
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, cwd=folder, env=_surroundings(), check=False, capture_output=True)
+        if not (folder / RUN / "eval/certificate.json").is_file():
+            raise RuntimeError(done.stderr.decode("utf-8", "replace"))
         paths = [path for path in sorted((folder / RUN).rglob("*")) if path.is_file()]
         return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
@@ -66,7 +68,7 @@ def a_run(rng: random.Random) -> tuple[list[str], dict[str, bytes]]:
         if name.endswith(".safetensors"):
             files |= _with_weights(files, name, rng)
         elif name.endswith((".json", ".yaml", ".jsonl")) and rng.random() < 0.5:
-            files[name] = _said(files[name], rng)
+            files[name] = said(files[name], rng)
         elif rng.random() < 0.08:
             del files[name]
         else:
@@ -118,7 +120,7 @@ _ODD = (
 )
 
 
-def _said(data: bytes, rng: random.Random) -> bytes:
+def said(data: bytes, rng: random.Random) -> bytes:
     """JSON with one value replaced; other texts with words replaced."""
     try:
         value = json.loads(data)
