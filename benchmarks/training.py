@@ -427,7 +427,7 @@ def collect(run: RunDir, *, cores: int | None = None) -> Result:
     `cores` is the number of cores that the run used, if known.
     """
     record = run.record()
-    held = load_held_out(run.path / "eval" / "held_out.npz")
+    held = load_held_out(run)
     solved = [] if held is None else [rho >= -TOLERANCE for rho in held.rho.tolist()]
     made = {key: record[key] for key in ("versions", "git", "hardware", "threads")}
     return {

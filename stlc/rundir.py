@@ -3,33 +3,49 @@
 A run is never overwritten; a new run takes the next number. `runs/latest` and `runs/<spec>/latest` are links
 to the newest run. Files are written atomically. Files of rows are an exception: rows are appended, so that at
 most the last row is lost if the process is killed.
+
+A run may come from anybody. All its files are read and written through `RunDir`: no link in its folder is
+followed, no pipe or device is opened, every size has a limit, stored JSON has the expected types, and the
+Python that a run names is run only by commands that drive (`stlc.foreign`).
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, usage
+from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, os_reason, usage
 from stlc.escape import file_part, shell
-from stlc.files import alone_in, find_trace, reported, write_atomic
-from stlc.jsontext import dumps
+from stlc.files import (
+    MAX_BYTES,
+    RECORD,
+    alone_in,
+    decoded,
+    find_trace,
+    place,
+    read_regular,
+    refused,
+    reported,
+    run_folder,
+    within,
+    write_atomic,
+)
+from stlc.jsontext import Shape, conforming, dumps
 from stlc.registry import did_you_mean
+from stlc.source import Source
 
 Status = Literal["running", "finished", "interrupted", "failed"]
 
 RUNS = Path("runs")
 LATEST = "latest"
-RECORD = "run.json"
 ROWS = "train.jsonl"
 SPEC = "spec.stl"
 SYSTEM = "system.yaml"
@@ -38,13 +54,38 @@ SCENE = "scene.npz"
 UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
 """Trace and scene of the first seed without guard, stored beside the guarded ones."""
 SIMULATION = "eval/simulate.json"
+HELD_OUT = "eval/held_out.npz"
 
-_KINDS: Mapping[str, type] = {
-    **dict.fromkeys(("status", "spec", "spec_path", "system", "system_path", "device", "started"), str),
-    **dict.fromkeys(("seed", "threads"), int),
-    "overrides": dict,
+MOST_JSON, MOST_ARRAYS = 50_000_000, 2_000_000_000
+"""Largest sizes in bytes of a file of JSON, and of a file of arrays or tensors."""
+
+_RECORD: Shape = {
+    **dict.fromkeys(("status?", "spec?", "spec_path?", "system?", "system_path?", "device?"), str),
+    **dict.fromkeys(("started?", "schedule?", "spec_hash?", "system_hash?"), str),
+    **dict.fromkeys(("seed?", "threads?", "steps?"), int),
+    **dict.fromkeys(("margin?", "seconds_allowed?"), float),
+    "budget?": float | str,
+    "overrides?": {"*": str},
+    "options?": {},
+    "engine?": {},
+    "versions?": {},
+    "git?": {},
+    "hardware?": {"cores?": int, "memory_gib?": float},
+    "result?": {
+        **dict.fromkeys(("accuracy?", "feasible?", "seconds?", "judged_seconds?"), float),
+        **dict.fromkeys(("held_out?", "searched?"), int),
+        "interval?": (float, float),
+        "requirements?": {"*": float},
+        "closed_loop?": {"share?": float, "recommended?": str},
+        "falsification?": {"last_share?": float},
+    },
 }
-"""Expected type of each entry of a run's record, if the entry is present."""
+"""Shape of a run's record; see `stlc.jsontext.conforming`."""
+_ROW: Shape = {
+    **dict.fromkeys(("step?", "steps?", "repaired?", "failing?"), int),
+    **dict.fromkeys(("seconds?", "loss?", "accuracy?", "feasible?", "lr?"), float),
+    "requirements?": {"*?": float},
+}
 
 _NUMBERED = re.compile(r"(\d{4,})-(.+)")
 
@@ -92,7 +133,7 @@ class RunDir:
         """
         linked = root / LATEST
         if (linked / RECORD).is_file():
-            return cls(linked.resolve())
+            return _resolved(linked)
         runs = sorted(every_run(root), key=lambda run: run.path.stat().st_mtime)
         if not runs:
             help_ = ("train one: stlc train specs/traffic.stl --system car.yaml",)
@@ -122,10 +163,10 @@ class RunDir:
         """
         given = Path(where)
         if given.exists() and given.resolve() != Path.cwd() / root:
-            folder = _folder_of(given)
+            folder = run_folder(given) or given
             if given.suffix == ".stl" and folder == given:
                 return _of_spec(given, root)
-            run = cls(folder.resolve())
+            run = _resolved(folder)
             return run if (run.path / RECORD).is_file() else run.checked()
         return cls.newest(root) if str(where) == LATEST else _by_name(str(where), root)
 
@@ -150,33 +191,72 @@ class RunDir:
 
     # ------------------------------------------------------------------ whole files
 
-    def write_json(self, name: str, value: object) -> None:
-        """Write `value` as the JSON file `name`. Raises MissingError (R201) if that fails."""
-        write_atomic(self.path / name, dumps(value, indent=2) + "\n")
+    def has(self, name: str) -> bool:
+        """True if something in the folder has this name; reading it can still fail."""
+        return os.path.lexists(self.path / name)
 
-    def read_json(self, name: str) -> Any:
-        """Read the JSON file `name` of the run. Raises RunError (R101) if it is missing or damaged."""
+    def file(self, name: str, most: int = MAX_BYTES) -> Path:
+        """Return the path of a file of the run, for a reader that opens it by its path.
+
+        Args:
+            name: path of the file, relative to the folder of the run.
+            most: largest size in bytes.
+
+        Raises:
+            RunError: R110, a link leads there, it is no regular file, it is too large, or the name leads out
+                of the folder.
+        """
+        return within(self.path, name, most)
+
+    def place(self, name: str) -> Path:
+        """Return the path at which a file of the run is to be written; see `stlc.files.place`."""
+        return place(self.path, name)
+
+    def write(self, name: str, data: bytes | str) -> None:
+        """Write a file atomically. Raises the errors of `place`, and MissingError (R201) if that fails."""
+        write_atomic(self.place(name), data)
+
+    def read(self, name: str, most: int = MAX_BYTES) -> bytes:
+        """Read a file of the run. Raises the errors of `file`, and RunError (R101) if it cannot be read."""
         try:
-            return json.loads((self.path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise RunError(self._damaged(name, error)) from error
+            return read_regular(self.file(name, most), most)
+        except OSError as error:
+            raise RunError(self.damaged(name, error)) from error
+
+    def source(self, name: str) -> Source:
+        """Read a text of the run, in which names of files do not leave the folder of the run.
+
+        Raises:
+            RunError: the errors of `read`.
+            SpecError: E003, it is not UTF-8.
+        """
+        return decoded(str(self.path / name), self.read(name), str(self.path))
+
+    def write_json(self, name: str, value: object) -> None:
+        """Write `value` as the JSON file `name`. Raises the errors of `write`."""
+        self.write(name, dumps(value, indent=2) + "\n")
+
+    def read_json(self, name: str, shape: Shape = Any) -> Any:
+        """Read the JSON file `name` of the run.
+
+        Raises:
+            RunError: R101, it is missing, damaged, or not of the given shape (see `jsontext.fault`); R110, it
+                is no file of the run.
+        """
+        data = self.read(name, MOST_JSON)
+        try:
+            return conforming(data, shape)
+        except (ValueError, RecursionError) as error:
+            raise RunError(self.damaged(name, error)) from error
 
     def record(self) -> dict[str, Any]:
         """Content of `run.json`. Raises RunError (R101) if it is missing or damaged."""
-        record = self.read_json(RECORD)
-        if not isinstance(record, dict):
-            raise RunError(self._damaged(RECORD, ValueError("it is no JSON object")))
-        for key, kind in _KINDS.items():
-            value = record.get(key)
-            if key in record and (not isinstance(value, kind) or isinstance(value, bool)):
-                raise RunError(self._damaged(RECORD, ValueError(f"its `{key}` is {value!r:.40}")))
-        if not all(isinstance(text, str) for text in record.get("overrides", {}).values()):
-            raise RunError(self._damaged(RECORD, ValueError("its `overrides` are no texts")))
+        record: dict[str, Any] = self.read_json(RECORD, _RECORD)
         return record
 
     def update(self, facts: Mapping[str, object]) -> dict[str, Any]:
         """Set the entries `facts` in `run.json` (created if missing), and return the file's whole content."""
-        before = self.record() if (self.path / RECORD).exists() else {}
+        before = self.record() if self.has(RECORD) else {}
         after = {**before, **facts}
         self.write_json(RECORD, after)
         return after
@@ -184,7 +264,7 @@ class RunDir:
     @property
     def status(self) -> Status:
         """Status of the run. Raises RunError (R101) if `run.json` is damaged."""
-        status: Status = self.record().get("status", "running")
+        status: Status = self.record().get("status") or "running"
         return status
 
     def finish(self, status: Status, result: object = None) -> None:
@@ -196,11 +276,14 @@ class RunDir:
         """Context in which this process alone trains the run; its value is False if another process does."""
         return alone_in(self.path)
 
-    def _damaged(self, name: str, error: Exception) -> Diagnostic:
+    def damaged(self, name: str, error: Exception) -> Diagnostic:
+        """Return the diagnostic R101 for a file of the run that cannot be read, or has wrong content."""
         if isinstance(error, FileNotFoundError):
             return Diagnostic("R101", f"`{self.shown}` is not a run: it has no {name}")
-        reason = str(error) or type(error).__name__
-        return Diagnostic("R101", f"`{self.shown}/{name}` is damaged", note=(reason,))
+        if isinstance(error, RecursionError):
+            return Diagnostic("R101", f"`{self.shown}/{name}` is damaged", note=("it is nested too deeply",))
+        reason = os_reason(error) if isinstance(error, OSError) else str(error) or type(error).__name__
+        return Diagnostic("R101", f"`{self.shown}/{name}` is damaged", note=(reason[:200],))
 
     # ------------------------------------------------------------------ rows
 
@@ -210,7 +293,8 @@ class RunDir:
         First, an incomplete last line is removed; it is left if a process was killed.
         """
         data = (dumps(row) + "\n").encode()
-        with reported(f"write `{self.shown}/{name}`"), (self.path / name).open("ab+") as file:
+        path = self.place(name)
+        with reported(f"write `{self.shown}/{name}`"), path.open("ab+") as file:
             _drop_torn_line(file.fileno())
             os.write(file.fileno(), data)
 
@@ -218,19 +302,18 @@ class RunDir:
         """Read the rows of a file of JSON lines, without an incomplete last one; [] if there is no file.
 
         Raises:
-            RunError: R101, a complete line is not a JSON object.
+            RunError: R101, a complete line is not a JSON object, or has a value of a wrong type; R110, the
+                file is no file of the run.
         """
-        try:
-            data = (self.path / name).read_bytes()
-        except FileNotFoundError:
+        if not self.has(name):
             return []
-        lines = data[: data.rfind(b"\n") + 1].splitlines()
-        try:
-            rows = [json.loads(line) for line in lines if line]
-        except (ValueError, RecursionError) as error:
-            raise RunError(self._damaged(name, error)) from error
-        if not all(isinstance(row, dict) for row in rows):
-            raise RunError(self._damaged(name, ValueError("a line is no JSON object")))
+        data, rows = self.read(name, MOST_JSON), []
+        for number, line in enumerate(data[: data.rfind(b"\n") + 1].split(b"\n"), 1):
+            try:
+                rows += [conforming(line, _ROW)] if line else []
+            except (ValueError, RecursionError) as error:
+                message = f"`{self.shown}/{name}`, line {number}, is damaged"
+                raise RunError(replace(self.damaged(name, error), message=message)) from error
         return rows
 
     def keep_rows(self, wanted: Callable[[dict[str, Any]], bool], name: str = ROWS) -> None:
@@ -239,7 +322,7 @@ class RunDir:
         A resumed run removes the rows after its checkpoint.
         """
         kept = [row for row in self.rows(name) if wanted(row)]
-        write_atomic(self.path / name, "".join(dumps(row) + "\n" for row in kept))
+        self.write(name, "".join(dumps(row) + "\n" for row in kept))
 
 
 def every_run(root: Path = RUNS) -> list[RunDir]:
@@ -247,9 +330,21 @@ def every_run(root: Path = RUNS) -> list[RunDir]:
     numbered = [
         (path.parent.name, int(match[1]), path)
         for path in root.glob("*/*")
-        if (match := _NUMBERED.fullmatch(path.name)) and not path.is_symlink()
+        if (match := _NUMBERED.fullmatch(path.name)) and not (path.is_symlink() or path.parent.is_symlink())
     ]
     return [RunDir(path) for _, _, path in sorted(numbered) if (path / RECORD).is_file()]
+
+
+def _resolved(folder: Path) -> RunDir:
+    """Return the run in a folder; a link `latest` is followed only to a run below its own folder.
+
+    Raises:
+        RunError: R110, `latest` leads elsewhere.
+    """
+    path = folder.resolve()
+    if folder.name == LATEST and not path.is_relative_to(folder.parent.resolve()):
+        raise refused(folder, "it leads out of its folder")
+    return RunDir(path)
 
 
 def remove_run(run: RunDir) -> None:
@@ -329,12 +424,6 @@ def _names(run: RunDir) -> tuple[str, str, str, str]:
     """
     number, _, words = run.name.partition("-")
     return run.name, number, str(int(number)), words
-
-
-def _folder_of(path: Path) -> Path:
-    """Return the nearest folder with a `run.json` at or above `path`; `path` itself if there is none."""
-    candidates = (path, *path.parents)
-    return next((folder for folder in candidates if (folder / RECORD).is_file()), path)
 
 
 def _slug(name: str) -> str:
@@ -450,7 +539,8 @@ def recorded_trace(what: str, runs: Path) -> Path:
             raise missing from None
     else:
         folder = RunDir.open(what, runs)
-    if not (folder.path / TRACE).is_file():
+    if not folder.has(TRACE):
         advice = (f"record one: {shell(('stlc', 'simulate', folder.name))}",)
         raise UsageError(Diagnostic("U102", f"`{folder.shown}` has no trace", help=advice))
+    folder.file(TRACE, MOST_ARRAYS)
     return Path(folder.shown) / TRACE

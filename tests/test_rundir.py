@@ -241,11 +241,11 @@ def test_the_record_grows(root):
     run = RunDir.create(root, "traffic")
     run.update({"seed": 3, "status": "running"})
     assert run.status == "running"
-    run.finish("finished", {"accuracy": float("nan")})
+    run.finish("finished", {"spread": float("nan")})
     record = run.record()
     assert record["seed"] == 3
     assert record["status"] == run.status == "finished"
-    assert record["result"] == {"accuracy": "nan"}
+    assert record["result"] == {"spread": "nan"}
     assert record["finished"].endswith("+00:00")
 
 
@@ -289,7 +289,7 @@ def test_a_kill_in_the_middle_of_a_row_costs_that_row(root, cut):
 def test_a_row_that_is_not_json_is_a_diagnostic(root):
     run = RunDir.create(root, "traffic")
     (run.path / "train.jsonl").write_text('{"step": 1}\nnonsense\n')
-    with pytest.raises(RunError, match=r"train\.jsonl` is damaged"):
+    with pytest.raises(RunError, match=r"train\.jsonl`, line 2, is damaged"):
         run.rows()
 
 
@@ -312,3 +312,64 @@ def test_every_error_carries_a_known_code(root):
         with pytest.raises(StlcError) as caught:
             action()
         assert [finding.code for finding in caught.value.diagnostics] == ["R101"]
+
+
+# ---------------------------------------------------------------------- runs of strangers
+
+
+def test_links_in_a_run_are_not_read(root, tmp_path):
+    run = made(root, "traffic", "quiet-heron")
+    (tmp_path / "far.json").write_text('{"secret": 1}')
+    (run.path / "train.jsonl").symlink_to(tmp_path / "far.json")
+    (run.path / "eval").symlink_to(tmp_path)
+    for read in (run.rows, lambda: run.read_json("eval/far.json"), lambda: run.source("eval/far.json")):
+        with pytest.raises(RunError, match=r"R110.*it is a link"):
+            read()
+    (run.path / "run.json").unlink()
+    (run.path / "run.json").symlink_to("/dev/zero")
+    with pytest.raises(RunError, match="R110"):
+        run.record()
+
+
+def test_a_row_is_appended_beside_what_a_link_leads_to(root, tmp_path):
+    run = made(root, "traffic", "quiet-heron")
+    (tmp_path / "keys").write_text("mine\n")
+    (run.path / "train.jsonl").symlink_to(tmp_path / "keys")
+    run.append_row({"step": 1})
+    assert run.rows() == [{"step": 1}]
+    assert (tmp_path / "keys").read_text() == "mine\n"
+
+
+def test_latest_leads_to_a_run_below_its_folder_alone(root, tmp_path):
+    run = made(root, "traffic", "quiet-heron")
+    assert RunDir.open("latest", root).path == RunDir.open(root / "latest").path == run.path
+    far = made(tmp_path / "elsewhere", "traffic", "far-fox")
+    (root / "latest").unlink()
+    (root / "latest").symlink_to(far.path)
+    (root / "linked").symlink_to(far.path.parent)
+    for where in ("latest", root / "latest"):
+        with pytest.raises(RunError, match=r"R110.*leads out of its folder"):
+            RunDir.found(where, root)
+    assert [each.path for each in every_run(root)] == [run.path]
+    with pytest.raises(UsageError):
+        RunDir.found("far-fox", root)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"result": {"accuracy": "high"}}', "`result.accuracy` is 'high', not a number"),
+        ('{"result": {"interval": [0.1]}}', "`result.interval` is no list of 2"),
+        ('{"hardware": {"cores": []}}', "`hardware.cores` is [], not a whole number"),
+        ('{"seed": 1e999}', "`seed` is not finite"),
+        ("[" * 9000, "nested too deeply"),
+    ],
+)
+def test_a_damaged_record_is_said_with_file_and_key(root, text, said):
+    run = made(root, "traffic", "quiet-heron")
+    (run.path / "run.json").write_text(text)
+    with pytest.raises(RunError) as caught:
+        run.record()
+    (finding,) = caught.value.diagnostics
+    assert "run.json` is damaged" in finding.message
+    assert said in finding.note[0]

@@ -19,12 +19,12 @@ from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.guard import GUARD_VERSION, Guard
 from stlc.controller.training.checkpoint import FOLDER, POINTER
-from stlc.controller.training.run import CONFIG, spec_hash, system_hash, task_of_run
+from stlc.controller.training.run import CONFIG, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.robots.functions import function_files
 from stlc.monitor.judgement import unknown_requirement
 from stlc.provenance import sha256
-from stlc.rundir import RunDir
+from stlc.rundir import MOST_ARRAYS, RunDir
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording, Watch
     from stlc.controller.problem.task import Task
     from stlc.controller.training.run import Run
+    from stlc.dynamics.declaration.decl import SystemDecl
 
 ROWS = 1000
 """Largest number of agents that are simulated at once."""
@@ -183,7 +184,7 @@ class PolicyDrives:
             "run": run.dir.shown,
             "spec": run.task.compiled.name,
             "system": run.task.system.decl.name,
-            "inputs": inputs_of(run.dir, run.task, self.rules),
+            "inputs": inputs_of(run.dir, run.task.system.decl, self.rules),
             "conditions": {
                 "guard": self.guard,
                 "scenario": None if scenario is None else scenario.name,
@@ -205,7 +206,7 @@ class PolicyDrives:
 # ---------------------------------------------------------------------- verification
 
 
-def inputs_of(folder: RunDir, task: Task, rules: Rules | None) -> dict[str, str | int | None]:
+def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None) -> dict[str, str | int | None]:
     """Hashes and versions of everything that the drives of a run depend on, beside their conditions.
 
     `spec`, `system`: files in the folder of the run, with imports and the changes of the training.
@@ -214,7 +215,6 @@ def inputs_of(folder: RunDir, task: Task, rules: Rules | None) -> dict[str, str 
     checkpoint and the options of the method. `guard_version`: raised with every change of a guard's
     decisions.
     """
-    decl = task.system.decl
     files = sorted(function_files(decl).items())
     judge = "" if rules is None else spec_sha256(rules.spec.source.text, rules.spec.library or {})
     changes = [] if rules is None else sorted(rules.overrides.items())
@@ -241,16 +241,15 @@ def verify(document: Mapping[str, Any], folder: RunDir) -> CertificateVerificati
     conditions = document["conditions"]
     changed = {str(name): str(text) for name, text in conditions["overrides"].items()}
     scenario = conditions["scenario"]
-    task = task_of_run(folder, changed, None if scenario is None else str(scenario))
-    present = inputs_of(folder, task, rules_for(folder, task.system.decl))
+    decl = declaration_of_run(folder, changed, None if scenario is None else str(scenario))
+    present = inputs_of(folder, decl, rules_for(folder, decl))
     return compared(document, present)
 
 
 def _policy(folder: RunDir) -> str:
     """Hash of the tensors of the newest checkpoint, if there is one, and of the resolved options."""
-    pointer = folder.path / FOLDER / POINTER
-    parts = [(folder.path / CONFIG).read_bytes()]
-    if pointer.is_file():
-        name = folder.read_json(f"{FOLDER}/{POINTER}")["file"]
-        parts.append((folder.path / FOLDER / str(name)).read_bytes())
+    parts = [folder.read(CONFIG)]
+    if folder.has(f"{FOLDER}/{POINTER}"):
+        name = folder.read_json(f"{FOLDER}/{POINTER}", {"file": str})["file"]
+        parts.append(folder.read(f"{FOLDER}/{name}", MOST_ARRAYS))
     return sha256(b"\0".join(sha256(part).encode() for part in parts))

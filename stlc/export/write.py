@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -31,7 +32,7 @@ from stlc.export.verify import (
     previous_plan_agreement,
     same_verdicts,
 )
-from stlc.files import write_atomic
+from stlc.files import place, write_atomic
 from stlc.jsontext import dumps
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
@@ -119,13 +120,15 @@ def export(run: Run, target: Target, folder: Path, precision: Precision = "float
         kept = tuple(name for name in EXAMPLES if name in texts and _differs(folder / name, texts[name]))
         files = tuple(name for name in texts if name not in kept)
         for name in files:
-            write_atomic(folder / name, texts[name])
+            write_atomic(place(folder, name), texts[name])
     return Exported(folder, files, found, latency, unchecked, kept)
 
 
 def _differs(path: Path, content: bytes) -> bool:
     """True if there is something else than `content` at `path`."""
-    return path.exists() and not (path.is_file() and path.read_bytes() == content)
+    if path.is_symlink() or not path.is_file():
+        return os.path.lexists(path)
+    return path.read_bytes() != content
 
 
 BUILT = "checked"

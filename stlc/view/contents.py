@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 from stlc.compile.ir.traverse import margin_unit
+from stlc.controller.training.run import read_library
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.scenarios.scenario import under
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
+from stlc.jsontext import Shape
 from stlc.monitor.verdict import Monitor
-from stlc.rundir import SIMULATION, TRACE, RunDir
+from stlc.rundir import MOST_ARRAYS, SIMULATION, SPEC, SYSTEM, TRACE, RunDir
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.trace import Trace, load_trace
@@ -24,7 +26,37 @@ from stlc.view.held_out import HeldOut, load_held_out
 T = TypeVar("T")
 Record = Mapping[str, Any]
 
-TEXTS = ("spec.stl", "system.yaml", "compiled.txt", "config.resolved.yaml")
+TEXTS = (SPEC, SYSTEM, "compiled.txt", "config.resolved.yaml")
+_DRIVES = {
+    **dict.fromkeys(("count", "obeyed", "undecided", "lost"), int),
+    "told?": int,
+    "rules": {"*": {"obeyed": int, "*": int}},
+    "broken": [
+        {
+            **{"seed": int, "agent": int, "lost": bool, "rules": {"*?": float}},
+            "cause?": {"why": str, "time": float},
+        }
+    ],
+}
+_SIMULATION: Shape = {
+    "spec": str,
+    **dict.fromkeys(("scenario?", "interval?", "world?"), str),
+    **dict.fromkeys(("agents?", "steps?", "ceiling?"), int),
+    **dict.fromkeys(("time_limit?", "paper_time_limit?"), float),
+    "seeds?": [int],
+    "margin?": {"*": float},
+    "overrides?": {"*": str},
+    "guards?": {
+        "*": {
+            "metrics?": {"*?": {"mean": float, "high?": float}},
+            "drives?": _DRIVES,
+            "units?": {"*": str},
+            "decisions?": {"*?": float},
+            "latency?": {"*?": float},
+        }
+    },
+}
+"""Shape of `eval/simulate.json`; see `stlc.jsontext.conforming`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +78,7 @@ class RunContents:
         usual: default numbers of agents and steps that the system has in the scenario of the closed-loop
             runs.
         trace: trace recorded in the closed-loop runs.
+        system: text of the system file.
     """
 
     run: RunDir
@@ -60,6 +93,7 @@ class RunContents:
     units: Mapping[str, str]
     usual: Record
     trace: Trace | None
+    system: Source | None
 
     @property
     def result(self) -> Record:
@@ -79,15 +113,11 @@ def read_contents(run: RunDir) -> RunContents:
     Raises:
         RunError: R101, the folder is not a run.
     """
-    decl = readable(lambda: load_system_decl(run.path / "system.yaml"))
-    simulation = readable(lambda: run.read_json(SIMULATION))
-    simulation = simulation if isinstance(simulation, Mapping) else None
-    paths = {name: run.path / name for name in TEXTS}
-    read = {
-        name: readable(partial(path.read_text, encoding="utf-8", errors="replace"))
-        for name, path in paths.items()
-    }
-    spec = readable(lambda: parse(Source("spec.stl", read["spec.stl"] or "")))
+    system = run.source(SYSTEM) if run.has(SYSTEM) else None
+    decl = None if system is None else readable(lambda: load_system_decl(system))
+    simulation = simulation_of(run)
+    read = {name: run.read(name).decode("utf-8", "replace") for name in TEXTS if run.has(name)}
+    spec = readable(lambda: replace(parse(Source(SPEC, read.get(SPEC, ""))), library=read_library(run)))
     scenario = (simulation or {}).get("scenario")
     deployed = decl if decl is None or scenario is None else readable(lambda: under(decl, str(scenario)))
     return RunContents(
@@ -98,12 +128,19 @@ def read_contents(run: RunDir) -> RunContents:
         outside=spec is not None and any(isinstance(item, ast.Extern) for item in spec.items),
         texts={name: text for name, text in read.items() if text},
         signature=None if decl is None else decl.signature,
-        held_out=load_held_out(run.path / "eval/held_out.npz"),
+        held_out=load_held_out(run),
         simulation=simulation,
         units={} if decl is None or spec is None else readable(lambda: _units(spec, decl)) or {},
         usual={} if deployed is None else {"agents": deployed.test.agents, "steps": deployed.test.steps},
-        trace=readable(lambda: load_trace(run.path / TRACE)),
+        trace=archived(run, TRACE, load_trace),
+        system=system,
     )
+
+
+def simulation_of(run: RunDir) -> Record | None:
+    """Content of `eval/simulate.json`; None without one. Raises RunError (R101, R110) if it is damaged."""
+    found: Record | None = run.read_json(SIMULATION, _SIMULATION) if run.has(SIMULATION) else None
+    return found
 
 
 def readable(read: Callable[[], T]) -> T | None:
@@ -112,6 +149,15 @@ def readable(read: Callable[[], T]) -> T | None:
         return read()
     except (OSError, StlcError):
         return None
+
+
+def archived(run: RunDir, name: str, read: Callable[[Path], T]) -> T | None:
+    """Call `read` on an archive of the run; None if the file is missing or damaged.
+
+    Raises RunError (R110) if it is no file of the run.
+    """
+    path = run.file(name, MOST_ARRAYS)
+    return readable(lambda: read(path))
 
 
 def untagged(declared: ast.Require) -> Span:

@@ -22,6 +22,7 @@ def draw_curves(rows: Rows) -> Picture | None:
 
     Returns None if the accuracy was measured less than twice.
     """
+    rows = [row for row in rows if row.get("seconds") is not None]
     measured = [row for row in rows if row.get("accuracy") is not None]
     if len(measured) < 2:
         return None

@@ -7,19 +7,20 @@ F-score (subgroup discovery).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.diagnostics import StlcError
 from stlc.escape import picture
+from stlc.jsontext import conforming
+from stlc.rundir import HELD_OUT, MOST_ARRAYS, RunDir
 from stlc.signature import Signature
+from stlc.trace.formats.npz import read_arrays
 from stlc.view.style import BLUE, INK, MUTED, RED, Picture, new_figure, picture_style
 from stlc.view.words import labelled
 
@@ -118,18 +119,22 @@ class Weakness:
     axes: tuple[int, int]
 
 
-def load_held_out(path: Path) -> HeldOut | None:
-    """Load the held-out set that training wrote to `path`; None if the file is missing or damaged."""
+def load_held_out(run: RunDir) -> HeldOut | None:
+    """Load the held-out set that training wrote; None if the file is missing or damaged.
+
+    Raises RunError (R110) if it is no file of the run.
+    """
+    path = run.file(HELD_OUT, MOST_ARRAYS)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            meta = json.loads(str(file["meta"]))
-            x0, rho, each = (np.asarray(file[key], dtype=float) for key in ("x0", "rho", "requirements"))
-            known, searched = (
-                np.asarray(file[key], dtype=bool) if key in file else None for key in ("known", "searched")
-            )
-    except (OSError, KeyError, ValueError, BadZipFile):
+        file = read_arrays(path)
+        meta = conforming(str(file["meta"]), {"names": [str], "requirements": [str]})
+        x0, rho, each = (np.asarray(file[key], dtype=float) for key in ("x0", "rho", "requirements"))
+        known, searched = (
+            np.asarray(file[key], dtype=bool) if key in file else None for key in ("known", "searched")
+        )
+    except (StlcError, KeyError, ValueError, RecursionError):
         return None
-    names, requirements = tuple(meta.get("names", ())), tuple(meta.get("requirements", ()))
+    names, requirements = tuple(meta["names"]), tuple(meta["requirements"])
     shapes_fit = x0.ndim == 2 and each.shape == (len(x0), len(requirements)) and rho.shape == (len(x0),)
     if not shapes_fit or x0.shape[1] != len(names) or not len(x0) or not requirements:
         return None

@@ -16,7 +16,7 @@ import numpy as np
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.escape import operand, shell
-from stlc.rundir import RunDir
+from stlc.rundir import SYSTEM, RunDir
 from stlc.signature import Signature
 from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_text
 from stlc.view.words import GUARDS, guard_words, share
@@ -187,11 +187,10 @@ def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
         RunError: R101, `run.json` is damaged.
     """
     try:
-        signature = load_system_decl(run.path / "system.yaml").signature
+        signature = load_system_decl(run.source(SYSTEM)).signature
     except StlcError:
         signature = None
-    held = load_held_out(run.path / "eval" / "held_out.npz")
-    return learning_on_record(run.record(), run.rows(), commands, clause(held, signature))
+    return learning_on_record(run.record(), run.rows(), commands, clause(load_held_out(run), signature))
 
 
 def learning_on_record(

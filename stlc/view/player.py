@@ -19,6 +19,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.escape import script_json
 from stlc.jsontext import dumps
 from stlc.monitor.judgement import beside
+from stlc.rundir import MOST_JSON
 from stlc.view.animation import VectorAnimation, dark_colors, speed_up, still_bytes
 from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table
@@ -102,11 +103,11 @@ def _still(contents: RunContents) -> Html | None:
 
     The picture is drawn anew if its file is missing or out of date.
     """
-    path = contents.run.path / STILL
-    if current(contents.run) and path.is_file():
-        kind, content = "png", path.read_bytes()
+    run = contents.run
+    if current(run) and run.has(STILL):
+        kind, content = "png", run.read(STILL, MOST_JSON)
     else:
-        animation = animation_of(contents.run)
+        animation = animation_of(run)
         if animation is None:
             return None
         kind, content = "webp", still_bytes(animation)
@@ -145,11 +146,7 @@ def _inks(color: str) -> str:
 def _files(contents: RunContents) -> Html | None:
     """Links to the animation files beside the page; None if there are none."""
     names = [f"{animation_name(contents.run)}{suffix}" for suffix in (".gif", ".mp4")]
-    links = [
-        join(el("a", name, attrs={"href": name}), " ")
-        for name in names
-        if (contents.run.path / name).exists()
-    ]
+    links = [join(el("a", name, attrs={"href": name}), " ") for name in names if contents.run.has(name)]
     return classed("p", "quiet", "The same as a file: ", links) if links else None
 
 

@@ -66,7 +66,7 @@ def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html |
     if not trace.meta.judge_text:
         return None
     try:
-        monitor = monitor_of(trace, system=contents.run.path / "system.yaml", drives=True)
+        monitor = monitor_of(trace, system=contents.system, drives=True)
         verdict = monitor.check(trace)
     except StlcError as error:
         return el("p", f"The drives could not be judged by their rules: {_messages(error)}.")
@@ -85,8 +85,7 @@ def _messages(error: StlcError) -> str:
 
 
 def _monitor(contents: RunContents, trace: Trace) -> Monitor:
-    text, system = contents.texts.get("spec.stl", ""), contents.run.path / "system.yaml"
-    return monitor_of(trace, text, system=system)
+    return monitor_of(trace, contents.texts.get("spec.stl", ""), system=contents.system)
 
 
 def map_section(contents: RunContents) -> Section | None:

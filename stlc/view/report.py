@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -65,11 +66,11 @@ def write_report(run: RunDir) -> Path:
     require_drawing()
     contents = read_contents(run)
     sections = sections_of(contents)
-    path = run.path / REPORT
+    path = run.place(REPORT)
     write_atomic(path, render_report(contents, sections))
     for part in sections:
         if part.picture is not None:
-            part.picture.save_png(run.path / f"{part.anchor}.png")
+            part.picture.save_png(run.place(f"{part.anchor}.png"))
     return path
 
 
@@ -374,7 +375,7 @@ def _simulate(contents: RunContents) -> list[str]:
         words += ["--scenario", str(done["scenario"])]
     seeds = list(done.get("seeds") or range(10))
     if seeds != list(range(10)):
-        whole = len(seeds) > 1 and seeds == list(range(seeds[0], seeds[-1] + 1))
+        whole = len(seeds) > 1 and all(after == before + 1 for before, after in pairwise(seeds))
         words += ["--seeds", f"{seeds[0]}..{seeds[-1]}" if whole else ",".join(map(str, seeds))]
     for name in ("agents", "steps"):
         if done.get(name) not in (None, contents.usual.get(name)):

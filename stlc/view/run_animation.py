@@ -6,19 +6,20 @@ drawn if there is neither a world nor a region.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
 
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
 from stlc.escape import file_part, picture
-from stlc.rundir import SCENE, SIMULATION, SYSTEM, TRACE, UNGUARDED, RunDir
+from stlc.rundir import MOST_ARRAYS, SCENE, SYSTEM, TRACE, UNGUARDED, RunDir
 from stlc.trace import Trace, load_trace
+from stlc.trace.formats.npz import read_arrays
 from stlc.view import bullet
 from stlc.view.animation import (
     MAX_BYTES,
@@ -29,7 +30,7 @@ from stlc.view.animation import (
     save_animation,
     save_still,
 )
-from stlc.view.contents import readable
+from stlc.view.contents import archived, readable, simulation_of
 from stlc.view.region_map import RegionMap, map_animation, map_of
 from stlc.view.scene import LegendKey, Scene, SceneOptions, frames_of, keys_of, ratio_of, scene_animation
 from stlc.view.signals import Strip, decisions_of, signal_animation
@@ -97,20 +98,21 @@ def animate(
     animation = animation_of(run)
     if animation is None:
         return None
-    gif = run.path / f"{animation_name(run)}.gif"
-    mp4 = gif.with_suffix(".mp4") if encoder() is not None else None
-    save_still(animation, run.path / STILL)
+    gif, video = (run.place(f"{animation_name(run)}{suffix}") for suffix in (".gif", ".mp4"))
+    mp4 = video if encoder() is not None else None
+    save_still(animation, run.place(STILL))
     save_animation(animation, gif, mp4, max_frames=max_frames, max_bytes=max_bytes)
     if mp4 is None:
-        gif.with_suffix(".mp4").unlink(missing_ok=True)  # of an older deployment
+        video.unlink(missing_ok=True)  # of an older deployment
     return AnimationFiles(gif, mp4)
 
 
 def current(run: RunDir) -> bool:
     """True if the animation file in the run's folder is at least as new as the recorded closed-loop run."""
-    gif = run.path / f"{animation_name(run)}.gif"
-    recorded = [run.path / name for name in (SCENE, TRACE) if (run.path / name).exists()]
-    return gif.exists() and all(gif.stat().st_mtime >= record.stat().st_mtime for record in recorded)
+    gif = f"{animation_name(run)}.gif"
+    recorded = [run.file(name, MOST_ARRAYS) for name in (SCENE, TRACE) if run.has(name)]
+    written = run.file(gif, MOST_ARRAYS).stat().st_mtime if run.has(gif) else -math.inf
+    return all(written >= record.stat().st_mtime for record in recorded)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,11 +172,11 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
     from stlc.dynamics.scenarios.scenario import under
 
     trace_name, scene_name = (TRACE, SCENE) if guarded else UNGUARDED
-    scene = _load_scene(run.path / scene_name)
+    scene = _load_scene(run, scene_name)
     if scene is None:
         return None
     try:
-        decl, scenario = load_system_decl(run.path / SYSTEM), _scenario(run)
+        decl, scenario = load_system_decl(run.source(SYSTEM)), _scenario(run)
         decl = decl if scenario is None else under(decl, scenario)
         if decl.test.world is None:
             return None
@@ -193,10 +195,12 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
 
 def _judged(run: RunDir, trace_name: str, scene: Scene) -> SceneVerdicts | None:
     """Verdicts on the agents of a scene; None if the trace does not belong to this scene."""
-    decisions, trace = scene.get("decision"), load_trace(run.path / trace_name)
-    if decisions is None or trace.samples != frames_of(scene) or trace.traces < decisions.shape[1]:
+    decisions, trace = scene.get("decision"), archived(run, trace_name, load_trace)
+    if decisions is None or trace is None or trace.samples != frames_of(scene):
         return None
-    return judge_agents(trace, decisions.shape[1], system=run.path / SYSTEM)
+    if trace.traces < decisions.shape[1]:
+        return None
+    return judge_agents(trace, decisions.shape[1], system=run.source(SYSTEM))
 
 
 def _scene_animation(run: RunDir, title: str) -> Animation | None:
@@ -300,14 +304,14 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
     animation = _signal_animation(run, "")
     if animation is None:
         return []
-    trace = load_trace(run.path / TRACE)
+    trace = load_trace(run.file(TRACE, MOST_ARRAYS))
 
     def record(shown: range) -> VectorAnimation:
         from stlc.view.vector import vector_animation
 
         return vector_animation(animation, shown)
 
-    judged = readable(lambda: judge_agents(trace, trace.traces, system=run.path / SYSTEM))
+    judged = readable(lambda: judge_agents(trace, trace.traces, system=run.source(SYSTEM)))
     decided = decisions_of(trace)
     if decided is not None:  # one decision per step: the last one is shown at the last sample, too
         whole = decided.shape[1] == trace.samples - 1
@@ -331,14 +335,13 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
 
 def _scenario(run: RunDir) -> str | None:
     """Name of the scenario of the latest closed-loop simulation; None without one."""
-    result = readable(lambda: run.read_json(SIMULATION))
-    name = result.get("scenario") if isinstance(result, dict) else None
-    return None if name is None else str(name)
+    name: str | None = (simulation_of(run) or {}).get("scenario")
+    return name
 
 
 def _signal_animation(run: RunDir, title: str) -> Animation | None:
     """Animation of the trace: its paths over regions or, without regions, its signals."""
-    trace = readable(lambda: load_trace(run.path / TRACE))
+    trace = archived(run, TRACE, load_trace)
     if trace is None:
         return None
     region_map = readable(lambda: _map_of(trace))
@@ -352,12 +355,8 @@ def _map_of(trace: Trace) -> RegionMap | None:
     return map_of(monitor.spec, monitor.check(trace), trace)
 
 
-def _load_scene(path: Path) -> Scene | None:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            scene = {name: file[name] for name in file.files}
-    except (OSError, ValueError, BadZipFile):
-        return None
+def _load_scene(run: RunDir, name: str) -> Scene | None:
+    scene = archived(run, name, read_arrays)
     return scene if scene and all(values.ndim and len(values) for values in scene.values()) else None
 
 

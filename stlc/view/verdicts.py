@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,9 @@ FLASH = (True, True, True, False)
 FLASHES = 4
 
 
-def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, drives: bool = False) -> Monitor:
+def monitor_of(
+    trace: Trace, text: str = "", *, system: Source | None = None, drives: bool = False
+) -> Monitor:
     """Return a monitor of the specification that is stored in a trace.
 
     A trace may store two specifications: the one for which the controls were planned, and a separate one that
@@ -43,17 +44,16 @@ def monitor_of(trace: Trace, text: str = "", *, system: Path | None = None, driv
     Args:
         trace: the recorded trace.
         text: specification to use if the trace stores none.
-        system: path of the system file, which supplies external functions.
+        system: text of the system file, which supplies external functions.
         drives: whether to use the separate specification, if there is one.
 
     Raises:
         SpecError: the specification is invalid.
     """
     carried = trace.meta.carried if drives else trace.meta.planned
-    spec = replace(parse(Source("spec.stl", carried.text or text)), library=carried.library or None)
+    spec = replace(parse(Source("spec.stl", carried.text or text)), library=carried.library)
     outside = any(isinstance(item, ast.Extern) for item in spec.items)
-    used = system if outside and system is not None and system.is_file() else None
-    return Monitor(spec, system=used, overrides=carried.overrides)
+    return Monitor(spec, system=system if outside else None, overrides=carried.overrides)
 
 
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Floats]:
@@ -126,7 +126,7 @@ class SceneVerdicts:
         return safety if safety and not ruled else {each.name for each in self.executed}
 
 
-def judge_agents(trace: Trace, agents: int, *, system: Path) -> SceneVerdicts:
+def judge_agents(trace: Trace, agents: int, *, system: Source | None) -> SceneVerdicts:
     """Evaluate the traces of the first `agents` agents by the specification stored in the trace.
 
     Raises:

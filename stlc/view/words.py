@@ -181,4 +181,4 @@ def cause_words(broken: Mapping[str, Any]) -> str:
     cause = broken.get("cause") or {"why": "start" if broken["lost"] else ""}
     if cause["why"] in ("start", ""):
         return "lost from its start" if cause["why"] else ""
-    return CAUSES[cause["why"]].format(f"{cause['time']:.3g} s")
+    return CAUSES.get(cause["why"], "").format(f"{cause['time']:.3g} s")

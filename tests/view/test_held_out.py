@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stlc.rundir import HELD_OUT, RunDir
 from stlc.view.held_out import (
     HeldOut,
     draw_failures,
@@ -102,26 +103,27 @@ def test_words(signature):
 
 
 def test_file_round_trip(trained):
-    data = load_held_out(trained.path / "eval/held_out.npz")
+    data = load_held_out(trained)
     assert data.names[0] == "x"
     assert data.each.shape == (5000, 4)
     assert data.requirements[data.worst] == "stop_sign"
 
 
 def test_what_is_no_held_out_set_is_none(tmp_path):
-    path = tmp_path / "held_out.npz"
-    assert load_held_out(path) is None
+    run = RunDir(tmp_path)
+    assert load_held_out(run) is None
+    path = run.place(HELD_OUT)
     path.write_bytes(b"no archive")
-    assert load_held_out(path) is None
+    assert load_held_out(run) is None
     meta = np.array(json.dumps({"names": ["a"], "requirements": ["r"]}))
     np.savez(path, x0=np.zeros((3, 2)), rho=np.zeros(3), requirements=np.zeros((3, 1)), meta=meta)
-    assert load_held_out(path) is None
+    assert load_held_out(run) is None
     np.savez(path, x0=np.array([{}], dtype=object), rho=np.zeros(1), requirements=np.zeros((1, 1)), meta=meta)
-    assert load_held_out(path) is None
+    assert load_held_out(run) is None
 
 
 def test_picture_shows_every_start_of_the_region(trained, signature):
-    data = load_held_out(trained.path / "eval/held_out.npz")
+    data = load_held_out(trained)
     picture = draw_failures(data, signature)
     starts, margins = picture.figure.axes
     shown = sum(len(collection.get_offsets()) for collection in starts.collections)

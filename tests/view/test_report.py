@@ -149,7 +149,7 @@ def test_hostile_texts_stay_texts(trained):
 
 def test_what_is_damaged_or_missing_is_left_out(deployed):
     (deployed.path / "trace.npz").write_bytes(b"not an archive")
-    (deployed.path / "eval/simulate.json").write_text("{")
+    (deployed.path / "eval/simulate.json").unlink()
     (deployed.path / "eval/held_out.npz").write_bytes(b"PK")
     (deployed.path / "spec.stl").write_text("require ((")
     (deployed.path / "system.yaml").unlink()

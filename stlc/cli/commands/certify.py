@@ -37,7 +37,8 @@ from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.escape import file_part, operand, shell, visible
-from stlc.files import find_spec, read_source, write_atomic
+from stlc.files import find_spec, of_run, read_source, write_atomic
+from stlc.foreign import driving
 from stlc.registry import guard_named
 
 if TYPE_CHECKING:
@@ -96,6 +97,7 @@ DRAWING = DrawnSubject()
     "stlc certify latest --scenario mismatch-10 --width .02 --agents 1",
     "stlc certify fall.stl --plant ball.yaml --share .9",
     "stlc certify --verify runs/latest/eval/certificate.json",
+    drives=True,
 )
 def certify(
     run: Annotated[
@@ -167,7 +169,8 @@ def certify(
     undecided; with --verify 1 if something differs.
     """
     if verify is not None:
-        return _verified(verify, run, what, runs)
+        with driving(False):
+            return _verified(verify, run, what, runs)
     from stlc.assurance.campaign import Campaign
     from stlc.assurance.certificate import Claim
     from stlc.assurance.conformal import SAME, DistributionShift
@@ -217,7 +220,7 @@ class _Chosen:
             if what.jobs != 1:
                 raise usage("`--jobs` is for plants", "stlc certify SPEC --plant FILE --jobs 2")
             drives = self._policy()
-            return drives, drives.run.dir.path / FILE, f"{drives.run.dir.shown}/{FILE}"
+            return drives, drives.run.dir.place(FILE), f"{drives.run.dir.shown}/{FILE}"
         require_drawn(self.name, self.how, what)
         subject = self._plant() if what.plant is not None else self._system()
         record = subject.record(())
@@ -421,11 +424,11 @@ def _read(path: Path) -> dict[str, Any]:
 
     Raises:
         UsageError: U102, the file does not exist.
-        RunError: R108, it is no certificate.
+        RunError: R108, it is no certificate; R110, it is in the folder of a run, and a link leads there.
     """
     from stlc.assurance.certificate import FORMAT
 
-    source = read_source(path)
+    source = read_source(of_run(path))
     try:
         document = json_library.loads(source.text)
     except (ValueError, RecursionError) as error:

@@ -17,7 +17,7 @@ from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.diagnostics import StlcError, usage
 from stlc.escape import visible
-from stlc.rundir import RUNS, RunDir, every_run, remove_run
+from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, every_run, remove_run
 
 Sort = Literal["time", "acc", "name"]
 
@@ -58,7 +58,7 @@ def show(run: RunArgument = "latest", runs: RunsOption = RUNS) -> Answer[documen
     """Show the settings and results of a run."""
     folder = RunDir.open(run, runs)
     record = folder.record()
-    files = sorted(str(path.relative_to(folder.path)) for path in folder.path.rglob("*") if path.is_file())
+    files = sorted(str(path.relative_to(folder.path)) for path in folder.path.rglob("*") if not path.is_dir())
 
     def tell() -> None:
         emit(visible(folder.shown))
@@ -82,9 +82,7 @@ def diff(
     """
     one, other = RunDir.open(first, runs), RunDir.open(second, runs)
     facts = differences(flattened(one.record()), flattened(other.record()))
-    texts = [
-        name for name in ("spec.stl", "system.yaml") if _text(one.path / name) != _text(other.path / name)
-    ]
+    texts = [name for name in (SPEC, SYSTEM) if _text(one, name) != _text(other, name)]
     rows = [*facts, *((name, "differs", "differs") for name in texts)]
     text = table(rows, header=("", one.name, other.name))
     values: list[documents.DifferentFact] = [{"key": key, "values": list(pair)} for key, *pair in facts]
@@ -136,11 +134,8 @@ def flattened(record: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return flat
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""
+def _text(run: RunDir, name: str) -> bytes | None:
+    return run.read(name) if run.has(name) else None
 
 
 def _record(run: RunDir) -> tuple[Mapping[str, Any], str]:

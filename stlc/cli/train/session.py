@@ -217,11 +217,11 @@ def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: 
     from stlc.view.held_out import find_weakness, load_held_out, unsolved_text, weakness_text
 
     folder = outcome.run.dir
-    held = load_held_out(folder.path / "eval" / "held_out.npz")
+    held = load_held_out(folder)
     weakness = None if held is None else find_weakness(held)
     if held is None or weakness is None:
         return final_screen(result, spark)
-    drawn = pictures and (folder.path / FAILURES).is_file()
+    drawn = pictures and folder.has(FAILURES)
     return final_screen(
         result,
         spark,

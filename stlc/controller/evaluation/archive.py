@@ -14,7 +14,7 @@ import torch
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.training.run import read_library
-from stlc.files import atomic_path, read_source
+from stlc.files import atomic_path
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.rundir import SPEC, SYSTEM, TRACE, UNGUARDED
@@ -94,7 +94,7 @@ def save_trace_of(
         MissingError: R201, a file cannot be written.
     """
     trace = trace_of(run, recording, setting, rules)
-    paths = [run.dir.path / TRACE, *([also] if also is not None else [])]
+    paths = [run.dir.place(TRACE), *([also] if also is not None else [])]
     for path in paths:
         save_trace(path, trace)
     return paths
@@ -112,7 +112,7 @@ def save_unguarded(
     Raises:
         MissingError: R201, a file cannot be written.
     """
-    trace_path, scene_path = (run.dir.path / name for name in UNGUARDED)
+    trace_path, scene_path = map(run.dir.place, UNGUARDED)
     if recording is None:
         for path in (trace_path, scene_path):
             path.unlink(missing_ok=True)
@@ -126,7 +126,7 @@ def save_unguarded(
 
 
 def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
-    record, spec = run.dir.record(), read_source(run.dir.path / SPEC).text
+    record, spec = run.dir.record(), run.dir.source(SPEC).text
     library = read_library(run.dir)
     return TraceMeta(
         spec_name=run.task.compiled.name,
@@ -141,7 +141,7 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
         judge_set={} if rules is None else dict(rules.overrides),
         system_name=run.task.system.decl.name,
         system_path=str(record.get("system_path", "")),
-        system_text=read_source(run.dir.path / SYSTEM).text,
+        system_text=run.dir.source(SYSTEM).text,
         system_hash=run.task.system.decl.hash,
         run=run.dir.name,
         seed=setting.seeds[0],

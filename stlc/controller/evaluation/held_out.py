@@ -239,5 +239,4 @@ def save_states(path: Path, task: Task, result: Score) -> None:
         searched=result.searched.numpy(),
         meta=np.array(json.dumps(meta)),
     )
-    path.parent.mkdir(exist_ok=True)
     write_atomic(path, buffer.getvalue())

@@ -20,9 +20,8 @@ from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.feasibility import safety_task, solvable
 from stlc.controller.training.run import INDEX, read_library, save_library
-from stlc.diagnostics import Diagnostic, RunError, SystemFileError, UsageError
-from stlc.dynamics.declaration.load import load_system_decl
-from stlc.files import read_source, write_atomic
+from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
+from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.explain.report import explain
@@ -159,7 +158,7 @@ def read_rules(judge: JudgeRef) -> ast.Spec:
         SpecError: the file is not a valid specification.
     """
     try:
-        spec = parse(read_source(judge.path))
+        spec = parse(read_source(judge.path, judge.span.source.root))
     except UsageError as error:
         first = error.diagnostics[0]
         advice = (*first.help, "`--set test.judge=null` does without")
@@ -180,7 +179,7 @@ def keep_rules(folder: RunDir, task: Task) -> None:
     index: dict[str, dict[str, str]] = {}
     for number, (written, (judge, spec)) in enumerate(found.items()):
         name = judge.path.name if number == 0 else f"{number}-{judge.path.name}"
-        write_atomic(folder.path / JUDGE / name, spec.source.text)
+        folder.write(f"{JUDGE}/{name}", spec.source.text)
         save_library(folder, spec.library or {}, _library_of(name))
         index[written] = {"file": name, "path": str(judge.path)}
     folder.write_json(_INDEX, index)
@@ -202,11 +201,8 @@ def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
 def rules_of(run: Run) -> Rules | None:
     """Rules for the closed-loop runs of a trained run; None if the specification of the plans judges them.
 
-    Training copies the rules that the system file names into the run folder. Normally this copy is read.
-    There are two exceptions:
-
-    - Rules that are named later, by the scenario or with `--set test.judge=…`, are read from their own file.
-    - Old run folders have no copies. For these, the present system file names the rules.
+    Training copies the rules that the system file names into the run folder, and this copy is read. Rules
+    that are named later, with `--set test.judge=…`, are read from their own file.
 
     Raises:
         RunError: R101, the index of the copies in the run folder is damaged.
@@ -219,46 +215,17 @@ def rules_of(run: Run) -> Rules | None:
 def rules_for(folder: RunDir, decl: SystemDecl) -> Rules | None:
     """Rules for the closed-loop runs of the run in a folder, whose system is `decl`; see `rules_of`."""
     judge, overrides = decl.test.judge, decl.overrides
-    if (folder.path / _INDEX).is_file():
-        return None if judge is None else _copied(folder, judge, overrides)
-    if judge is None:
-        judge = _named_since(folder, decl)
     if judge is None:
         return None
-    spec = read_rules(judge)
-    return Rules(spec, str(judge.path), _own(spec, overrides))
-
-
-def _copied(folder: RunDir, judge: JudgeRef, overrides: Mapping[str, str]) -> Rules:
-    index = folder.read_json(_INDEX)
-    if isinstance(index, dict) and judge.written not in index:
+    index = folder.read_json(_INDEX, {"*": {"file": str, "path?": str}}) if folder.has(_INDEX) else {}
+    entry = index.get(judge.written)
+    if entry is None:
         spec = read_rules(judge)
         return Rules(spec, str(judge.path), _own(spec, overrides))
-    entry = index[judge.written] if isinstance(index, dict) else None
-    name = entry.get("file") if isinstance(entry, dict) else None
-    if not isinstance(entry, dict) or not isinstance(name, str) or Path(name).name != name:
-        raise RunError(Diagnostic("R101", f"`{folder.shown}/{_INDEX}` is damaged"))
-    spec = parse(read_source(folder.path / JUDGE / name))
+    name = entry["file"]
+    spec = parse(folder.source(f"{JUDGE}/{name}"))
     spec = replace(spec, library=read_library(folder, _library_of(name)))
-    return Rules(spec, str(entry.get("path", name)), _own(spec, overrides))
-
-
-def _named_since(folder: RunDir, decl: SystemDecl) -> JudgeRef | None:
-    """Reference to the rules that a run's system file names today, for the chosen scenario.
-
-    None if the system file names no rules, does not exist or is invalid. Also None if `test.judge` is
-    overridden.
-    """
-    path = Path(str(folder.record().get("system_path") or ""))
-    if "test.judge" in decl.overrides or not path.is_file():
-        return None
-    try:
-        now = load_system_decl(path)
-    except SystemFileError:
-        return None
-    laid = None if decl.scenario is None else decl.scenario.name
-    own = [each.judge for each in now.scenarios if each.name == laid and each.judge is not None]
-    return own[0] if own else now.test.judge
+    return Rules(spec, entry.get("path") or name, _own(spec, overrides))
 
 
 def _library_of(name: str) -> str:

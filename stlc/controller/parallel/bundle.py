@@ -26,9 +26,9 @@ from stlc.controller.parallel.jobs import TAIL, Job, JobResult, document_of, sta
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.robots.functions import function_files
-from stlc.files import atomic_path, find_spec, find_system, read_source, write_atomic
+from stlc.files import RECORD, atomic_path, find_spec, find_system, read_source, within, write_atomic
 from stlc.grammar.parse.parser import parse
-from stlc.rundir import RECORD, RUNS, RunDir, every_run
+from stlc.rundir import RUNS, RunDir, every_run
 from stlc.version import __version__
 
 _OTHER_VERSION = 5
@@ -73,6 +73,10 @@ class JobBundle:
         probe = runs / f".probe-{secrets.token_hex(8)}"
         with atomic_path(probe) as written:
             written.touch()
+        for path in inputs:
+            if (path / RECORD).is_file():  # links would be followed: a run holds none
+                for each in path.rglob("*"):
+                    within(path, f"{each.relative_to(path).as_posix()}", folders=each.is_dir())
         files = pack({str(path.relative_to(path.anchor)): path for path in inputs if path.exists()})
         known = tuple(map(str, inputs))
         return cls(job.arguments, str(folder), str(runs), known, files, str(probe), cores, __version__)
@@ -153,8 +157,7 @@ def _replace(run: RunDir, files: bytes) -> None:
         unpack(files, beside)
         moves = [(path, run.path / path.relative_to(beside)) for path in beside.rglob("*") if path.is_file()]
         for path, target in sorted(moves, key=lambda move: (move[1].name == RECORD, move[1].exists())):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            path.replace(target)
+            path.replace(run.place(target.relative_to(run.path).as_posix()))
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 

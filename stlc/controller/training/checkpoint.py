@@ -20,9 +20,8 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from stlc.diagnostics import Diagnostic, RunError
-from stlc.files import write_atomic
 from stlc.provenance import sha256
-from stlc.rundir import RunDir
+from stlc.rundir import MOST_ARRAYS, RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -37,6 +36,7 @@ _HASH = 8
 """Number of digits of the hash in the name of a file."""
 _NAME = re.compile(rf"step-\d{{6,}}(-[0-9a-f]{{{_HASH}}})?\.safetensors")
 """Names of tensor files; older ones have no hash."""
+_FACTS = {"file": str, "sha256": str, "spec_hash?": str, "system_hash?": str}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +55,15 @@ def save_checkpoint(
     Raises:
         MissingError: R201, the disk is full or not writable; the last good checkpoint stays.
     """
-    folder = run.path / FOLDER
-    folder.mkdir(exist_ok=True)
     data = save_tensors({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
     digest = sha256(data)
-    path = folder / f"step-{step:06d}-{digest[:_HASH]}.safetensors"
-    write_atomic(path, data)
+    path = run.path / FOLDER / f"step-{step:06d}-{digest[:_HASH]}.safetensors"
+    run.write(f"{FOLDER}/{path.name}", data)
     text = json.dumps({**facts, "file": path.name, "sha256": digest}, indent=1)
-    write_atomic(path.with_suffix(".json"), text)
-    write_atomic(folder / POINTER, text)
+    run.write(f"{FOLDER}/{path.stem}.json", text)
+    run.write(f"{FOLDER}/{POINTER}", text)
     for pattern in ("step-*", ".step-*", ".last.*"):  # the hidden ones are of a save that was killed
-        for old in folder.glob(pattern):
+        for old in path.parent.glob(pattern):
             if old.stem != path.stem:
                 with suppress(OSError):
                     old.unlink()
@@ -74,8 +72,7 @@ def save_checkpoint(
 
 def never_saved(run: RunDir) -> bool:
     """True if no checkpoint of the run was ever written, except for a part of the first one."""
-    folder = run.path / FOLDER
-    return not (folder / POINTER).exists() and not any(folder.glob("step-*.json"))
+    return not run.has(f"{FOLDER}/{POINTER}") and not any((run.path / FOLDER).glob("step-*.json"))
 
 
 def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpoint:
@@ -90,8 +87,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
         RunError: R101, there is no checkpoint or it is damaged; R102, it belongs to another specification or
             system.
     """
-    folder = run.path / FOLDER
-    facts, data = _read(folder)
+    facts, data = _read(run)
     for key, wanted, word in (
         ("spec_hash", spec_hash, "specification"),
         ("system_hash", system_hash, "system"),
@@ -100,7 +96,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
             raise RunError(
                 Diagnostic(
                     "R102",
-                    f"the checkpoint in `{_shown(folder)}` was trained for another {word}",
+                    f"the checkpoint in `{run.shown}/{FOLDER}` was trained for another {word}",
                     help=(f"train again, or put the {word} back that the checkpoint was made with",),
                     note=(f"{word} now {wanted[:12]}, of the checkpoint {str(facts.get(key))[:12]}",),
                 )
@@ -108,7 +104,7 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
     try:
         return Checkpoint(load_tensors(data), facts)
     except (SafetensorError, *_DAMAGE) as error:
-        raise RunError(_damaged(folder, str(error)[:100])) from error
+        raise RunError(_damaged(run, str(error)[:100])) from error
 
 
 @contextmanager
@@ -117,46 +113,38 @@ def restoring(run: RunDir) -> Iterator[None]:
     try:
         yield
     except _DAMAGE as error:
-        raise RunError(_damaged(run.path / FOLDER, f"{type(error).__name__}: {error}"[:200])) from error
+        raise RunError(_damaged(run, f"{type(error).__name__}: {error}"[:200])) from error
 
 
-def _read(folder: Path) -> tuple[dict[str, Any], bytes]:
+def _read(run: RunDir) -> tuple[dict[str, Any], bytes]:
     """Read the scalars and the bytes of the tensor file of the latest checkpoint.
 
     Raises:
         RunError: R101, there is no checkpoint, it cannot be read, or the bytes are not those that were
             written with the scalars.
     """
-    try:
-        facts = json.loads((folder / POINTER).read_text())
-        name = facts["file"]
-        if not _NAME.fullmatch(name):
-            raise ValueError(f"`{name}` is not the name of a checkpoint")
-        data = (folder / name).read_bytes()
-    except FileNotFoundError as error:
+    if not run.has(f"{FOLDER}/{POINTER}"):
         raise RunError(
             Diagnostic(
                 "R101",
-                f"there is no checkpoint in `{_shown(folder)}`",
+                f"there is no checkpoint in `{run.shown}/{FOLDER}`",
                 help=("train: stlc train SPEC", "an earlier run is named by its number: stlc simulate 7"),
                 note=("nothing has been saved yet, or the run ended before that",),
             )
-        ) from error
-    except (OSError, *_DAMAGE) as error:
-        raise RunError(_damaged(folder, str(error))) from error
-    if sha256(data) != facts.get("sha256"):
-        raise RunError(_damaged(folder, f"`{name}` is not what was written"))
+        )
+    facts = run.read_json(f"{FOLDER}/{POINTER}", _FACTS)
+    name = facts["file"]
+    if not _NAME.fullmatch(name):
+        raise RunError(_damaged(run, f"`{name:.100}` is not the name of a checkpoint"))
+    data = run.read(f"{FOLDER}/{name}", MOST_ARRAYS)
+    if sha256(data) != facts["sha256"]:
+        raise RunError(_damaged(run, f"`{name}` is not what was written"))
     return facts, data
 
 
-def _damaged(folder: Path, why: str) -> Diagnostic:
-    message = f"the checkpoint in `{_shown(folder)}` is damaged: {why}"
+def _damaged(run: RunDir, why: str) -> Diagnostic:
+    message = f"the checkpoint in `{run.shown}/{FOLDER}` is damaged: {why}"
     return Diagnostic("R101", message, help=("train again",))
-
-
-def _shown(folder: Path) -> str:
-    """Path of the folder `folder`, as messages print it."""
-    return f"{RunDir(folder.parent).shown}/{folder.name}"
 
 
 def weights(checkpoint: Checkpoint, prefix: str) -> dict[str, torch.Tensor]:

@@ -16,7 +16,6 @@ from stlc.controller.training.loop import prepare, run
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.diagnostics import usage
 from stlc.dynamics.robots.functions import function_files
-from stlc.files import write_atomic
 from stlc.provenance import git_state, hardware, versions
 from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, now, require_name
 from stlc.version import __version__
@@ -87,15 +86,15 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "hardware": hardware(),
         }
     )
-    write_atomic(folder.path / SPEC, task.compiled.spec.source.text)
+    folder.write(SPEC, task.compiled.spec.source.text)
     save_library(folder, library_of(task.compiled.spec))
-    write_atomic(folder.path / SYSTEM, decl.source.text)
+    folder.write(SYSTEM, decl.source.text)
     for path in {world.path for world in decl.worlds if world.path.is_file()}:
-        write_atomic(folder.path / path.name, path.read_bytes())
+        folder.write(path.name, path.read_bytes())
     for name, path in function_files(decl).items():
-        write_atomic(folder.path / name, path.read_bytes())
+        folder.write(name, path.read_bytes())
     keep_rules(folder, task)
-    write_atomic(folder.path / "compiled.txt", dump(task.compiled))
+    folder.write("compiled.txt", dump(task.compiled))
     hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder), "learnt": decl.learnt}
     folder.update(hashes)
     return folder

@@ -16,13 +16,12 @@ from stlc.controller.training.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import scenario_constants
-from stlc.files import read_source, write_atomic
+from stlc.dynamics.scenarios.scenario import scenario_constants, under
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.provenance import sha256
 from stlc.registry import METHODS
-from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir
+from stlc.rundir import HELD_OUT, RUNS, SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from stlc.controller.evaluation.held_out import Score
     from stlc.controller.policies.policy import PlanProposer, Policy
     from stlc.controller.problem.task import PlanVerdicts
+    from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.rundir import Status
 
 LIB = "lib"
@@ -153,7 +153,7 @@ class RunWriter:
     def held_out(self, task: Task, score: Score) -> None:
         """Save the held-out states and their verdicts."""
         if self.writes:
-            save_states(self.folder.path / "eval" / "held_out.npz", task, score)
+            save_states(self.folder.place(HELD_OUT), task, score)
 
     def close(self, status: Status, result: object = None) -> None:
         """Write the final status of the run and its result into `run.json`."""
@@ -173,14 +173,26 @@ def task_of_run(
         scenario: name of a scenario of the system file to apply.
     """
     trained = folder.record().get("overrides") or {}
-    spec = replace(parse(read_source(folder.path / SPEC)), library=read_library(folder))
-    overlay = {} if scenario is None else scenario_constants(folder.path / SYSTEM, scenario, trained)
-    changed = {**trained, **overlay, **(overrides or {})}
+    spec = replace(parse(folder.source(SPEC)), library=read_library(folder))
+    decl, changed = declaration_of_run(folder, overrides, scenario), _changes(folder, overrides, scenario)
     drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
     values = {name: text for name, text in changed.items() if name in drawn}
     constants = {name: text for name, text in changed.items() if name not in drawn}
-    system = System.load(folder.path / SYSTEM, changed, scenario=scenario)
-    return Task.of(spec, system, overrides=constants, values=values)
+    return Task.of(spec, System(decl), overrides=constants, values=values)
+
+
+def declaration_of_run(
+    folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
+) -> SystemDecl:
+    """Read the system in a run's folder. No code is run; the arguments are those of `task_of_run`."""
+    decl = load_system_decl(folder.source(SYSTEM), _changes(folder, overrides, scenario))
+    return decl if scenario is None else under(decl, scenario)
+
+
+def _changes(folder: RunDir, overrides: Mapping[str, str] | None, scenario: str | None) -> dict[str, str]:
+    trained = folder.record().get("overrides") or {}
+    overlay = {} if scenario is None else scenario_constants(folder.source(SYSTEM), scenario, trained)
+    return {**trained, **overlay, **(overrides or {})}
 
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -224,20 +236,20 @@ def trained_on(folder: RunDir) -> str:
     then, learnt = record.get("system_hash"), record.get("learnt")
     if now == then or not isinstance(then, str) or learnt is None:
         return now
-    decl = load_system_decl(folder.path / SYSTEM, record.get("overrides") or {})
+    decl = load_system_decl(folder.source(SYSTEM), record.get("overrides") or {})
     return then if decl.learnt == learnt else now
 
 
 def _hash(folder: RunDir, name: str, library: Mapping[str, str] | None = None) -> str:
     overrides = folder.record().get("overrides") or {}
     imports = json.dumps(dict(sorted(library.items()))) if library else ""
-    return sha256(read_source(folder.path / name).text + json.dumps(overrides, sort_keys=True) + imports)
+    return sha256(folder.source(name).text + json.dumps(overrides, sort_keys=True) + imports)
 
 
 def save_library(folder: RunDir, library: Mapping[str, str], below: str = LIB) -> None:
     """Save a specification's imports (name -> text) in the subfolder `below` of a run's folder."""
     for key, text in library.items():
-        write_atomic(folder.path / below / file_of(key), text)
+        folder.write(f"{below}/{file_of(key)}", text)
     if library:
         folder.write_json(f"{below}/{INDEX}", {key: file_of(key) for key in library})
 
@@ -246,20 +258,17 @@ def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
     """Read the texts saved by `save_library`, by name of the import.
 
     Raises:
-        RunError: R101, a text is damaged.
+        RunError: R101, a text is damaged; R110, a name leads out of the run.
     """
-    if not (folder.path / below / INDEX).is_file():
+    if not folder.has(f"{below}/{INDEX}"):
         return {}
-    index = folder.read_json(f"{below}/{INDEX}")
-    names = index.values() if isinstance(index, dict) else [None]
-    if any(not isinstance(name, str) or name.startswith("/") or ".." in name.split("/") for name in names):
-        raise RunError(Diagnostic("R101", f"`{folder.shown}/{below}/{INDEX}` is damaged"))
-    return {key: read_source(folder.path / below / name).text for key, name in index.items()}
+    index: dict[str, str] = folder.read_json(f"{below}/{INDEX}", {"*": str})
+    return {key: folder.source(f"{below}/{name}").text for key, name in index.items()}
 
 
 def save_config(folder: RunDir, config: ResolvedConfig) -> None:
     """Write the resolved options of a run, as JSON, which is also YAML."""
-    write_atomic(folder.path / CONFIG, json.dumps(asdict(config), indent=1) + "\n")
+    folder.write(CONFIG, json.dumps(asdict(config), indent=1) + "\n")
 
 
 def load_config(folder: RunDir) -> ResolvedConfig:
@@ -268,13 +277,11 @@ def load_config(folder: RunDir) -> ResolvedConfig:
     Raises:
         RunError: R101, their file is missing or damaged.
     """
+    values: dict[str, Any] = folder.read_json(CONFIG, {"method": str, "hidden": [int]})
     try:
-        values: dict[str, Any] = json.loads((folder.path / CONFIG).read_text())
         method = values["method"]
         kind: type[ResolvedConfig] = METHODS.get(method).options if method in METHODS else ResolvedConfig
         engine = {field.name: values[field.name] for field in fields(kind) if field.name in values}
         return checked_config(kind(**{**engine, "hidden": tuple(engine["hidden"])}))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise RunError(
-            Diagnostic("R101", f"`{folder.shown}/{CONFIG}` is missing or damaged: {error}")
-        ) from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RunError(folder.damaged(CONFIG, error)) from error

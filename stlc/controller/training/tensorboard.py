@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from stlc.diagnostics import not_installed
 from stlc.escape import markdown, tag
+from stlc.files import place
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,4 +74,5 @@ def find_writer() -> Opener:
         module = "torch.utils.tensorboard"
     else:
         raise not_installed("`--log tensorboard` needs tensorboardX, which is not installed", "log")
-    return lambda run: TensorBoardLogger(import_module(module).SummaryWriter(str(run / FOLDER)))
+    writer = import_module(module).SummaryWriter
+    return lambda run: TensorBoardLogger(writer(str(place(run, f"{FOLDER}/events").parent)))

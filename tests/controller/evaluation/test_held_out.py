@@ -14,6 +14,7 @@ from stlc.controller.training.config import HELD_OUT_SEED, TrainConfig, resolve_
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
+from stlc.rundir import HELD_OUT, RunDir
 from stlc.view.held_out import load_held_out, unsolved_text
 
 
@@ -32,8 +33,9 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
     assert 0 < int(good.sum()) < 60
     assert bool(found.known[good].all())
     assert found.feasible == float(found.known.double().mean()) > found.accuracy
-    save_states(tmp_path / "held_out.npz", car_task, found)
-    held = load_held_out(tmp_path / "held_out.npz")
+    folder = RunDir(tmp_path)
+    save_states(folder.place(HELD_OUT), car_task, found)
+    held = load_held_out(folder)
     assert held is not None
     failing, known = held.unsolved
     assert failing == 60 - int(good.sum())

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.training import checkpoint
+from stlc import rundir
 from stlc.controller.training.checkpoint import (
     load_checkpoint,
     never_saved,
@@ -82,7 +82,7 @@ def test_a_full_disk_at_any_moment_keeps_the_last_good_one(
 def test_a_second_save_at_one_step_keeps_the_first_until_it_is_whole(
     run: RunDir, monkeypatch: pytest.MonkeyPatch, files: int
 ) -> None:
-    real, written = checkpoint.write_atomic, itertools.count()
+    real, written = rundir.write_atomic, itertools.count()
 
     def killed(path: Path, data: bytes | str) -> None:
         if next(written) >= files:
@@ -90,7 +90,7 @@ def test_a_second_save_at_one_step_keeps_the_first_until_it_is_whole(
         real(path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "write_atomic", killed)
+        patch.setattr(rundir, "write_atomic", killed)
         with pytest.raises(KeyboardInterrupt):
             save_checkpoint(run, {"w": torch.zeros(1)}, HASHES, step=1)
     assert _value(run) == [0.0, 1.0, 2.0]
@@ -205,7 +205,7 @@ def test_an_engine_that_is_none(run: RunDir, name: str, value: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["[" * 9000, "[]", '{"overrides": []}', '{"overrides": {"a": 1}}', '{"seed": null}']
+    "text", ["[" * 9000, "[]", '{"overrides": []}', '{"overrides": {"a": 1}}', '{"seed": "one"}']
 )
 def test_records_that_are_damaged(run: RunDir, text: str) -> None:
     (run.path / "run.json").write_text(text)
