@@ -251,6 +251,13 @@ def arranged(monkeypatch, machine):
                 monkeypatch.setattr("stlc.controller.policies.policy.BestOfKPolicy.candidates", no_number)
             case "R105":
                 monkeypatch.setattr("stlc.export.verify._distance", lambda *_: float("inf"))  # nothing agrees
+            case "R110":
+                path = Path("runs/cart/0001-first/spec.stl")
+                path.unlink()
+                path.symlink_to("/etc/passwd")
+            case "R111":
+                with Path("runs/cart/0001-first/system.yaml").open("a") as lines:
+                    lines.write("functions: {f: {kind: python, target: 'f.py:f'}}\n")
             case "R404":
                 path = Path("specs/cart.stl")
                 path.write_text(path.read_text().replace("abs(x) < 0.1 m", "x > 100 m"))
