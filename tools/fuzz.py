@@ -47,7 +47,7 @@ EVERY = 5000
 PATIENCE = 180
 """Wall-clock seconds without an outcome after which a worker counts as hung in foreign code."""
 
-WAIT = 100
+WAIT = 170
 """Wall-clock seconds after which a command counts as waiting for ever."""
 
 ANSWERS = frozenset(range(6))
