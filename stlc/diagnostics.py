@@ -211,6 +211,7 @@ CODES: dict[str, str] = {
     "E302": "a future operator with a negative bound",
     "E303": "an interval bound that is not a constant",
     "W304": "an interval bound that is not a whole number of steps",
+    "W319": "a comment for stlc that it does not understand",
     "E305": "an interval without a sample",
     "W305": "a recording that was read in part",
     "E306": "more signal is needed than there is",

@@ -41,6 +41,7 @@ from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
+from stlc.grammar.allow import not_allowed
 from stlc.signature import Signature
 from stlc.source import Span
 
@@ -132,7 +133,7 @@ class Compiled:
             period of a goal such as `always@[a, end] once[0, c] p`; it determines the length of simulated
             missions. None if the mission ends.
         grid: time step and horizon.
-        warnings: findings that are not errors.
+        warnings: findings that are not errors, without those that comments allow.
         typed: the specification after the first stage.
         end: treatment of windows that extend beyond the end of a plan.
     """
@@ -247,7 +248,7 @@ def compile_resolved(
         mission=max(map(mission_steps, goals), default=None),
         recurring=_remembered(stage.table.timers) if any(map(never_over, goals)) else None,
         grid=grid,
-        warnings=tuple(sink),
+        warnings=tuple(not_allowed(sink)),
         typed=spec,
         end=end,
     )

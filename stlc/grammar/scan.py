@@ -21,12 +21,13 @@ from stlc.grammar.words import (
     SPACE,
     UNARY_TEMPORAL,
 )
+from stlc.source import Source, Span
 
 LexemeKind = Literal["word", "quoted", "number", "string", "sign"]
 
 _LEXEME = re.compile(
     rf"""
-    {SPACE}+ | (?:\#|//)[^\n]*
+    {SPACE}+ | (?P<comment>(?:\\#|//)[^\\n]*)
     | (?P<string>"[^"\n]*")
     | (?P<quoted>`[^`\n]+`)
     | (?P<word>[^\W\d¹²³⁰⁴-⁹][^\W¹²³⁰⁴-⁹]*)
@@ -69,8 +70,15 @@ def lexemes(text: str, start: int = 0, end: int | None = None) -> Iterator[Lexem
     """
     for match in _LEXEME.finditer(text, start, len(text) if end is None else end):
         kind = match.lastgroup
-        if kind is not None:
+        if kind is not None and kind != "comment":
             yield Lexeme(kind, match[0], match.start(), match.end())  # type: ignore[arg-type]
+
+
+def comments(source: Source) -> Iterator[Span]:
+    """Yield the location of each comment of a text, from its `#` or `//` to the end of its line."""
+    for match in _LEXEME.finditer(source.text):
+        if match.lastgroup == "comment":
+            yield source.span(match.start(), match.end())
 
 
 def declaration_starts(text: str) -> list[int]:

@@ -12,6 +12,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Purpose, compile_resolved
 from stlc.diagnostics import CODES, Diagnostic, Fix, SpecError, UsageError
 from stlc.grammar import ast
+from stlc.grammar.allow import not_allowed
 from stlc.grammar.parse.parser import parse
 from stlc.lint.rules import RULES
 from stlc.registry import closest
@@ -138,7 +139,7 @@ EVERYTHING_USUAL = Selection()
 def lint(
     source: Source, *, within: Surroundings | None = None, selection: Selection = EVERYTHING_USUAL
 ) -> tuple[Diagnostic, ...]:
-    """Return all findings in a text, in source order.
+    """Return the findings in a text that its comments do not allow, in source order.
 
     Args:
         source: the text.
@@ -153,7 +154,7 @@ def lint(
     for code, rule in RULES.items():
         if selection.wants(code):
             found += rule.check(spec)
-    kept = [finding for finding in found if selection.wants(finding.code)]
+    kept = not_allowed(finding for finding in found if selection.wants(finding.code))
     return tuple(sorted(kept, key=lambda finding: _place(finding, source)))
 
 

@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
+from stlc.grammar.allow import misunderstood
 from stlc.grammar.ambiguity import Ambiguity, AmbiguityKind, ambiguities
 from stlc.grammar.scan import Lexeme, lexemes
 from stlc.grammar.traverse import descendants
@@ -152,6 +153,11 @@ def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
         yield Diagnostic("W504", message, spec.source.span(0, 0), help=(advice,))
 
 
+def unread_comments(spec: ast.Spec) -> Iterator[Diagnostic]:
+    """Yield W319 for comments such as `# stlc: alow W311`, and for codes in them that are no warnings."""
+    return misunderstood(spec.source)
+
+
 Check: TypeAlias = Callable[[ast.Spec], Iterator[Diagnostic]]
 
 
@@ -174,6 +180,7 @@ RULES: Mapping[str, LintRule] = MappingProxyType(
         "W106": LintRule(foreign_spellings),
         "W301": LintRule(missing_parentheses),
         "W302": LintRule(unclear_implications, usual=False),
+        "W319": LintRule(unread_comments),
         "W504": LintRule(nothing_required),
     }
 )
