@@ -92,19 +92,26 @@ def _codes(comment: Span, found: re.Match[str]) -> list[Span]:
 
 
 def _declaration(comment: Span) -> Span:
-    """Return the declaration to which a comment applies, with the lines between the two."""
+    """Return the declaration to which a comment applies, with the lines between the two.
+
+    A comment on a line of its own also applies to the next line, which may be a comment.
+    """
     source = comment.source
     text = source.text
     items = list(lexemes(text))
     starts = declaration_starts(text)
     after = bisect_left(items, comment.end, key=lambda item: item.start)
-    beside = text[text.rfind("\n", 0, comment.start) + 1 : comment.start].strip()
-    index = after - 1 if beside or after == len(items) else after
+    alone = not text[text.rfind("\n", 0, comment.start) + 1 : comment.start].strip()
+    index = after if alone and after < len(items) else after - 1
     if index < 0:
         return source.span(0, len(text))
     at = bisect_right(starts, items[index].start)
-    end = starts[at] if at < len(starts) else len(text)
-    last = bisect_left(items, end, key=lambda item: item.start) - 1
-    line_end = text.find("\n", items[last].end)
-    ends = max(comment.end, len(text) if line_end < 0 else line_end)
+    limit = starts[at] if at < len(starts) else len(text)
+    last = bisect_left(items, limit, key=lambda item: item.start) - 1
+    ends = _line_end(text, max(comment.end + alone, items[last].end))
     return source.span(min(comment.start, starts[at - 1]), ends)
+
+
+def _line_end(text: str, offset: int) -> int:
+    found = text.find("\n", offset)
+    return len(text) if found < 0 else found
