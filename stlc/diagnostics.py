@@ -25,10 +25,14 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Repair of a finding: edits, as (source location, replacement) pairs, and their effect in words."""
+    """Repair of a finding: edits, as (source location, replacement) pairs, and their effect in words.
+
+    If not `same`, the repair changes what is required: it is offered, and never applied by itself.
+    """
 
     edits: tuple[tuple[Span, str], ...]
     text: str = ""
+    same: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +215,11 @@ CODES: dict[str, str] = {
     "E302": "a future operator with a negative bound",
     "E303": "an interval bound that is not a constant",
     "W304": "an interval bound that is not a whole number of steps",
+    "W311": "a requirement that is judged at the first sample only",
+    "W312": "a formula that every value satisfies",
+    "W313": "a comparison that a declared range decides",
+    "W314": "a bare number beside a unit for which another is common",
+    "W315": "a requirement in a comment",
     "W319": "a comment for stlc that it does not understand",
     "E305": "an interval without a sample",
     "W305": "a recording that was read in part",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -14,6 +14,7 @@ from stlc.diagnostics import CODES, Diagnostic, Fix, SpecError, UsageError
 from stlc.grammar import ast
 from stlc.grammar.allow import not_allowed
 from stlc.grammar.parse.parser import parse
+from stlc.lint.meaning import TYPED_RULES
 from stlc.lint.rules import RULES
 from stlc.registry import closest
 from stlc.source import Source, Span
@@ -41,8 +42,9 @@ class Fixed:
 def fix(source: Source, check: Callable[[Source], Sequence[Diagnostic]]) -> Fixed:
     """Repair a text in rounds until no finding with an automatic repair remains; return the repaired text.
 
-    In each round, all repairs that do not overlap are applied. Of two overlapping repairs, the second waits
-    for the next round. A round that increases the number of errors is undone, and no further round follows.
+    In each round, all repairs that do not overlap are applied, except those that change what is required. Of
+    two overlapping repairs, the second waits for the next round. A round that increases the number of errors
+    is undone, and no further round follows.
 
     Args:
         source: the text.
@@ -50,7 +52,7 @@ def fix(source: Source, check: Callable[[Source], Sequence[Diagnostic]]) -> Fixe
     """
     findings, count = tuple(check(source)), 0
     for _ in range(ROUNDS):
-        fixes = [found.fix for found in findings if found.fix is not None]
+        fixes = [found.fix for found in findings if found.fix is not None and found.fix.same]
         chosen = _apart(one for one in fixes if all(span.source is source for span, _ in one.edits))
         if not chosen:
             break
@@ -150,7 +152,7 @@ def lint(
         spec = parse(source)
     except SpecError as error:
         return error.diagnostics
-    found = list(_compiled(spec, within))
+    found = list(_compiled(spec, within, selection))
     for code, rule in RULES.items():
         if selection.wants(code):
             found += rule.check(spec)
@@ -158,19 +160,24 @@ def lint(
     return tuple(sorted(kept, key=lambda finding: _place(finding, source)))
 
 
-def _compiled(spec: ast.Spec, within: Surroundings | None) -> Sequence[Diagnostic]:
-    """Return the findings of the compiler in a specification.
+def _compiled(spec: ast.Spec, within: Surroundings | None, selection: Selection) -> Iterator[Diagnostic]:
+    """Yield the findings of the compiler in a specification, and those of the rules on its meaning.
 
     Without a system (`within` is None), only names, types and units are checked.
     """
     warnings: list[Diagnostic] = []
     try:
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)
-        if within is None:
-            return warnings
-        return compile_resolved(resolved, within.grid, within.purpose).warnings
+        if within is not None:
+            warnings = list(compile_resolved(resolved, within.grid, within.purpose).warnings)
     except SpecError as error:
-        return [*warnings, *error.diagnostics]
+        yield from (*warnings, *error.diagnostics)
+        return
+    yield from warnings
+    plans = within is not None and within.purpose == "train"
+    for code, rule in TYPED_RULES.items():
+        if selection.wants(code) and (rule.plans or not plans):
+            yield from rule.check(resolved)
 
 
 def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
 from stlc.grammar.allow import misunderstood
 from stlc.grammar.ambiguity import Ambiguity, AmbiguityKind, ambiguities
-from stlc.grammar.scan import Lexeme, lexemes
+from stlc.grammar.scan import Lexeme, comments, lexemes
 from stlc.grammar.traverse import descendants
 from stlc.grammar.words import BINARY_TEMPORAL, UNARY_TEMPORAL
 from stlc.source import Span
@@ -153,6 +154,19 @@ def nothing_required(spec: ast.Spec) -> Iterator[Diagnostic]:
         yield Diagnostic("W504", message, spec.source.span(0, 0), help=(advice,))
 
 
+_REQUIREMENT = re.compile(r"(?:#+|//+)\s*(?:@\w+(?:\([^)]*\))?\s*)*require\s+(?P<name>\w+)\s*:(?!\s*$)")
+
+
+def requirements_in_comments(spec: ast.Spec) -> Iterator[Diagnostic]:
+    """Yield W315 for comments that read as a requirement, unless there is a requirement of this name."""
+    names = {item.name for item in spec.items}
+    for comment in comments(spec.source):
+        found = _REQUIREMENT.match(comment.text)
+        if found is not None and found["name"] not in names:
+            message = f"`{found['name']}` is in a comment, so nothing requires it"
+            yield Diagnostic("W315", message, comment, help=("remove the `#`, or the comment",))
+
+
 def unread_comments(spec: ast.Spec) -> Iterator[Diagnostic]:
     """Yield W319 for comments such as `# stlc: alow W311`, and for codes in them that are no warnings."""
     return misunderstood(spec.source)
@@ -180,6 +194,7 @@ RULES: Mapping[str, LintRule] = MappingProxyType(
         "W106": LintRule(foreign_spellings),
         "W301": LintRule(missing_parentheses),
         "W302": LintRule(unclear_implications, usual=False),
+        "W315": LintRule(requirements_in_comments),
         "W319": LintRule(unread_comments),
         "W504": LintRule(nothing_required),
     }

@@ -28,7 +28,7 @@ def typed(tmp_path):
 
 
 def test_no_findings(typed):
-    document, _ = typed("require r: m.near(x) and std.response(go, x > m.top, 2 s)│")
+    document, _ = typed("require r: always (m.near(x) and std.response(go, x > m.top, 2 s))│")
     assert [one.diagnostic.code for one in document.findings] == []
 
 

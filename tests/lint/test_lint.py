@@ -13,7 +13,7 @@ from stlc.dynamics.declaration.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse
-from stlc.lint.lint import Selection, Surroundings, fix, lint
+from stlc.lint.lint import Selection, Surroundings, edited, fix, lint
 from stlc.lint.rules import RULES
 from stlc.source import Source
 
@@ -44,7 +44,7 @@ def test_the_flagship_has_nothing_to_say():
         ("require r: G[0 s, 1 s] (x < 1 m && !(y > 1 m))", ["W106"] * 3),
         ("require r: alw_[0 s, 1 s] x < 1 m", ["W106"]),
         ("require r: always[0 s, 1 s] `G` < 1 m\nsignal `G` [m]", []),
-        ("require r: always[0 s, 1 s] x < 1 m and y < 1 m", ["W301"]),
+        ("require r: always[0 s, 1 s] x < 1 m and eventually y < 1 m", ["W301"]),
         ("", ["W504"]),
     ],
 )
@@ -65,7 +65,7 @@ def test_findings_come_in_the_order_of_the_text():
 
 # ---------------------------------------------------------------------- selection
 
-UNCLEAR = SIGNAL + "const a = 1\nrequire r: G[0, 1] x < 1 m and y < 1 m -> x > 0 m"
+UNCLEAR = SIGNAL + "const a = 1\nrequire r: G[0, 1] x < 1 m and y < 1 m -> F x > 0 m"
 
 
 @pytest.mark.parametrize(
@@ -108,10 +108,10 @@ def repaired(text: str) -> tuple[str, list[str], int]:
     ("text", "after"),
     [
         ("require r: G[0 s, 1 s](x<1 m&&y<1 m)", "require r: always[0 s, 1 s](x<1 m and y<1 m)"),
-        ("require r: !x<1 m", "require r: not x<1 m"),
+        ("require r: G !x<1 m", "require r: always not x<1 m"),
         (
-            "require r: always[0 s, 1 s] x < 1 m and y < 1 m",
-            "require r: (always[0 s, 1 s] x < 1 m) and y < 1 m",
+            "require r: always[0 s, 1 s] x < 1 m and eventually y < 1 m",
+            "require r: (always[0 s, 1 s] x < 1 m) and eventually y < 1 m",
         ),
         ("require r: always[2 s, 1 s] x < 1 m", "require r: always[1 s, 2 s] x < 1 m"),
         ("require r: □[0 s, 1 s] x ≤ 1 m", "require r: always[0 s, 1 s] x <= 1 m"),
@@ -123,12 +123,12 @@ def test_a_repair(text, after):
 
 
 def test_a_repair_does_not_change_the_meaning():
-    text = SIGNAL + "require r: F[0 s, 1 s] x < 1 m && G[0 s, 1 s] y < 1 m || x => y > 0 m"
+    text = SIGNAL + "require r: F[0 s, 1 s] x < 1 m && G[0 s, 1 s] y < 1 m || x => F y > 0 m"
     text = text.replace("|| x =>", "|| x > 2 m =>")
     after, left, count = repaired(text)
     assert parse(Source("text", after)) == parse(Source("text", text))
     assert left == []
-    assert count == 7
+    assert count == 8
     assert format_text(Source("text", after)) == format_text(Source("text", text))
 
 
@@ -143,3 +143,15 @@ def test_a_grid_brings_what_only_it_knows():
     text = "state signal x [m]\nrequire r: always[0 s, 0.25 s] x < 1 m"
     assert codes(text) == []
     assert codes(text, within=within) == ["W304"]
+
+
+def test_a_repair_that_changes_the_requirement_is_left_to_the_reader():
+    text = SIGNAL + "require r: x<1 m&&y<1 m"
+    after = SIGNAL + "require r: x<1 m and y<1 m"
+    assert repaired(text) == (after, ["W311"], 1)
+    (finding,) = lint(Source("text", after))
+    assert finding.fix is not None
+    assert parse(Source("text", edited(after, finding.fix.edits))) == parse(
+        Source("text", SIGNAL + "require r: always (x < 1 m and y < 1 m)")
+    )
+    assert not lint(Source("text", edited(after, finding.fix.edits)))

@@ -1,15 +1,15 @@
-"""Warnings about requirements: contradictions, vacuous requirements, and jumps of the modulo operator."""
+"""Warnings about requirements: contradictions, tautologies, vacuity, and jumps of the modulo operator."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 
 from stlc.compile.analysis.ranges import KnownRanges, bounds
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.normal_form import normal
+from stlc.compile.ir.normal_form import Sign, normal
 from stlc.compile.ir.traverse import leaves, nodes, numbers, subexpressions
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
@@ -19,31 +19,54 @@ from stlc.source import Span
 _TOLERANCE = 1e-6
 
 
-def contradictions(formula: typed.Formula) -> Iterator[Diagnostic]:
-    """Yield the warning W505 for each conjunction in a formula that no values of its signals satisfy."""
+def contradictions(formula: typed.Formula, signature: Signature) -> Iterator[Diagnostic]:
+    """Yield W505 for conjunctions that no values of their signals satisfy, W312 for formulas that all do.
+
+    W312 concerns disjunctions and implications. Of nested formulas, the innermost is reported. `signature`
+    tells which signals have whole values.
+    """
+    whole = {column.name for column in signature.columns if column.kind != "real"}
     reported: set[Span] = set()
-    for node in nodes(formula):
+    for node in reversed(list(nodes(formula))):
         if isinstance(node, typed.Logic) and node.op == "if":
             node = typed.Logic(node.items[1].span, "and", node.items[:2])
-        if isinstance(node, typed.Logic) and node.op == "and" and node.span not in reported:
-            found = _contradiction(node)
-            if found is not None:
-                reported |= {inner.span for inner in nodes(node)}
-                yield found
+        if not isinstance(node, typed.Logic) or node.op not in _DECIDED_BY or node.span in reported:
+            continue
+        found = None if any(part.span in reported for part in nodes(node)) else _decided(node, whole)
+        if found is not None:
+            reported.add(node.span)
+            yield found
 
 
 @dataclass(slots=True)
 class _Room:
     """Range that the predicates of a conjunction leave for one linear combination of signals.
 
-    `low` is the greatest lower bound and `high` the least upper bound. `low_at` and `high_at` are the
-    predicates that set these bounds.
+    `low` is the greatest lower bound and `high` the least upper bound; `low_at` and `high_at` set them.
+    If `whole`, all signals have whole values; the compiler puts bounds halfway between these.
     """
 
+    whole: bool
     low: float = -math.inf
     high: float = math.inf
-    low_at: typed.Predicate | None = None
-    high_at: typed.Predicate | None = None
+    low_at: _Demand | None = None
+    high_at: _Demand | None = None
+
+    def bound(self, factor: float, bound: float, demand: _Demand) -> None:
+        """Add a bound that a predicate sets: from below if `factor` is positive, else from above."""
+        if factor > 0 and (bound > self.low or (bound == self.low and demand.strict)):
+            self.low, self.low_at = bound, demand
+        if factor < 0 and (bound < self.high or (bound == self.high and demand.strict)):
+            self.high, self.high_at = bound, demand
+
+    @property
+    def empty(self) -> bool:
+        """True if no value is left, with a margin for rounding."""
+        if self.low_at is None or self.high_at is None:
+            return False
+        if self.low == self.high:
+            return self.whole or self.low_at.strict or self.high_at.strict
+        return self.low > self.high + _TOLERANCE * max(1.0, abs(self.low), abs(self.high))
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,45 +83,76 @@ class _Linear:
         return _Linear({p: f for p, f in parts.items() if f}, self.constant + factor * other.constant)
 
 
-def _contradiction(node: typed.Logic) -> Diagnostic | None:
+_DECIDED_BY: Mapping[str, Sign] = {"and": 1, "or": -1, "->": -1}
+"""Connective -> 1 if a contradiction in it makes it false, -1 if one in its negation makes it true."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Demand:
+    """Demand of the predicate at `span`: that `linear` is positive (`strict`), or at least 0."""
+
+    linear: _Linear
+    strict: bool
+    span: Span
+
+
+def _decided(node: typed.Logic, whole: Set[str]) -> Diagnostic | None:
+    sign = _DECIDED_BY[node.op]
     rooms: dict[frozenset[tuple[ir.Num, float]], _Room] = {}
-    for pred in _conjuncts(node):
-        linear = _linear(pred.num)
+    for demand in _conjuncts(normal(node, sign)):
+        linear = demand.linear
         if not linear.parts or not math.isfinite(linear.constant):
             continue
         scale = next(iter(sorted(linear.parts.items(), key=lambda item: repr(item[0]))))[1]
         key = frozenset((part, factor / scale) for part, factor in linear.parts.items())
-        room, bound = rooms.setdefault(key, _Room()), -linear.constant / scale
-        if scale > 0 and bound > room.low:
-            room.low, room.low_at = bound, pred
-        if scale < 0 and bound < room.high:
-            room.high, room.high_at = bound, pred
+        counted = all(isinstance(part, ir.Signal) and part.name in whole for part in linear.parts)
+        room = rooms.setdefault(key, _Room(counted))
+        room.bound(scale, -linear.constant / scale, demand)
     for room in rooms.values():
-        least = _TOLERANCE * max(1.0, abs(room.low), abs(room.high)) if math.isfinite(room.low) else 0.0
-        if room.low_at is not None and room.high_at is not None and room.low > room.high + least:
-            return Diagnostic(
-                "W505",
-                "this can never be true: its parts leave no room",
-                node.span,
-                labels=(
-                    Label(room.low_at.span, "bounds it from one side"),
-                    Label(room.high_at.span, "and this from the other"),
-                ),
-                help=("`or`, or the other comparison?",),
-            )
+        if room.low_at is None or room.high_at is None or not room.empty:
+            continue
+        low, high = sorted((room.low_at.span, room.high_at.span), key=lambda span: span.start)
+        if sign > 0:
+            message, advice = "this can never be true: its parts leave no room", "`or`"
+            labels = (Label(low, "bounds it from one side"), Label(high, "and this from the other"))
+        else:
+            message, advice = "this is always true: its parts leave no value out", "`and`"
+            labels = (Label(low, "holds wherever the other part does not"), Label(high, "and this likewise"))
+        labels = labels if low != high else ()
+        code = "W505" if sign > 0 else "W312"
+        return Diagnostic(
+            code, message, node.span, labels=labels, help=(f"{advice}, or the other comparison?",)
+        )
     return None
 
 
-def _conjuncts(formula: typed.Formula) -> Iterator[typed.Predicate]:
-    """Yield the predicates of a conjunction, all of which must hold at the same instant."""
+def _conjuncts(formula: typed.Formula) -> Iterator[_Demand]:
+    """Yield what the predicates of a conjunction in negation normal form require at one instant.
+
+    A predicate on `c - abs(x)` requires two linear forms.
+    """
     match formula:
-        case typed.Predicate():
-            yield formula
+        case typed.Predicate(span, num, strict):
+            yield from (_Demand(part, strict, span) for part in _at_least(_linear(num)))
+        case typed.Not(_, typed.Predicate(span, num, strict)):
+            opposite = _Linear().plus(_linear(num), -1.0)
+            yield from (_Demand(part, not strict, span) for part in _at_least(opposite))
         case typed.Logic(_, "and", items):
             for item in items:
                 yield from _conjuncts(item)
         case _:
             return
+
+
+def _at_least(linear: _Linear) -> Iterator[_Linear]:
+    """Yield linear forms that are at least 0 if and only if `linear` is: two if a term is -abs(…)."""
+    for part, factor in linear.parts.items():
+        if isinstance(part, ir.Op) and part.name == "abs" and factor < 0:
+            rest, inner = linear.plus(_Linear({part: 1.0}), -factor), _linear(part.args[0])
+            yield rest.plus(inner, factor)
+            yield rest.plus(inner, -factor)
+            return
+    yield linear
 
 
 def _linear(num: ir.Num) -> _Linear:

@@ -543,7 +543,7 @@ def _check_divisor(function: Function, divisor: Number, span: Span, scope: Scope
         labels = () if origin is None or origin.span is None else (Label(origin.span, "from here"),)
         amount = "0" if divisor.unit.dimensionless else f"0 {divisor.unit}"
         scope.fail(Diagnostic("E401", f"{what} by zero", place, f"is {amount}", labels))
-    reach = bounds(divisor.num, scope.facts)
+    reach = bounds(divisor.num, scope.ranges)
     if divisor.constant is None and reach is not None and reach[0] <= 0 <= reach[1]:
         low, high = (f"{end / divisor.unit.scale:g}" for end in reach)
         unit = "" if divisor.unit.dimensionless and not divisor.unit.text else f" {divisor.unit}"

@@ -124,15 +124,12 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
     scope.report(Diagnostic("E104", message, place, labels=(Label(span, "and here"),)))
 
 
-def with_facts(file: File, facts: Mapping[str, Bounds]) -> File:
-    """Return a copy of `file` with `facts` in its scope, and in the scopes of all files that it imports.
-
-    `facts` are the ranges that signals never leave.
-    """
-    files = tuple(with_facts(part, facts) for part in file.files)
+def with_ranges(file: File, ranges: Mapping[str, Bounds]) -> File:
+    """Return a copy of `file` with ranges of signals in its scope, and in the scopes of all its imports."""
+    files = tuple(with_ranges(part, ranges) for part in file.files)
     after = dict(zip((id(part.scope) for part in file.files), (part.scope for part in files), strict=True))
     modules = {alias: after[id(scope)] for alias, scope in file.scope.modules.items()}
-    return replace(file, files=files, scope=replace(file.scope, facts=facts, modules=modules))
+    return replace(file, files=files, scope=replace(file.scope, ranges=ranges, modules=modules))
 
 
 Item = TypeVar("Item")
@@ -166,17 +163,17 @@ def resolve(
     file = declared(spec, load_modules(spec), interface, values, scope)
     _adopt_units(spec, values, file.found, file.scope)
     signature, parameters = signature_of(file, interface)
-    file = with_facts(file, enforced(signature.columns))
+    facts, ranges = enforced(signature.columns), nominal(signature.columns)
+    file = with_ranges(file, facts if interface is None else ranges)
     scope = file.scope
     constants = _constants(spec, interface, scope)
     _check_definitions(file)
-    ranges = nominal(signature.columns)
     requirements = _requirements(spec, ast.Require, scope, ranges)
     assumptions = _requirements(spec, ast.Assume, scope, ranges)
     warnings: list[Diagnostic] = [] if sink is None else sink
     _finish(findings, spec, warnings)
     for requirement, item in zip(requirements, _items(spec, ast.Require), strict=True):
-        warnings.extend(_warnings(requirement, item, signature, scope))
+        warnings.extend(_warnings(requirement, item, signature, facts))
     offered = () if interface is None else interface.signature.names
     return typed.Spec(
         name=spec.name or PurePath(spec.source.name).stem,
@@ -377,13 +374,15 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
 
 
 def _warnings(
-    requirement: typed.Requirement, item: ast.Require, signature: Signature, scope: Scope
+    requirement: typed.Requirement, item: ast.Require, signature: Signature, facts: KnownRanges
 ) -> list[Diagnostic]:
     """Return the warnings about a requirement.
 
-    W502: no finite prefix violates a `@safety` requirement. W503: it always holds. W505: it never holds.
+    W502: no finite prefix violates a `@safety` requirement. W503, W312: it always holds, or a part of it.
+    W505: a part of it never holds.
     """
     tag = next((tag for tag in item.tags if tag.name == "safety"), None)
-    found = [*vacuous(requirement.formula, signature, scope.facts), *contradictions(requirement.formula)]
+    formula = requirement.formula
+    found = [*vacuous(formula, signature, facts), *contradictions(formula, signature)]
     weak = safety_never_violated(requirement, tag)
     return found if weak is None else [*found, weak]

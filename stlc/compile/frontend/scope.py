@@ -201,7 +201,7 @@ class Scope:
         earlier: whether `prev(…)` is allowed in numbers of one instant; it reads signals whose names end in
             `ir.BEFORE`.
         time_unit: unit of numbers without a unit in intervals; "" if the file does not declare one.
-        facts: ranges that signals never leave, each in the unit in which the signal is stored.
+        ranges: ranges in which divisors must not contain 0, each in the unit in which the signal is stored.
         system_hints: advice for names that only the system declares, by name.
         modules: scopes of imported files, by alias.
         product: whether `x in [lo, hi]` has the robustness `(x - lo) (hi - x)` (`@product`).
@@ -218,7 +218,7 @@ class Scope:
     temporal: bool = False
     earlier: bool = False
     time_unit: str = ""
-    facts: Mapping[str, Bounds] = field(default_factory=dict)
+    ranges: Mapping[str, Bounds] = field(default_factory=dict)
     system_hints: Mapping[str, str] = field(default_factory=dict)
     modules: Mapping[str, Scope] = field(default_factory=dict, compare=False)
     product: bool = False

@@ -105,7 +105,7 @@ class Names:
 
     def expressions(self, reader: Reader) -> Expressions:
         """Return a compiler of expressions that knows all names declared up to now."""
-        scope = Scope(dict(self.entries), error=SystemFileError, facts=enforced(self.columns))
+        scope = Scope(dict(self.entries), error=SystemFileError, ranges=enforced(self.columns))
         return Expressions(reader, scope)
 
     def group(self, name: str) -> tuple[Column, ...]:
