@@ -103,7 +103,10 @@ class Document:
     def findings(self) -> tuple[Finding, ...]:
         """Findings of `stlc lint`, and errors of the system file, in text order."""
         found = [self._about_system(self.missing)] if self.missing else []
-        within = None if self.system is None else Surroundings(self.system.interface(), self.grid)
+        within = None
+        if self.system is not None:
+            judge = self.system.judges_by(Path(self.source.name))
+            within = Surroundings(self.system.interface(), self.grid, "check" if judge else "train")
         linted = self.unread or lint(self.source, within=within)
         errors = {one.code for one in linted if one.severity == "error"}
         mild = bool(errors) and errors <= _ONLY_FOR_TRAINING

@@ -15,7 +15,7 @@ from stlc.cli.framework.documents import LintedFiles
 from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, SystemOption, spec_files
 from stlc.cli.framework.output import Answer, emit, emit_json, say, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import CODES, Diagnostic, SpecError, usage
+from stlc.diagnostics import CODES, Diagnostic, SpecError, SystemFileError, UsageError, usage
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
 from stlc.source import Span
 from stlc.version import __version__
@@ -50,8 +50,9 @@ def lint(
 ) -> Answer[LintedFiles]:
     """Report errors and warnings in specifications.
 
-    Checks syntax, types, units, parentheses, unused names and vacuous requirements; with --system it also
-    checks that the specification fits the system. Exit code: 0 no errors, 1 warnings and --strict, 3 errors.
+    Checks syntax, types, units, parentheses, unused names, and requirements that require little. With a
+    system, that of --system or else the one that the file names, it also checks that the specification fits
+    it. Exit code: 0 no errors, 1 warnings and --strict, 3 errors.
     `stlc explain CODE` says what a code means.
     """
     from stlc.files import find_spec, read_source, write_atomic
@@ -74,7 +75,14 @@ def lint(
             except SpecError as error:
                 findings += error.diagnostics
                 continue
-            look = partial(lint_text, within=_surroundings(system, source), selection=selection)
+            try:
+                within = _surroundings(system, source)
+            except (SystemFileError, UsageError) as error:
+                if system is not None:
+                    raise
+                findings += error.diagnostics
+                within = None
+            look = partial(lint_text, within=within, selection=selection)
             if not fix:
                 findings += look(source)
                 continue
@@ -101,10 +109,17 @@ def _codes(text: str | None) -> tuple[str, ...]:
 
 
 def _surroundings(system: str | None, source: Source) -> Surroundings | None:
-    """Load the system file `system`, with which the specification `source` is checked.
+    """Load the system `system`, or else the one that `source` names, to check the specification with it.
 
-    Return None if `system` is None.
+    Return None if there is none, or if the specification cannot be read.
     """
+    from stlc.grammar.parse.parser import parse
+
+    if system is None:
+        try:
+            system = parse(source).system
+        except SpecError:
+            return None
     if system is None:
         return None
     from stlc.compile.ir.discretize import Grid
@@ -147,7 +162,7 @@ def _summary(result: LintedFiles, findings: Sequence[Diagnostic]) -> str:
     if not findings:
         return f"{fixed}{files}, nothing to say"
     found = ", ".join(_several(count[kind], kind) for kind in ("error", "warning") if count[kind])
-    repairable = sum(finding.fix is not None for finding in findings)
+    repairable = sum(finding.fix is not None and finding.fix.same for finding in findings)
     more = f"; {repairable} can be repaired: stlc lint --fix" if repairable else ""
     return f"{fixed}{found} in {files}{more}"
 
