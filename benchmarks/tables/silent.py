@@ -152,8 +152,8 @@ def _section(
     peer, of = sum(row.rtamt or 0 for row in with_peer), sum(row.cases for row in with_peer)
     both = sum(row.silent for row in with_peer)
     yield (
-        f"**{silent_:,} of {cases:,} mistakes ({silent_ / cases:.0%}) pass stlc in silence.** Of the {of:,} that "
-        f"can be made with RTAMT, {both:,} ({both / of:.0%}) pass stlc and {peer:,} ({peer / of:.0%}) RTAMT."
+        f"**{silent_:,} of {cases:,} mistakes ({silent_ / cases:.0%}) pass stlc in silence.** RTAMT can be given "
+        f"{of:,} of them: {both:,} ({both / of:.0%}) pass stlc, {peer:,} ({peer / of:.0%}) pass RTAMT."
     )
     yield ""
     yield from found.markdown()

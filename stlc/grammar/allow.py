@@ -33,7 +33,7 @@ class Allowance:
         place, where = finding.span, self.where
         return (
             finding.code == self.code
-            and finding.severity == "warning"
+            and finding.severity != "error"
             and place is not None
             and place.source == where.source
             and where.start <= place.start <= where.end

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
+from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Purpose, compile_resolved
 from stlc.diagnostics import CODES, Diagnostic, Fix, SpecError, UsageError
@@ -145,39 +146,48 @@ def lint(
 
     Args:
         source: the text.
-        within: system and purpose; with None, checks that need a system are skipped.
+        within: system and purpose; with None, only names, types and units are checked, without a time grid.
         selection: choice of the warnings to report.
     """
     try:
         spec = parse(source)
     except SpecError as error:
         return error.diagnostics
-    found = list(_compiled(spec, within, selection))
-    for code, rule in RULES.items():
-        if selection.wants(code):
-            found += rule.check(spec)
-    kept = not_allowed(finding for finding in found if selection.wants(finding.code))
-    return tuple(sorted(kept, key=lambda finding: _place(finding, source)))
-
-
-def _compiled(spec: ast.Spec, within: Surroundings | None, selection: Selection) -> Iterator[Diagnostic]:
-    """Yield the findings of the compiler in a specification, and those of the rules on its meaning.
-
-    Without a system (`within` is None), only names, types and units are checked.
-    """
+    plans = within is not None and within.purpose == "train"
     warnings: list[Diagnostic] = []
+    resolved: typed.Spec | None = None
     try:
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)
         if within is not None:
             warnings = list(compile_resolved(resolved, within.grid, within.purpose).warnings)
     except SpecError as error:
-        yield from (*warnings, *error.diagnostics)
-        return
-    yield from warnings
-    plans = within is not None and within.purpose == "train"
-    for code, rule in TYPED_RULES.items():
-        if selection.wants(code) and (rule.plans or not plans):
-            yield from rule.check(resolved)
+        warnings += error.diagnostics
+    found = not_allowed(finding for finding in warnings if selection.wants(finding.code))
+    found += rule_findings(spec, selection, resolved=resolved, plans=plans)
+    return tuple(sorted(found, key=lambda finding: _place(finding, source)))
+
+
+def rule_findings(
+    spec: ast.Spec,
+    selection: Selection = EVERYTHING_USUAL,
+    *,
+    resolved: typed.Spec | None = None,
+    plans: bool = False,
+) -> list[Diagnostic]:
+    """Return the findings of the lint rules in a specification that its comments do not allow.
+
+    Args:
+        spec: the specification.
+        selection: choice of the warnings to report.
+        resolved: the resolved specification; with None, rules on its meaning are skipped.
+        plans: whether the specification is one of plans, and not of recordings.
+    """
+    found = [each for code, rule in RULES.items() if selection.wants(code) for each in rule.check(spec)]
+    if resolved is not None:
+        for code, typed_rule in TYPED_RULES.items():
+            if selection.wants(code) and (typed_rule.plans or not plans):
+                found += typed_rule.check(resolved)
+    return not_allowed(found)
 
 
 def _place(finding: Diagnostic, source: Source) -> tuple[bool, int]:
