@@ -98,7 +98,7 @@ def _lines(record: dict[str, Any], files: Files) -> Iterator[str]:
 
 def _of_fact(record: dict[str, Any], requirement: str) -> Remark:
     near = f"{requirement} {record.get('signal', '')}"
-    return Remark(record["code"], record["text"], record["severity"], frozenset(_WORD.findall(near)))
+    return Remark(record["code"], record["text"], "fact", frozenset(_WORD.findall(near)))
 
 
 def noticed(wrong: Answer, right: Answer, place: frozenset[str]) -> bool:

@@ -152,8 +152,9 @@ def _section(
     peer, of = sum(row.rtamt or 0 for row in with_peer), sum(row.cases for row in with_peer)
     both = sum(row.silent for row in with_peer)
     yield (
-        f"**{silent_:,} of {cases:,} mistakes ({silent_ / cases:.0%}) pass stlc in silence.** RTAMT can be given "
-        f"{of:,} of them: {both:,} ({both / of:.0%}) pass stlc, {peer:,} ({peer / of:.0%}) pass RTAMT."
+        f"**{silent_:,} of {cases:,} mistakes ({silent_ / cases:.0%}) pass stlc in silence.** "
+        f"RTAMT can be given {of:,} of them: {both:,} ({both / of:.0%}) pass stlc, "
+        f"{peer:,} ({peer / of:.0%}) pass RTAMT."
     )
     yield ""
     yield from found.markdown()
