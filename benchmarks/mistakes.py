@@ -207,10 +207,10 @@ def two_clocks(rng: Rng, situation: Situation) -> Mistaken | None:
     rate = (10.0, 0.1, 100.0)[rng.integers(3)]
     samples = situation.plant.samples
     false = [f"{k * situation.plant.dt * rate:.6g}" for k in range(samples)]
-    file = table(
-        {"time": false, "time_received": clock(situation, samples), **cells(situation, situation.bad)}
-    )
-    return _recorded_wrong(situation, file, situation.bad, "time", "clock", dt=situation.plant.dt * rate)
+    name = ("time_received", "t_host", "stamp", "elapsed", "rx_time", "time_s")[rng.integers(6)]
+    columns = {"time": false, name: clock(situation, samples), **cells(situation, situation.bad)}
+    dt = situation.plant.dt * rate
+    return _recorded_wrong(situation, table(columns), situation.bad, "time", name, "clock", dt=dt)
 
 
 def starts_late(rng: Rng, situation: Situation) -> Mistaken | None:
@@ -373,7 +373,7 @@ def few_samples(rng: Rng, situation: Situation) -> Mistaken | None:
             **cells(situation, data),
         }
     )
-    return _recorded_wrong(situation, file, data, "sample", "step", dt=situation.plant.dt * every)
+    return _recorded_wrong(situation, file, data, "sample", "samples", "step", dt=situation.plant.dt * every)
 
 
 def never_updated(_: Rng, situation: Situation) -> Mistaken | None:
