@@ -112,7 +112,7 @@ def noticed(wrong: Answer, right: Answer, place: frozenset[str]) -> bool:
 
 def rtamt_notices(read: Read) -> bool:
     """True if RTAMT refuses what a literal reading sees, or does not find it satisfied."""
-    rtamt = _rtamt()
+    rtamt = import_rtamt()
     spec = rtamt.StlDiscreteTimeSpecification()
     names = sorted(signals_of(read.formula))
     for name in names:
@@ -130,12 +130,20 @@ def rtamt_notices(read: Read) -> bool:
     return not first >= 0
 
 
-def _rtamt() -> Any:
-    """Import RTAMT, whose parser needs `typing.io`, which Python 3.12 no longer has."""
-    if "typing.io" not in sys.modules:
-        stand_in = types.ModuleType("typing.io")
-        stand_in.TextIO = typing.TextIO  # type: ignore[attr-defined]
-        sys.modules["typing.io"] = stand_in
-    import rtamt
+def import_rtamt() -> Any:
+    """Import RTAMT.
 
+    Its parser imports `typing.io`, which Python 3.11 deprecates and 3.12 no longer has.
+    """
+    before = sys.modules.get("typing.io")
+    stand_in = types.ModuleType("typing.io")
+    stand_in.TextIO = typing.TextIO  # type: ignore[attr-defined]
+    sys.modules["typing.io"] = stand_in
+    try:
+        import rtamt
+    finally:
+        if before is None:
+            del sys.modules["typing.io"]
+        else:
+            sys.modules["typing.io"] = before
     return rtamt

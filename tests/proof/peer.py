@@ -12,9 +12,6 @@ some operators is not what stlc means; the mapping says so line by line:
 from __future__ import annotations
 
 import re
-import sys
-import types
-import typing
 from collections.abc import Mapping
 from itertools import count
 from typing import Any
@@ -22,24 +19,9 @@ from typing import Any
 from proof.language import Atom, Edge, Formula, Many, Meet, Not, Over, Pair, Step, Window
 from proof.levels import inside
 
+from benchmarks.answers import import_rtamt
 
-def _import_rtamt() -> Any:
-    """Its parser imports `typing.io`, which Python 3.11 deprecates and 3.12 no longer has."""
-    before = sys.modules.get("typing.io")
-    stand_in = types.ModuleType("typing.io")
-    stand_in.TextIO = typing.TextIO
-    sys.modules["typing.io"] = stand_in
-    try:
-        import rtamt
-    finally:
-        if before is None:
-            del sys.modules["typing.io"]
-        else:
-            sys.modules["typing.io"] = before
-    return rtamt
-
-
-RTAMT = _import_rtamt()
+RTAMT = import_rtamt()
 
 _NEGATIVE = re.compile(r"[(]-")
 
