@@ -36,7 +36,9 @@ CLEAN, FOUND, INVALID = 0, 1, 3
 )
 def lint(
     files: SpecsArgument = None,
-    fix: Annotated[bool, typer.Option("--fix", help="Repair what can be repaired, in place.")] = False,
+    fix: Annotated[
+        bool, typer.Option("--fix", help="Repair in place, without changing what is required.")
+    ] = False,
     select: Annotated[
         str | None,
         typer.Option(metavar="CODES", help="Warnings to look for, such as W1,W304; ALL for every one."),
