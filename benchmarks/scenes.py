@@ -150,12 +150,12 @@ def motion(rng: np.random.Generator, channel: Channel, samples: int) -> Floats:
         rng.uniform(0.4, 1.0) * np.sin(2 * np.pi * (rng.uniform(0.5, 2.0 + 4 * k) * t + rng.uniform()))
         for k in range(4)
     )
-    values = np.asarray(waves + 0.02 * rng.standard_normal(samples))
+    values: Floats = np.asarray(waves + 0.02 * rng.standard_normal(samples), dtype=np.float64)
     values = (values - values.min()) / (values.max() - values.min())
     if channel.flag:
-        return (values > rng.uniform(0.45, 0.7)).astype(float)
+        return np.where(values > rng.uniform(0.45, 0.7), 1.0, 0.0)
     low, high = sorted(rng.uniform((0.1, 0.55), (0.3, 0.7)))
-    return channel.low + (channel.high - channel.low) * (low + (high - low) * values)
+    return np.asarray(channel.low + (channel.high - channel.low) * (low + (high - low) * values))
 
 
 def amount(value: float, unit: str, digits: int = 3) -> str:
@@ -191,7 +191,7 @@ def _situation(rng: np.random.Generator, plant: Plant, shape: Shape) -> Situatio
     condition: Formula
     if other.flag:
         condition = Flag(other.name)
-        bad[other.name] = np.where(np.arange(plant.samples) // 1 >= first - 2, 1.0, good[other.name])
+        bad[other.name] = np.where(np.arange(plant.samples) >= first - 2, 1.0, good[other.name])
         bad[other.name][last + 2 :] = good[other.name][last + 2 :]
     else:
         level = np.quantile(good[other.name], rng.uniform(0.4, 0.7))

@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.editor.document import read
+from stlc.editor.document import Systems, analyse, read
 from stlc.source import Source
 
 GOOD = "signal x [m]\nconst c = 2 m\nrequire a: x > c\nrequire b: always[0 s, 1 s] x > 0 m\n"
@@ -51,3 +51,19 @@ def test_never_fails(place, junk):
 @given(st.text(alphabet=GOOD + '@"`{}[]()', max_size=60))
 def test_any_text(text):
     read(Source("t.stl", text))
+
+
+def test_a_judge_of_drives_is_linted_as_one(tmp_path):
+    system = (
+        "stlc: 1\nname: cart\ntime: {dt: 0.2 s, horizon: 20 steps}\nstate: {x: {unit: m}}\nflow: {x: 1 m/s}\n"
+        "control: {a: {range: [-1, 1]}}\ninit: {mixture: [{draw: {x: 0}}]}\ntest: {judge: rules.stl}\n"
+    )
+    (tmp_path / "cart.yaml").write_text(system)
+    text = 'system "cart.yaml"\nstate signal x [m]\nrequire r: always x < 9 m\nrequire s: x < 3 m\n'
+    (tmp_path / "rules.stl").write_text(text)
+    found = {}
+    for name in ("rules.stl", "plans.stl"):
+        document = analyse(Source(str(tmp_path / name), text), Systems())
+        found[name] = [one.diagnostic.code for one in document.findings]
+    assert found["rules.stl"] == ["W311"]
+    assert "W311" not in found["plans.stl"]

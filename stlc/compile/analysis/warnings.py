@@ -111,17 +111,19 @@ def _decided(node: typed.Logic, whole: Set[str]) -> Diagnostic | None:
     for room in rooms.values():
         if room.low_at is None or room.high_at is None or not room.empty:
             continue
-        low, high = sorted((room.low_at.span, room.high_at.span), key=lambda span: span.start)
+        places = sorted({room.low_at.span, room.high_at.span}, key=lambda span: span.start)
         if sign > 0:
-            message, advice = "this can never be true: its parts leave no room", "`or`"
-            labels = (Label(low, "bounds it from one side"), Label(high, "and this from the other"))
+            code, message, advice = "W505", "this can never be true: its parts leave no room", "`or`"
+            texts = ("bounds it from one side", "and this from the other")
         else:
-            message, advice = "this is always true: its parts leave no value out", "`and`"
-            labels = (Label(low, "holds wherever the other part does not"), Label(high, "and this likewise"))
-        labels = labels if low != high else ()
-        code = "W505" if sign > 0 else "W312"
+            code, message, advice = "W312", "this is always true: its parts leave no value out", "`and`"
+            texts = ("holds wherever the other part does not", "and this likewise")
         return Diagnostic(
-            code, message, node.span, labels=labels, help=(f"{advice}, or the other comparison?",)
+            code,
+            message,
+            node.span,
+            labels=tuple(map(Label, places, texts)) if len(places) > 1 else (),
+            help=(f"{advice}, or the other comparison?",),
         )
     return None
 
