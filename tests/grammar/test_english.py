@@ -72,3 +72,22 @@ def test_definitions_that_many_requirements_share_are_not_told_with_each():
     assert told[0] == told[1]
     assert not told[-1]
     assert sum(len(text) for each in told for _, text in each) < 2 * REPEATED
+
+
+@pytest.mark.parametrize(
+    ("formula", "english"),
+    [
+        ("x > 2", "At the first sample: x > 2."),
+        ("historically x < 3", "At the first sample: at all times so far: x < 3."),
+        ("calm", "At the first sample: calm holds."),
+        ("soon", "soon holds."),
+        ("always x > 2", "At all times from now on: x > 2."),
+        ("x > 2 -> eventually[0 s, 1 s] x > 3", "If x > 2, then at some time in the next 1 s: x > 3."),
+        ("std.settles(x, 1, 2, 1 s)", "std.settles(x, 1, 2, 1 s)."),
+        ("round", "At the first sample: round holds."),
+    ],
+)
+def test_what_is_read_once(formula, english):
+    head = "import std\nsignal x\ndef calm = x < 3\ndef soon = eventually calm\ndef round = round\n"
+    spec = parse(Source("t", f"{head}require r: {formula}"))
+    assert Meanings(spec).sentence(spec.items[-1]) == english

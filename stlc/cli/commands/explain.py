@@ -107,7 +107,7 @@ def _spec(name: str, wanted: list[str]) -> Answer[documents.SpecInWords]:
     from stlc.files import find_spec, read_source
     from stlc.grammar import ast
     from stlc.grammar.parse.parser import parse
-    from stlc.grammar.show.english import Meanings, sentence
+    from stlc.grammar.show.english import Meanings
 
     spec = parse(read_source(find_spec(name)))
     items = [item for item in spec.items if isinstance(item, ast.Require | ast.Assume)]
@@ -122,7 +122,7 @@ def _spec(name: str, wanted: list[str]) -> Answer[documents.SpecInWords]:
             "kind": "require" if isinstance(item, ast.Require) else "assume",
             "tags": [tag.name for tag in item.tags],
             "doc": item.doc,
-            "sentence": sentence(item),
+            "sentence": meanings.sentence(item),
             "where": dict(meanings.of(item)),
         }
         for item in items

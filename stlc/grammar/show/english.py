@@ -61,6 +61,26 @@ class Meanings:
             queue.extend(self._uses[name])
         return list(found.items())
 
+    def sentence(self, item: ast.Require | ast.Assume) -> str:
+        """Return a requirement as one English sentence, which says so if it reads the first sample only."""
+        once = self._reads_once(item.formula)
+        return f"At the first sample: {say(item.formula)}." if once else sentence(item)
+
+    def _reads_once(self, expr: ast.Expr) -> bool:
+        """True if an expression has no operator of the future, nor has a definition that it uses."""
+        names: set[str] = set()
+        queue = [expr]
+        while queue:
+            for node in descendants(queue.pop()):
+                if isinstance(node, ast.Attr):
+                    return False
+                if isinstance(node, ast.Temporal | ast.Until) and not OPERATORS[node.op].past:
+                    return False
+                if isinstance(node, ast.Name) and node.name in self._known and node.name not in names:
+                    names.add(node.name)
+                    queue.append(self._known[node.name].value)
+        return True
+
     def _used(self, expr: ast.Expr) -> list[str]:
         names = (node.name for node in descendants(expr) if isinstance(node, ast.Name))
         return list(dict.fromkeys(name for name in names if name in self._known))
