@@ -188,12 +188,32 @@ def _recorded_wrong(
     )
 
 
+_LARGER: Mapping[str, tuple[str, float]] = MappingProxyType(
+    {
+        **{
+            "m": ("km", 1e3),
+            "m/s": ("km/s", 1e3),
+            "s": ("min", 60.0),
+            "km/h": ("m/s", 3.6),
+            "N": ("kN", 1e3),
+        },
+        **{"kPa": ("bar", 100.0), "kW": ("MW", 1e3), "A": ("kA", 1e3), "Nm": ("kNm", 1e3)},
+    }
+)
+"""Unit -> a larger one of the same dimension, and its size in the first."""
+
+
 # ------------------------------------------------------------------------ the recording
 
 
 def clock_in_other_units(rng: Rng, situation: Situation) -> Mistaken | None:
-    """The clock counts milliseconds, microseconds or nanoseconds, and nothing says so."""
-    factor = (1e3, 1e6, 1e9)[rng.integers(3)]
+    """The clock counts milliseconds, microseconds or nanoseconds, and nothing says so.
+
+    In most cases, a window still has a few samples, so that its size alone does not show it.
+    """
+    factor = (1e3, 1e6, 1e9)[rng.integers(3)] if rng.random() < 0.3 else 1e3
+    if factor == 1e3 and situation.plant.dt * factor > 0.4 * situation.seconds:
+        return None
     name = ("time", "t", "stamp", "timestamp")[rng.integers(4)]
     times = [f"{k * situation.plant.dt * factor:.0f}" for k in range(situation.plant.samples)]
     file = table({name: times, **cells(situation, situation.bad)})
@@ -293,7 +313,7 @@ def column_twice(_: Rng, situation: Situation) -> Mistaken | None:
 def runs_strung_together(rng: Rng, situation: Situation) -> Mistaken | None:
     """Two runs stand in one file; what the first owes at its end, the second one does.
 
-    The second run goes on in time, after a pause, or starts from 0 again.
+    The second run goes on in time, at once or after a pause, or starts from 0 again.
     """
     cut = situation.incident[0] + 1
     joined = {
@@ -301,7 +321,7 @@ def runs_strung_together(rng: Rng, situation: Situation) -> Mistaken | None:
     }
     samples = situation.plant.samples
     first = clock(situation, cut)
-    start = (0.0, (cut + 2) * situation.plant.dt, (cut + samples) * situation.plant.dt)[rng.integers(3)]
+    start = (0, cut, cut + 2, cut + samples)[rng.integers(4)] * situation.plant.dt
     rest = [f"{start + k * situation.plant.dt:.6g}" for k in range(samples)]
     file = table({"time": first + rest, **cells(situation, joined)})
     words = ("time", "clock", "step", "gap", situation.main, situation.other)
@@ -330,19 +350,16 @@ def sensor_stuck(rng: Rng, situation: Situation) -> Mistaken | None:
 
 
 def row_of_units(_: Rng, situation: Situation) -> Mistaken | None:
-    """A row of units follows the header, in another unit than the specification declares."""
+    """A row of units follows the header, and names a larger unit than the specification."""
     channel = situation.plant.channel(situation.main)
-    other = {"m": ("cm", 100.0), "m/s": ("km/h", 3.6), "rad": ("deg", 180 / np.pi), "kPa": ("bar", 0.01)}
-    if channel.unit not in other:
+    if channel.unit not in _LARGER:
         return None
-    unit, factor = other[channel.unit]
-    if abs(factor) > 1:
-        factor, unit = 1 / factor, {"cm": "hm", "km/h": "m/s", "deg": "rad"}.get(unit, unit)
-    data = dict(situation.bad) | {situation.main: situation.bad[situation.main] * factor}
-    names = {each.name: each.unit for each in situation.plant.channels}
+    unit, size = _LARGER[channel.unit]
+    data = dict(situation.bad) | {situation.main: situation.bad[situation.main] / size}
     columns = {"time": ["s", *clock(situation, situation.plant.samples)]}
     for name, texts in cells(situation, data).items():
-        columns[name] = [unit if name == situation.main else names[name], *texts]
+        own = unit if name == situation.main else situation.plant.channel(name).unit
+        columns[name] = [own, *texts]
     return _recorded_wrong(situation, table(columns), data, situation.main, "unit", "number", rtamt=False)
 
 
@@ -444,21 +461,6 @@ def wrong_bound(rng: Rng, situation: Situation) -> Mistaken | None:
     factor = (0.1, 0.01, 0.001)[rng.integers(3)] if inner.op == "always" else (10.0, 60.0)[rng.integers(2)]
     window = (inner.window[0], round(inner.window[1] * factor, 9))
     return _written_wrong(situation, _changed(outer, inner, replace(inner, window=window)))
-
-
-_LARGER: Mapping[str, tuple[str, float]] = MappingProxyType(
-    {
-        **{
-            "m": ("km", 1e3),
-            "m/s": ("km/s", 1e3),
-            "s": ("min", 60.0),
-            "km/h": ("m/s", 3.6),
-            "N": ("kN", 1e3),
-        },
-        **{"kPa": ("bar", 100.0), "kW": ("MW", 1e3), "A": ("kA", 1e3), "Nm": ("kNm", 1e3)},
-    }
-)
-"""Unit -> a larger one of the same dimension, and its size in the first."""
 
 
 def wrong_unit(_: Rng, situation: Situation) -> Mistaken | None:

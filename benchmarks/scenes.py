@@ -85,6 +85,10 @@ PLANTS = (
         Channel("mu", "", -1, 1), Channel("ratio", "", 8, 22), Channel("target", "", 8, 22),
         Channel("rich", flag=True), Channel("torque", "Nm", 0, 300),
     )),
+    Plant("drone", 0.005, 3000, (
+        Channel("altitude", "m", 0, 60), Channel("floor", "m", 0, 60), Channel("roll", "rad", -1.2, 1.2),
+        Channel("armed", flag=True), Channel("motor", "", 0, 2000),
+    )),
     Plant("crane", 0.25, 320, (
         Channel("load", "kg", 0, 9000), Channel("rated", "kg", 0, 9000), Channel("swing", "rad", -0.9, 0.9),
         Channel("lifting", flag=True), Channel("wind", "m/s", 0, 25),
