@@ -206,6 +206,10 @@ _LARGER: Mapping[str, tuple[str, float]] = MappingProxyType(
 # ------------------------------------------------------------------------ the recording
 
 
+_CLOCK = ("clock", "time", "step", "steps")
+"""Words of remarks on the clock of a recording."""
+
+
 def clock_in_other_units(rng: Rng, situation: Situation) -> Mistaken | None:
     """The clock counts milliseconds, microseconds or nanoseconds, and nothing says so.
 
@@ -217,9 +221,7 @@ def clock_in_other_units(rng: Rng, situation: Situation) -> Mistaken | None:
     name = ("time", "t", "stamp", "timestamp")[rng.integers(4)]
     times = [f"{k * situation.plant.dt * factor:.0f}" for k in range(situation.plant.samples)]
     file = table({name: times, **cells(situation, situation.bad)})
-    return _recorded_wrong(
-        situation, file, situation.bad, name, "clock", "time", "step", dt=situation.plant.dt * factor
-    )
+    return _recorded_wrong(situation, file, situation.bad, name, *_CLOCK, dt=situation.plant.dt * factor)
 
 
 def two_clocks(rng: Rng, situation: Situation) -> Mistaken | None:
@@ -230,7 +232,7 @@ def two_clocks(rng: Rng, situation: Situation) -> Mistaken | None:
     name = ("time_received", "t_host", "stamp", "elapsed", "rx_time", "time_s")[rng.integers(6)]
     columns = {"time": false, name: clock(situation, samples), **cells(situation, situation.bad)}
     dt = situation.plant.dt * rate
-    return _recorded_wrong(situation, table(columns), situation.bad, "time", name, "clock", dt=dt)
+    return _recorded_wrong(situation, table(columns), situation.bad, name, *_CLOCK, dt=dt)
 
 
 def starts_late(rng: Rng, situation: Situation) -> Mistaken | None:
@@ -324,7 +326,7 @@ def runs_strung_together(rng: Rng, situation: Situation) -> Mistaken | None:
     start = (0, cut, cut + 2, cut + samples)[rng.integers(4)] * situation.plant.dt
     rest = [f"{start + k * situation.plant.dt:.6g}" for k in range(samples)]
     file = table({"time": first + rest, **cells(situation, joined)})
-    words = ("time", "clock", "step", "gap", situation.main, situation.other)
+    words = (*_CLOCK, "gap", situation.main, situation.other)
     return _recorded_wrong(situation, file, joined, *words)
 
 
@@ -402,7 +404,10 @@ def never_updated(_: Rng, situation: Situation) -> Mistaken | None:
         else situation.other
     )
     data = dict(situation.bad) | {name: np.full(situation.plant.samples, situation.bad[name][0])}
-    return _recorded_wrong(situation, recorded(situation, data), data, name)
+    row = (
+        () if name == situation.main else (situation.name,)
+    )  # a condition that never holds is told in the row
+    return _recorded_wrong(situation, recorded(situation, data), data, name, *row)
 
 
 # ------------------------------------------------------------------------ the specification

@@ -88,7 +88,7 @@ def test_what_is_no_number_of_samples(time: str) -> None:
 
 
 def test_lint_without_a_system_leaves_times_to_the_compiler() -> None:
-    assert [found.code for found in lint(source("shift(x, 0.25 s) > d * 1 m/s"))] == []
+    assert [found.code for found in lint(source("always shift(x, 0.25 s) > d * 1 m/s"))] == []
 
 
 def test_the_step_may_be_that_of_the_trace() -> None:
