@@ -100,7 +100,7 @@ def silent(
             ALARMS,
         )
         tables = {"mistakes": found, "correct": alarms}
-        publish("silent", output, lambda: _section(found, alarms, seed), tables, seed=seed)
+        publish("silent", output, lambda: _section(found, alarms, cases, seed), tables, seed=seed)
 
 
 def measure(kind: Kind, count: int, seed: int, folder: Path) -> SilentRow:
@@ -144,15 +144,15 @@ def alarm(name: str, count: int, seed: int, folder: Path) -> AlarmRow:
 
 
 def _section(
-    found: Table[Kind, SilentRow], alarms: Table[Sequence[object], AlarmRow], seed: int
+    found: Table[Kind, SilentRow], alarms: Table[Sequence[object], AlarmRow], cases: int, seed: int
 ) -> Iterator[str]:
     rows = found.rows
-    cases, silent_ = sum(row.cases for row in rows), sum(row.silent for row in rows)
+    made, silent_ = sum(row.cases for row in rows), sum(row.silent for row in rows)
     with_peer = [row for row in rows if row.rtamt is not None]
     peer, of = sum(row.rtamt or 0 for row in with_peer), sum(row.cases for row in with_peer)
     both = sum(row.silent for row in with_peer)
     yield (
-        f"**{silent_:,} of {cases:,} mistakes ({silent_ / cases:.0%}) pass stlc in silence.** "
+        f"**{silent_:,} of {made:,} mistakes ({silent_ / made:.0%}) pass stlc in silence.** "
         f"RTAMT can be given {of:,} of them: {both:,} ({both / of:.0%}) pass stlc, "
         f"{peer:,} ({peer / of:.0%}) pass RTAMT."
     )
@@ -161,5 +161,5 @@ def _section(
     yield ""
     yield from alarms.markdown()
     yield ""
-    yield f"- `python -m benchmarks silent --seed {seed}`"
+    yield f"- `python -m benchmarks silent --cases {cases} --seed {seed}`"
     yield measured_here()
