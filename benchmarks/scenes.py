@@ -270,7 +270,7 @@ def _meant(
         case "pair":
             rest = [each for each in plant.channels if not each.flag and each != main]
             second = rest[rng.integers(len(rest))]
-            high = good[second.name].max() + 0.3 * (second.high - second.low)
+            high = good[second.name].max() + 0.2 * (second.high - second.low)
             return Over("always", None, Joined("and", atom(second, "<", high), keep))
         case "guarded":
             return Over("always", None, Joined("->", condition, keep))
