@@ -10,6 +10,7 @@ import typing
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
+from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -140,7 +141,7 @@ def import_rtamt() -> Any:
     stand_in.TextIO = typing.TextIO  # type: ignore[attr-defined]
     sys.modules["typing.io"] = stand_in
     try:
-        import rtamt
+        rtamt = import_module("rtamt")
     finally:
         if before is None:
             del sys.modules["typing.io"]

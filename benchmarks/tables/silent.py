@@ -7,11 +7,11 @@ files without it do not get.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -99,7 +99,7 @@ def silent(
             lambda cell: alarm(*cell, seed, folder),
             ALARMS,
         )
-        tables = {"mistakes": found, "correct": alarms}
+        tables: dict[str, Table[Any, Any]] = {"mistakes": found, "correct": alarms}
         publish("silent", output, lambda: _section(found, alarms, cases, seed), tables, seed=seed)
 
 
@@ -144,7 +144,7 @@ def alarm(name: str, count: int, seed: int, folder: Path) -> AlarmRow:
 
 
 def _section(
-    found: Table[Kind, SilentRow], alarms: Table[Sequence[object], AlarmRow], cases: int, seed: int
+    found: Table[Kind, SilentRow], alarms: Table[Any, AlarmRow], cases: int, seed: int
 ) -> Iterator[str]:
     rows = found.rows
     made, silent_ = sum(row.cases for row in rows), sum(row.silent for row in rows)

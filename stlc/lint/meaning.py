@@ -10,8 +10,7 @@ from itertools import pairwise
 from types import MappingProxyType
 from typing import TypeAlias
 
-from stlc.compile.analysis.ranges import KnownRanges
-from stlc.compile.analysis.warnings import truth
+from stlc.compile.analysis.warnings import in_range, truth
 from stlc.compile.frontend.scope import enforced
 from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import typed
@@ -20,7 +19,6 @@ from stlc.compile.ir.traverse import mentions_horizon, nodes, operands
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
 from stlc.grammar.traverse import descendants
-from stlc.signature import Signature
 from stlc.source import Span
 
 # ------------------------------------------------------------- the first sample only
@@ -143,9 +141,8 @@ def beyond_ranges(spec: typed.Spec) -> Iterator[Diagnostic]:
             decided = truth(node, ranges)
             if decided is not None and columns_of(node.num) and truth(node, facts) is None:
                 reported.add(node.span)
-                known = ", ".join(
-                    _range(name, spec.signature, ranges) for name in sorted(columns_of(node.num))
-                )
+                names = sorted(columns_of(node.num) & ranges.keys())
+                known = ", ".join(in_range(name, spec.signature, ranges) for name in names)
                 word = "true" if decided else "false"
                 yield Diagnostic(
                     "W313",
@@ -158,12 +155,6 @@ def beyond_ranges(spec: typed.Spec) -> Iterator[Diagnostic]:
 
 def _within(span: Span, whole: Span) -> bool:
     return span.source is whole.source and whole.start <= span.start <= span.end <= whole.end
-
-
-def _range(name: str, signature: Signature, ranges: KnownRanges) -> str:
-    low, high = ranges[name]
-    unit = signature[name].unit
-    return f"`{name}` is in [{low:g}, {high:g}]" + (f" {unit}" if unit.text else "")
 
 
 # ------------------------------------------------------------- bare numbers

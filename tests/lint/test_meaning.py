@@ -147,6 +147,8 @@ def test_what_is_read_once_depends_on_the_first_sample_alone(formula, rows):
         ("always below(level, 30 m)", []),
         ("always wind < 13 m/s", ["W503"]),
         ("always level < x", []),
+        ("always sin(x) + level / 1 m < 30", ["W313"]),
+        ("always sin(x) < 2", ["W503"]),
     ],
 )
 def test_decided_by_a_range(formula, codes):

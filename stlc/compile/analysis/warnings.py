@@ -287,14 +287,17 @@ def _because(formula: typed.Formula, signature: Signature, facts: KnownRanges) -
     Only ranges in `facts` are named; the text is empty if there are none. `signature` gives the units of the
     signals.
     """
-    parts = []
     read = (leaf for num in numbers(formula) for leaf in leaves(num))
-    for name in dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))):
-        if name in facts and name in signature:
-            low, high = facts[name]
-            unit = signature[name].unit
-            parts.append(f"`{name}` is in [{low:g}, {high:g}]" + (f" {unit}" if unit.text else ""))
+    names = dict.fromkeys(leaf.name for leaf in read if isinstance(leaf, (ir.Signal, ir.ShiftedSignal)))
+    parts = [in_range(name, signature, facts) for name in names if name in facts and name in signature]
     return f": {', '.join(parts)}" if parts else ""
+
+
+def in_range(name: str, signature: Signature, ranges: KnownRanges) -> str:
+    """Return a text on the range of a signal, such as "`x` is in [0, 5] m"."""
+    low, high = ranges[name]
+    unit = signature[name].unit
+    return f"`{name}` is in [{low:g}, {high:g}]" + (f" {unit}" if unit.text else "")
 
 
 # ----------------------------------------------------------------------- safety
