@@ -18,11 +18,16 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.namespace import Array
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.support import earliest
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import Boundary
 from stlc.diagnostics import Diagnostic, UsageError
+from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
+from stlc.monitor.uncertain import outer
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 At: TypeAlias = int | Literal["all"] | None
@@ -59,12 +64,60 @@ def rule_bounds(
 
     The bounds hold for all values of unknown samples; if nothing is unknown, they are the same array.
     `horizon` is the length of a planning window in steps. In windows that extend beyond the trace, samples
-    are unknown (`ends` is "open"), or the windows are clipped ("truncate").
+    are unknown (`ends` is "open"), or the windows are clipped ("truncate"). Where a window begins beyond the
+    end of the trace, the bounds hold wherever the trace may end.
     """
     formula, window = rule.under(record.semantics), window_of(rule, horizon)
     if window is None:
-        return bounds(formula, record, starts, ends)
-    return window_bounds(formula, record, starts, window, ends)
+        found = bounds(formula, record, starts, ends)
+    else:
+        found = window_bounds(formula, record, starts, window, ends)
+    if ends == "open" or not (outside := beyond(rule, starts, record.samples, horizon)).any():
+        return found
+    if record.cells is not None or record.ops is not NUMPY:
+        return widened(outside, found, rule_bounds(rule, record, starts, horizon, "open"))
+    lower, upper = (prefix_bound(formula, end, cut=True) for end in ("lower", "upper"))
+    grown = replace(record, env=with_seen(record.env))
+    return widened(outside, found, growing_bounds(lower, upper, grown, starts, window))
+
+
+def growing_bounds(
+    lower: ir.Formula, upper: ir.Formula, record: Record, starts: range, window: int | None
+) -> tuple[Array, Array]:
+    """Values of two bounds of `prefix_bound` at `starts`, each `(count, batch)`; the record may go on.
+
+    `window` is the number of samples from an instant to the `end` of its planning window, if that moves. The
+    record has the column `stlc.monitor.prefix_bounds.SEEN`.
+    """
+    if window is not None:
+        low, high = window_bounds(lower, record, starts, window, "open")
+        return low, high if upper == lower else window_bounds(upper, record, starts, window, "open")[1]
+    least, most = (lengthened(each, record.samples) for each in (lower, upper))
+    (low,) = record.values([record.sides(least)[0]], starts, "lower", FAR)
+    (high,) = record.values([record.sides(most)[1]], starts, "upper", FAR)
+    return low, high
+
+
+def beyond(rule: CompiledRequirement, starts: range, samples: int, horizon: int | None) -> NDArray[np.bool_]:
+    """Instants from which a window of a requirement begins beyond the last sample, (count,).
+
+    `horizon` is the length of a planning window in steps; a trace that holds the whole planning window of an
+    instant is not too short there.
+    """
+    later, clocked = earliest(rule.formula)
+    window = window_of(rule, horizon)
+    least = later if window is None else min(later, window)
+    first = samples - least if later else samples
+    return np.array([start >= first or clocked >= samples for start in starts], dtype=bool)
+
+
+def widened(
+    where: NDArray[np.bool_], one: tuple[Array, Array], other: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Return bounds `(count, …)` that hold for both of two pairs at the instants `where`, else the first."""
+    (low, high), (least, most) = outer(*one), outer(*other)
+    rows = where.reshape(-1, *[1] * (low.ndim - 1))
+    return np.where(rows, np.minimum(low, least), low), np.where(rows, np.maximum(high, most), high)
 
 
 def rule_known(

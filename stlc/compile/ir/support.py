@@ -195,6 +195,38 @@ _EVERYTHING = 1 << 40
 _REQUIRED, _HISTORY = _Required(), _History()
 
 
+def earliest(formula: ir.Formula) -> tuple[int, int]:
+    """Return the latest of the first samples of all future windows: after now, and after the first sample.
+
+    If the trace ends before that sample, some operand of the formula has no value, wherever windows are cut.
+    The second number is that of operators such as `always@[a, b]`, which count from the first sample.
+    """
+    return fold(formula, _EARLIEST)
+
+
+@final
+class _Earliest(Analysis[tuple[int, int]]):
+    def predicate(self, num: ir.Num) -> tuple[int, int]:  # noqa: ARG002
+        return 0, 0
+
+    def constant(self) -> tuple[int, int]:
+        return 0, 0
+
+    def over(self, parts: Sequence[tuple[int, int]], offsets: Sequence[ir.Offsets]) -> tuple[int, int]:
+        firsts = (max(first or 0, 0) for first, _ in offsets)
+        later = max(part[0] + first for part, first in zip(parts, firsts, strict=True))
+        return later, max(part[1] for part in parts)
+
+    def shift(self, body: tuple[int, int], node: ir.Shift) -> tuple[int, int]:  # noqa: ARG002
+        return body
+
+    def at_start(self, body: tuple[int, int]) -> tuple[int, int]:
+        return 0, max(body)
+
+
+_EARLIEST = _Earliest()
+
+
 # ---------------------------------------------------------------------------------- signals
 
 

@@ -13,7 +13,7 @@ from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.instants import At, check_length, starts_of
+from stlc.monitor.instants import At, beyond, check_length, starts_of, widened
 from stlc.monitor.judgement import Status, unknown_requirement
 from stlc.monitor.online.bounds import RobustnessBounds, Tracker, TrackingOptions
 from stlc.monitor.online.history import ColumnHistory, Floats
@@ -88,6 +88,8 @@ class Watched:
         truths: evaluator of the robustness that decides, if it is another one (`stlc.monitor.values`).
         tolerance: the tolerance, as in `How`.
         tally: summary of the instants whose verdict is final; these instants are called counted.
+        cut: whether windows are clipped at the end of the trace.
+        horizon: length of a planning window in steps; None if unknown.
         decided: whether an instant already has a verdict, (instants,). The first entry belongs to the first
             instant that is not counted.
     """
@@ -98,6 +100,8 @@ class Watched:
     truths: Tracker | None
     tolerance: float
     tally: RequirementSummary = field(default_factory=RequirementSummary)
+    cut: bool = False
+    horizon: int | None = None
     decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     @property
@@ -136,7 +140,17 @@ class Watched:
 
     def ended(self, starts: range) -> JudgedInstants:
         """Return bounds and verdicts at the instants `starts` once the trace has ended."""
-        return self._judged(*(tracker.ended(starts) for tracker in self.trackers))
+        return self._judged(*(self._ended(tracker, starts) for tracker in self.trackers))
+
+    def _ended(self, tracker: Tracker, starts: range) -> RobustnessBounds:
+        """Bounds once the trace has ended; where a window begins beyond its end, it may also go on."""
+        found = tracker.ended(starts)
+        if not self.cut:
+            return found
+        outside = beyond(self.rule, starts, self.values.samples, self.horizon)
+        if not outside.any():
+            return found
+        return RobustnessBounds(*widened(outside, found, tracker.live(starts.start, starts.stop)))
 
     def _judged(self, bounds: RobustnessBounds, truths: RobustnessBounds | None = None) -> JudgedInstants:
         least, most = truths or bounds
@@ -184,7 +198,8 @@ class Online:
         if (deciding := decisive(rule, self.how.tolerance, self.compiled.signature)) is not rule:
             truths = self._trackers.of(deciding, options, everywhere=everywhere)
         tally = RequirementSummary(low_at=begin, high_at=begin, first=begin)
-        return Watched(rule, everywhere, values, truths, self.how.tolerance, tally)
+        cut = ending == "truncate"
+        return Watched(rule, everywhere, values, truths, self.how.tolerance, tally, cut, horizon)
 
     def push(self, sample: Sample) -> tuple[Decision, ...]:
         """Add one sample; return the verdicts that this sample decides, in the order of the requirements.

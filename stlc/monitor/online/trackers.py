@@ -15,14 +15,14 @@ from stlc.compile.ir.support import history, reach, uses_end
 from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.monitor.instants import rule_bounds, window_of
+from stlc.monitor.instants import growing_bounds, rule_bounds, window_of
 from stlc.monitor.online.bounds import Ending, RobustnessBounds, Tracker, TrackingOptions
 from stlc.monitor.online.columns import Beyond, ColumnPlans, ColumnReader, Side, shareable
 from stlc.monitor.online.history import Floats
 from stlc.monitor.online.paced import MOST, WIDE, PacedTracker, span
 from stlc.monitor.online.streams import ColumnPlan, EndlessError, endless, looks_on, plan
 from stlc.monitor.online.unbounded import UnboundedState, skeleton
-from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
+from stlc.monitor.prefix_bounds import prefix_bound, with_seen
 from stlc.monitor.values import Record, window_bounds
 
 
@@ -376,7 +376,6 @@ class RecomputeTracker(_CutTracker):
     window: int | None = field(init=False)
     _signals: Mapping[str, Floats] = field(default_factory=dict)
     _ends: tuple[ir.Formula, ir.Formula] = field(init=False)
-    _long: tuple[int, ir.Formula, ir.Formula] = (-1, ir.Truth(True), ir.Truth(True))
 
     def __post_init__(self) -> None:
         self.window = window_of(self.rule, self.horizon)
@@ -400,17 +399,8 @@ class RecomputeTracker(_CutTracker):
 
     def of_all(self, starts: range) -> tuple[Floats, Floats]:
         """Return the least and the greatest robustness over all continuations, (instants, traces) each."""
-        record, (lower, upper) = Record.of(with_seen(self._signals), NUMPY), self._ends
-        if self.window is not None:
-            low, high = window_bounds(lower, record, starts, self.window, "open")
-            if upper != lower:
-                high = window_bounds(upper, record, starts, self.window, "open")[1]
-        else:
-            if self._long[0] != self.samples:
-                self._long = self.samples, lengthened(lower, self.samples), lengthened(upper, self.samples)
-            least, most = record.sides(self._long[1])[0], record.sides(self._long[2])[1]
-            (low,) = record.values([least], starts, "lower", FAR)
-            (high,) = record.values([most], starts, "upper", FAR)
+        record = Record.of(with_seen(self._signals), NUMPY)
+        low, high = growing_bounds(*self._ends, record, starts, self.window)
         return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> RobustnessBounds:
