@@ -12,7 +12,8 @@ from typing import Literal
 
 from stlc.source import Span
 
-Severity = Literal["error", "warning"]
+Severity = Literal["error", "warning", "fact"]
+"""An error; a warning, which most likely is a mistake; a fact, which stands beside a result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Diagnostic:
     """An error or a warning about an input or about the machine.
 
     Attributes:
-        code: an entry of `CODES`; codes that start with W are warnings.
+        code: an entry of `CODES`; codes that start with W are warnings or facts.
         message: one terse headline, in the user's terms.
         span: location in the source; None for a finding that concerns no text.
         label: text shown beside the underlined location.
@@ -61,8 +62,10 @@ class Diagnostic:
 
     @property
     def severity(self) -> Severity:
-        """Severity, "error" or "warning", by the first letter of the code."""
-        return "warning" if self.code.startswith("W") else "error"
+        """Severity by the first letter of the code; warnings in `FACTS` are facts."""
+        if not self.code.startswith("W"):
+            return "error"
+        return "fact" if self.code in FACTS else "warning"
 
     def with_note(self, text: str) -> Diagnostic:
         """A copy with one more note."""
@@ -247,6 +250,8 @@ CODES: dict[str, str] = {
     "E603": "a trace file that cannot be read, or is not safe to read",
     "E604": "a trace whose times are not finite",
     "E605": "a trace whose arrays do not fit together",
+    "E606": "a trace with two clocks that disagree",
+    "E607": "a clock whose numbers are hardly seconds",
     # system files
     "S100": "not a YAML document",
     "S101": "an unknown key",
@@ -298,8 +303,24 @@ CODES: dict[str, str] = {
     "W603": "a control without effect",
     "W701": "a cache folder, or a file in it, that others could have changed",
     "W702": "a C compiler that fails or hangs",
+    "W711": "a requirement that could read a part of the recording only",
+    "W712": "an obligation that the recording never triggered",
+    "W713": "an `eventually` that is true at once, everywhere",
+    "W714": "a comparison far from all recorded values",
+    "W715": "a signal that is constant, or stuck for a while",
+    "W716": "a value far off all others",
+    "W717": "a column that seems to tell objects apart",
+    "W718": "a recording of a few samples",
+    "W719": "a signal that is known in a part of the recording only",
+    "W720": "a column of the signal's own name that `--map` hides",
+    "W721": "a column whose name says another unit than its signal has",
+    "W722": "a signal in radians with values as in degrees",
+    "W723": "a requirement that is satisfied on the boundary",
     "U101": "a command line that cannot be understood",
     "U102": "a file that does not exist",
     # the tool itself
     "B001": "a bug in stlc",
 }
+
+FACTS = frozenset({*(f"W{number}" for number in range(711, 720)), "W722", "W723"})
+"""Codes of facts about a result (`stlc.monitor.facts`), which are no warnings."""

@@ -16,6 +16,7 @@ from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics
 from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.monitor.facts.fact import Fact
 from stlc.monitor.signals import Gap, Signals
 from stlc.monitor.values import Record
 from stlc.registry import closest
@@ -78,6 +79,11 @@ class Prepared:
             return None
         first = min(span.first for span in spans)
         return TimeRange(first, max(max(span.last for span in spans), first))
+
+    @property
+    def duration(self) -> TimeRange:
+        """Time of the recording, from its first to its last sample."""
+        return self.whole or TimeRange(self.time(0), self.time(self.record.samples - 1))
 
     def seen(self, rule: CompiledRequirement) -> TimeRange | None:
         """Time in which all signals of a requirement were seen (E602 without one); None if it is `whole`."""
@@ -245,6 +251,10 @@ class Judgement:
         return int(trace), self.start + int(instant)
 
 
+def _no_facts(_: Verdict) -> tuple[Fact, ...]:
+    return ()
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Verdicts of all requirements of a specification on one or many traces.
@@ -252,10 +262,17 @@ class Verdict:
     Attributes:
         requirements: one judgement per requirement, in the order of the specification.
         subject: the evaluated signals and the compiled requirements.
+        rules: function that finds the facts.
     """
 
     requirements: tuple[Judgement, ...]
     subject: Prepared = field(repr=False)
+    rules: Callable[[Verdict], tuple[Fact, ...]] = field(default=_no_facts, repr=False, compare=False)
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """Facts that the verdict rests on, such as what was read; they are looked for on each call."""
+        return self.rules(self)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -184,6 +184,7 @@ class Signals:
         cells: recorded values between the samples, if the signals were resampled.
         spans: signal -> time in which it was seen, if the signals were resampled.
         times: time of each sample in seconds, where that differs from the grid; None if it does not.
+        trace: the recording that the signals are of; None for signals of a Python program.
     """
 
     env: Mapping[str, Array]
@@ -196,6 +197,7 @@ class Signals:
     cells: Cells | None = None
     spans: Mapping[str, TimeRange] = field(default_factory=dict)
     times: NDArray[np.float64] | None = None
+    trace: Trace | None = None
 
     @property
     def batch(self) -> int:
@@ -270,7 +272,8 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
     columns = {key: changes[key](values) if key in changes else values for key, values in columns.items()}
     cells = None if trace.moments is None else _cells(trace.moments, columns, changes)
     spans = {key: span for key, span in trace.spans.items() if key in columns}
-    return Signals(columns, (trace.traces,), samples, NUMPY, name, trace.dt, trace.t0, cells, spans)
+    known = (name, trace.dt, trace.t0, cells, spans)
+    return Signals(columns, (trace.traces,), samples, NUMPY, *known, trace=trace)
 
 
 def _find(data: Given, name: str) -> Any:

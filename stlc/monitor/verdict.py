@@ -23,6 +23,7 @@ from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
+from stlc.monitor.facts.rules import facts_of
 from stlc.monitor.given import UNNAMED, Given, is_frame, trace_of_frame
 from stlc.monitor.given import plain as plain_signals
 from stlc.monitor.grid import Times, agreed_times, given_times, named_times, require_windows, system_of
@@ -184,7 +185,7 @@ class Monitor:
         if not reported.exact:
             ready = ready.under(reported)
             judgements = [_reported(judgement, ready, ends) for judgement in judgements]
-        return Verdict(tuple(judgements), ready).within(_scope(judged, tolerance))
+        return Verdict(tuple(judgements), ready, facts_of).within(_scope(judged, tolerance))
 
     def robustness(
         self,

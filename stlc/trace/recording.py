@@ -161,6 +161,7 @@ class Recording:
         line: function from the index of a row to its line in the file; None if rows are no lines.
         clocks: the clocks of its groups, once they are chosen.
         track: the object in a table that this is, such as `agent=2`; "" if the file holds one.
+        labels: column that seems to tell objects apart, in a table of one object -> number of its values.
     """
 
     name: str
@@ -176,6 +177,7 @@ class Recording:
     line: Callable[[int], int] | None = None
     clocks: tuple[Clock, ...] = ()
     track: str = ""
+    labels: Mapping[str, int] = field(default_factory=dict)
 
     def unit(self, name: str) -> str:
         """Return the unit that the file states for an array, as text; "" if there is none."""

@@ -74,6 +74,8 @@ class Trace:
         remarks: warnings about the file.
         track: the object in a table that this is, such as `agent=2`; "" if the file holds one.
         others: names of arrays of the file that were not read.
+        sources: signal -> its name in the file, for those that were renamed.
+        labels: column that seems to tell objects apart -> number of its values.
     """
 
     signature: Signature
@@ -89,6 +91,8 @@ class Trace:
     remarks: tuple[Diagnostic, ...] = ()
     track: str = ""
     others: tuple[str, ...] = ()
+    sources: Mapping[str, str] = field(default_factory=dict)
+    labels: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def file(self) -> str:
@@ -139,6 +143,8 @@ class Trace:
             data=moved(self.data),
             moments=moments,
             spans=moved(self.spans),
+            others=(*self.others, *(name for name in self.data if name in names and name not in back)),
+            sources={new: old for new, old in names.items() if new != old},
         )
 
 
@@ -362,6 +368,7 @@ def _trace(recording: Recording, t0: float, dt: float, data: dict[str, Floats]) 
         remarks=recording.remarks,
         track=recording.track,
         others=recording.others,
+        labels=recording.labels,
     )
 
 

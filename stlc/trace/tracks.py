@@ -85,7 +85,7 @@ def separated(
     if not named or named == [NONE]:
         if best is not None and not rising:
             _require_no_runs(recording, best)
-        return (recording,)
+        return (recording if named else replace(recording, labels=_labels(arrays, read)),)
     if missing := [name for name in named if name not in arrays]:
         raise TraceError(absent(recording.name, missing[0], (*recording.signals, *recording.others)))
     parts = tuple(_split(recording, named, one, read))
@@ -128,6 +128,17 @@ def _telling(
         )
         raise TraceError(Diagnostic("E601", message, help=(f"--group {names[0]}",)))
     return list(fitting)[:1]
+
+
+def _labels(arrays: Mapping[str, Array], read: Mapping[str, bool] | None) -> dict[str, int]:
+    """Columns that are called like the name of an object and have few values, with their number."""
+    found = {}
+    for name, values in arrays.items():
+        if is_group_name(name) and name not in (read or ()) and values.dtype.kind in "biufU":
+            count = len(np.unique(values))
+            if 2 <= count <= len(values) // 2:
+                found[name] = count
+    return found
 
 
 def _require_no_runs(recording: Recording, best: Candidate) -> None:

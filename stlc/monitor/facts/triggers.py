@@ -1,0 +1,128 @@
+"""Obligations of a requirement that a recording never put to the test.
+
+A requirement is walked from its root as written, with the instants at which each part has to hold. The right
+side of an implication has to hold where its left side does; the operand of `always` throughout its window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stlc.compile.augment.lift import from_first_sample
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import to_window
+from stlc.compile.ir.traverse import absolute, leaves, numbers
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.monitor.judgement import Judgement, Part, Prepared
+from stlc.monitor.uncertain import outer
+from stlc.monitor.values import bounds, by_truth
+from stlc.source import Span
+
+Bools = NDArray[np.bool_]
+_OUTWARD = ("always", "historically", "release")
+
+
+@dataclass(frozen=True, slots=True)
+class Trigger:
+    """Part of a requirement whose obligation depends on what the recording holds.
+
+    Attributes:
+        span: the part that triggers it: the left side of an implication, or the whole operator.
+        at: instants at which it has to hold, (samples, traces) or (samples, 1).
+        hits: instants among them at which there is an obligation beyond the present sample, (samples,
+            traces).
+        kind: "triggered" for implications and `until`; "at once" for `eventually`, which a present sample
+            may satisfy.
+    """
+
+    span: Span
+    at: Bools
+    hits: Bools
+    kind: str = "triggered"
+
+
+def triggers(judged: Judgement, subject: Prepared) -> Iterator[Trigger]:
+    """Yield the obligations of a requirement that depend on what the recording holds."""
+    part = judged.part or Part(0, subject.record.samples)
+    at = np.zeros((subject.record.samples, 1), dtype=bool)
+    at[judged.start : judged.start + judged.instants] = True
+    yield from _Walk(subject, part).visit(judged.rule.typed.formula, at)
+
+
+@dataclass(frozen=True, slots=True)
+class _Walk:
+    subject: Prepared
+    part: Part
+
+    def visit(self, node: typed.Formula, at: Bools) -> Iterator[Trigger]:
+        """Yield the obligations of a formula that has to hold at the instants `at`."""
+        if not at.any():
+            return
+        match node:
+            case typed.Logic(_, "->", (left, right)) if (held := self.held(left)) is not None:
+                yield Trigger(left.span, at, at & held)
+                yield from self.visit(right, at & held)
+            case typed.Logic(_, "and", items):
+                for item in items:
+                    yield from self.visit(item, at)
+            case typed.Temporal(_, "always" | "historically", _, body):
+                yield from self.visit(body, self.window(node, at))
+            case typed.Temporal(_, "eventually", _, body) if (held := self.held(body)) is not None:
+                lo = self.steps(node).lo
+                if node.interval.clock == "now" and lo < len(held):
+                    there = np.zeros_like(held)
+                    there[: len(held) - lo] = held[lo:]
+                    yield Trigger(node.span, at, at & ~there, "at once")
+            case typed.Until(_, "until" | "unless" | "release", interval, left, right):
+                ends = self.held(left if node.op == "release" else right)
+                if interval.clock == "now" and not self.steps(node).lo and ends is not None:
+                    yield Trigger(node.span, at, at & ~ends)
+            case typed.Freeze(_, _, body):
+                yield from self.visit(body, at)
+            case _:
+                return
+
+    def steps(self, node: typed.Temporal | typed.Until) -> ir.Window:
+        """Return the interval of an operator in samples."""
+        return to_window(node.interval, self.subject.compiled.grid, [], outward=node.op in _OUTWARD)
+
+    def window(self, node: typed.Temporal, at: Bools) -> Bools:
+        """Return the instants in the windows of `always` or `historically` that begin at `at`."""
+        steps, samples = self.steps(node), len(at)
+        if node.interval.clock == "start":
+            first = np.zeros_like(at[:1])
+            first[0] = at.any(axis=0)
+            at = np.concatenate([first, np.zeros_like(at[1:])])
+        if node.op == "always" and steps.hi is None:
+            first = np.where(at.any(axis=0), at.argmax(axis=0) + steps.lo, samples)
+            return self.inside(np.arange(samples)[:, None] >= first)
+        forward = at if node.op == "always" else at[::-1]
+        edges = np.zeros(at.shape, dtype=np.int32)
+        if steps.lo < samples:
+            edges[steps.lo :] += forward[: samples - steps.lo]
+        if steps.hi is not None and steps.hi + 1 < samples:
+            edges[steps.hi + 1 :] -= forward[: samples - steps.hi - 1]
+        within = np.cumsum(edges, axis=0) > 0
+        return self.inside(within if node.op == "always" else within[::-1])
+
+    def inside(self, instants: Bools) -> Bools:
+        """Return the instants without those outside of the part that is judged."""
+        instants[: self.part.first] = False
+        instants[self.part.stop :] = False
+        return instants
+
+    def held(self, node: typed.Formula) -> Bools | None:
+        """Instants at which a formula may hold, (samples, traces); None if it reads a frozen value."""
+        if any(isinstance(leaf, ir.FrozenVar) for num in numbers(node) for leaf in leaves(num)):
+            return None
+        written = from_first_sample(node) if absolute(node) else node
+        formula = by_truth(simplify(lower(written, self.subject.compiled.grid, [])))
+        record = self.subject.record.of_cells(formula, loose=False)
+        _, high = outer(*bounds(formula, record, range(record.samples), "truncate"))
+        return np.asarray(high > 0)
