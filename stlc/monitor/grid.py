@@ -19,6 +19,7 @@ from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.source import Source
 from stlc.trace import Trace, as_fraction
+from stlc.trace.time_grid import LONGEST
 
 if TYPE_CHECKING:
     from stlc.dynamics.declaration.decl import SystemDecl
@@ -116,7 +117,12 @@ def named_times(spec: ast.Spec, overrides: Mapping[str, str]) -> Times | None:
 
 
 def require_windows(trace: Trace, rules: Sequence[CompiledRequirement]) -> None:
-    """Raise TraceError (E602) if a window is shorter than a step of the trace, and so checks nothing."""
+    """Check the windows of requirements against the step of a trace.
+
+    Raises:
+        TraceError: E602, a window is shorter than a step, and so checks nothing; E607, a step is so long, and
+            windows hold so few, that the clock hardly counts seconds.
+    """
     for rule in rules:
         for node in nodes(rule.typed.formula):
             if not isinstance(node, (typed.Temporal, typed.Until)) or node.interval.hi is None:
@@ -124,9 +130,7 @@ def require_windows(trace: Trace, rules: Sequence[CompiledRequirement]) -> None:
             last, length = node.interval.hi, float(node.interval.hi.seconds)
             if last.steps or last.horizons or not 0.0 < length < trace.dt * (1.0 - _SLACK):
                 continue
-            name = next((clock.name for clock in trace.clocks), "t")
-            scales = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-            unit = next((unit for unit, scale in scales.items() if trace.dt * scale <= length), "ms")
+            name, unit = _clock_name(trace), _finer(trace.dt, length)
             message = (
                 f"`{trace.name}` has a sample every {trace.dt:.6g} s by its clock `{name}`, "
                 f"and a window of {length:.6g} s has none but its first"
@@ -137,6 +141,50 @@ def require_windows(trace: Trace, rules: Sequence[CompiledRequirement]) -> None:
             )
             span = node.interval.span or last.span or rule.span
             raise TraceError(Diagnostic("E602", message, span, help=help_))
+    _require_seconds(trace, rules)
+
+
+_SCALES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_LONG, _WIDE = 100.0, 100.0
+"""Seconds of a step from which it may count no seconds, and steps of a window from which it does."""
+
+
+def _clock_name(trace: Trace) -> str:
+    return next((clock.name for clock in trace.clocks), "t")
+
+
+def _finer(step: float, length: float) -> str:
+    """Unit of time in which a step is not longer than `length` seconds."""
+    return next((unit for unit, scale in _SCALES.items() if step * scale <= length), "ms")
+
+
+def _require_seconds(trace: Trace, rules: Sequence[CompiledRequirement]) -> None:
+    """Raise TraceError (E607) if a clock without a unit has steps that are long beside all windows.
+
+    Steps of whole minutes up to an hour, hours up to a day, and days are usual.
+    """
+    step, spans = trace.dt, ((60.0, 3600.0), (3600.0, 86400.0), (86400.0, LONGEST))
+    usual = step < _LONG or any(step % unit == 0.0 and step <= most for unit, most in spans)
+    if usual or not trace.clocks or any(clock.unit for clock in trace.clocks):
+        return
+    intervals = (
+        node.interval
+        for rule in rules
+        for node in nodes(rule.typed.formula)
+        if isinstance(node, (typed.Temporal, typed.Until))
+    )
+    bounds = [each.hi for each in intervals if each.hi is not None and not each.hi.horizons]
+    longest = max(bounds, key=lambda each: each.seconds, default=None)
+    if longest is None or not 0.0 < float(longest.seconds) < _WIDE * step:
+        return
+    name, length = _clock_name(trace), float(longest.seconds)
+    unit = _finer(step, length / 10.0)
+    message = (
+        f"is the clock `{name}` of `{trace.name}` in seconds? "
+        f"Its step of {step:.6g} is long beside {length:.6g} s"
+    )
+    help_ = (f"--clock {name}:{unit}  if it is in {unit}", f"--clock {name}:s  if it is in seconds")
+    raise TraceError(Diagnostic("E607", message, longest.span, help=help_))
 
 
 def agreed_times(name: str, step: float, horizon: int | None, given: Times) -> Times:

@@ -29,6 +29,7 @@ from stlc.trace.recording import (
     absent,
     clock_rank,
     is_count_name,
+    is_source_time,
 )
 from stlc.units import parse_unit
 
@@ -59,7 +60,12 @@ _OF_DAY = re.compile(r"(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2}(?:[.,]\d+)?))?
 _OFFSET = re.compile(r"(.*:.*\d)\s*(?:(?P<sign>[+-])(?P<h>\d{2}):?(?P<m>\d{2})|Z|UTC)", re.IGNORECASE)
 _YEAR_LAST = re.compile(r"(?P<d>\d{1,2})\.(?P<m>\d{1,2})\.(?P<y>\d{4})(?P<rest>.*)", re.DOTALL)
 _SECONDS, _NANOSECONDS = {"sec", "secs"}, ("nanosec", "nsec", "nsecs")
+_OF_SOURCE = re.compile(
+    r"(?:gps|gnss|utc|sim|ros|sys|system|log|host|wall|unix|boot|server)[ _]", re.IGNORECASE
+)
 _SAME = 1e-6
+_PACE = 0.02
+"""Logarithm of the ratio of the steps of two clocks up to which they agree; crystals drift less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -394,7 +400,35 @@ def _parted(
     if not parts:
         parts = {best_of(recording.name, rising.values()).name: {}}
     near = {name: tuple(n for n in rising if n != name and n not in parts) for name in parts}
+    if read is not None and not setting.name:
+        for name, others in near.items():
+            _require_one_pace(recording.name, rising[name], [rising[other] for other in others])
     return [(ClockGroup(arrays, None, name), rising[name], near[name]) for name, arrays in parts.items()]
+
+
+def _require_one_pace(trace: str, clock: Candidate, others: list[Candidate]) -> None:
+    """Raise TraceError (E606) if another clock of the same samples has steps of another length.
+
+    A clock whose unit nothing says may be in ms, us or ns, or count rows.
+    """
+    samples, group = len(clock.seconds), clock.name.rpartition(".")[0]
+    for other in others:
+        beside = other.name.rpartition(".")[0] == group and len(other.seconds) == samples
+        if samples < 2 or not beside or not (clock_rank(other.name) == 2 or is_source_time(other.name)):
+            continue
+        steps = [float(each.seconds[-1] - each.seconds[0]) / (samples - 1) for each in (clock, other)]
+        counts = not other.sure and clock.sure and steps[1] == 1.0
+        if counts or not (steps[0] > 0 and steps[1] > 0):
+            continue
+        unsure = not (clock.sure and other.sure)
+        scales = (1.0, 1e3, 1e6, 1e9) if unsure else (1.0,)
+        if all(abs(math.log(steps[0] * x / steps[1])) > _PACE for s in scales for x in (s, 1.0 / s)):
+            message = (
+                f"`{trace}` has two clocks: `{clock.name}` with a step of {steps[0]:.6g} s, and "
+                f"`{other.name}` with {steps[1]:.6g} s"
+            )
+            help_ = (f"--clock {clock.name}  or  --clock {other.name}  names the one that counts",)
+            raise TraceError(Diagnostic("E606", message, help=help_))
 
 
 def _shared(one: str, other: str) -> int:

@@ -35,6 +35,12 @@ _CLOCKED = re.compile(
 _COUNTS = re.compile(
     r"(?:.*[._\s/])?(?:frame|cycle|step|tick)(?:[ _]?(?:id|number|nr|no|count|index))?", re.IGNORECASE
 )
+_OF = (
+    r"(?:gps|gnss|utc|sim|ros|sys|system|log|host|wall|unix|boot|server|local|device|rx|tx|recv|received?|sent|send|"
+    r"arrival|arrived|publish|published|recorded?|captured?)"
+)
+_STAMP = r"(?:t|time|timestamp|stamp|clock)"
+_OF_SOURCE = re.compile(rf"(?i:{_OF}[ _]{_STAMP}|{_STAMP}[ _]{_OF})")
 _GROUPED = re.compile(
     r"(?i:(?:.*[._\s/])?(?:trace|agent|id|track|vehicle|unit|run|episode|engine|case|object|trial|subject|series))"
     r"|.*(?:_id|_ID|[a-z]I[dD])"
@@ -49,7 +55,12 @@ def clock_rank(name: str) -> int:
     if name.strip() == ROSTOPIC or _CLOCKED.fullmatch(leaf):
         return 2
     starts = (found.end() for found in re.finditer(r"[_\s](?!t\b)", leaf))
-    return int(any(_CLOCKED.fullmatch(leaf, start) for start in starts))
+    return int(any(_CLOCKED.fullmatch(leaf, start) for start in starts) or is_source_time(name))
+
+
+def is_source_time(name: str) -> bool:
+    """True if a column is called like the time of a source, such as `gps_time` or `time_received`."""
+    return len(name) <= _LONGEST and _OF_SOURCE.fullmatch(re.split(r"[./]", name)[-1]) is not None
 
 
 def is_count_name(name: str) -> bool:

@@ -181,3 +181,40 @@ def test_two_columns_that_could_tell_objects_apart_are_an_error() -> None:
         t=[0, 1, 0, 1, 0, 1, 0, 1], run=[0, 0, 1, 1, 2, 2, 3, 3], id=[3, 3, 3, 0, 0, 5, 5, 5], v=STEPS[:8]
     )
     assert read(rows, group="run").traces == 4
+
+
+@pytest.mark.parametrize(
+    ("clocks", "agree"),
+    [
+        ({"t": 0.1 * STEPS, "time_ms": 100 * STEPS}, True),
+        ({"t": 0.1 * STEPS, "time_ms": 110 * STEPS}, False),
+        ({"t": 0.1 * STEPS, "time_ms": 100.5 * STEPS}, True),  # a crystal drifts
+        ({"time_s": 0.1 * STEPS, "timestamp": 100 * STEPS}, True),  # ms, which nothing says
+        ({"time_s": 0.1 * STEPS, "timestamp": 250 * STEPS}, False),
+        ({"time_ms": 100 * STEPS, "time": 1.0 * STEPS}, True),  # it counts rows
+        ({"t": 0.1 * STEPS, "gps_time": 7.0 * STEPS}, False),
+        ({"time": 0.1 * STEPS, "time_received": STEPS}, False),
+        ({"time": 0.1 * STEPS, "t_host": 0.01 * STEPS}, False),
+        ({"time": 0.1 * STEPS, "time_to_collision": STEPS}, True),
+        ({"t": 0.1 * STEPS, "motor_time": 7.0 * STEPS}, True),  # its last word only is that of a clock
+        ({"t": 0.1 * STEPS, "time_ms": np.tile([0.0, 40.0], 5)}, True),  # it does not rise
+        ({"t": 0.1 * STEPS, "timestamp": 1_700_000_000 + 0.1 * STEPS}, True),
+        ({"t": 0.1 * STEPS, "timestamp": 1_700_000_000 + 0.2 * STEPS}, False),
+    ],
+)
+def test_two_clocks_agree_or_are_an_error(clocks: dict[str, np.ndarray], agree: bool) -> None:
+    recording = table(**clocks, v=STEPS)
+    if agree:
+        assert read(recording).samples == len(STEPS)
+        return
+    with pytest.raises(TraceError, match=r"E606: `r` has two clocks: `.*` with a step of .* s"):
+        read(recording)
+    for name in clocks:
+        assert read(recording, clock=name).clocks[0].name == name  # the user says which one counts
+
+
+def test_columns_of_objects_in_one_trace_are_told() -> None:
+    recording = table(t=0.1 * STEPS, car_id=STEPS % 2, lap_id=STEPS, v=STEPS)
+    assert read(recording).labels == {"car_id": 2}
+    assert read(recording, group="none").labels == {}
+    assert read(recording, "v", "car_id").labels == {}
