@@ -34,6 +34,7 @@ from stlc.grammar.parse.parser import parse
 from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.grammar.traverse import descendants
 from stlc.lint.lint import Surroundings, lint
+from stlc.monitor.facts.findings import findings_on
 from stlc.signature import Column
 from stlc.source import Source, Span
 from stlc.units import Unit
@@ -67,6 +68,7 @@ class Document:
         unread: errors of the declarations that could not be parsed.
         system: declaration of the system that the text names, or None.
         missing: errors because of which the system could not be loaded; empty if it was loaded.
+        trace: path of a recording, whose facts are shown too; None for none.
     """
 
     source: Source
@@ -74,6 +76,7 @@ class Document:
     unread: tuple[Diagnostic, ...]
     system: SystemDecl | None
     missing: tuple[Diagnostic, ...]
+    trace: Path | None = None
 
     @cached_property
     def names(self) -> SymbolNames:
@@ -109,6 +112,8 @@ class Document:
             within = Surroundings(self.system.interface(), self.grid, "check" if judge else "train")
         linted = self.unread or lint(self.source, within=within)
         errors = {one.code for one in linted if one.severity == "error"}
+        if self.trace is not None and not (errors or self.missing):
+            linted = (*linted, *findings_on(self.spec, self.trace, self.spec.system))
         mild = bool(errors) and errors <= _ONLY_FOR_TRAINING
         found += [replace(self._place(one), mild=mild and one.severity == "error") for one in linted]
         return tuple(sorted(found, key=lambda one: one.span.start))
@@ -157,13 +162,13 @@ def _load(path: Path) -> SystemDecl | StlcError:
         return error
 
 
-def analyse(source: Source, systems: Systems) -> Document:
-    """Analyse a text together with the system that it names."""
+def analyse(source: Source, systems: Systems, trace: Path | None = None) -> Document:
+    """Analyse a text together with the system that it names, and with a recording, if there is one."""
     spec, unread = read(source)
     if spec.system is None:
-        return Document(source, spec, unread, None, ())
+        return Document(source, spec, unread, None, (), trace)
     try:
-        return Document(source, spec, unread, systems.load(spec.system, Path(source.name)), ())
+        return Document(source, spec, unread, systems.load(spec.system, Path(source.name)), (), trace)
     except StlcError as error:
         return Document(source, spec, unread, None, error.diagnostics)
     except OSError as error:

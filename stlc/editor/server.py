@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from pygls.exceptions import JsonRpcInvalidParams
 from pygls.lsp.server import LanguageServer
 from pygls.workspace import PositionCodec
 
-from stlc.diagnostics import Diagnostic, SpecError
+from stlc.diagnostics import Diagnostic, Severity, SpecError
 from stlc.editor.completion import Offer, complete
 from stlc.editor.document import Document, Finding, Systems, analyse, definition, outline, system_place
 from stlc.editor.hover import hover, summary
@@ -24,6 +25,11 @@ from stlc.grammar.format.format import format_text
 from stlc.source import Source, Span
 from stlc.version import __version__
 
+_SEVERITIES: Mapping[Severity, lsp.DiagnosticSeverity] = {
+    "error": lsp.DiagnosticSeverity.Error,
+    "warning": lsp.DiagnosticSeverity.Warning,
+    "fact": lsp.DiagnosticSeverity.Information,
+}
 _BREAK = re.compile(r"\r\n|\r|\n")
 
 
@@ -71,18 +77,22 @@ def mapper_of(text: str, codec: PositionCodec) -> PositionMapper:
 
 
 class Server(LanguageServer):
-    """Language server that stores an analysis of every open specification, renewed after each change."""
+    """Language server that stores an analysis of every open specification, renewed after each change.
 
-    def __init__(self) -> None:
+    `trace` is the path of a recording, whose facts are shown in every specification; None for none.
+    """
+
+    def __init__(self, trace: Path | None = None) -> None:
         super().__init__("stlc", __version__, text_document_sync_kind=lsp.TextDocumentSyncKind.Full)
         self.systems = Systems()
+        self.trace = trace
         self.documents: dict[str, Document] = {}
 
     def analyse(self, uri: str) -> Document:
         """Analyse the current text of the file at a URI, and store the result."""
         text = self.workspace.get_text_document(uri).source
         source = Source(uris.to_fs_path(uri) or uri if uri.startswith("file:") else uri, text)
-        self.documents[uri] = analyse(source, self.systems)
+        self.documents[uri] = analyse(source, self.systems, self.trace)
         return self.documents[uri]
 
     def document(self, params: Any) -> Document:
@@ -121,11 +131,11 @@ class Server(LanguageServer):
     def diagnostic(self, finding: Finding) -> lsp.Diagnostic:
         """Convert a finding to an LSP diagnostic, with its advice and its further locations in the text."""
         inner = finding.diagnostic
-        warns = finding.mild or inner.severity == "warning"
+        severity = lsp.DiagnosticSeverity.Warning if finding.mild else _SEVERITIES[inner.severity]
         return lsp.Diagnostic(
             range=self.range(finding.span),
             message="\n".join(_lines(inner)),
-            severity=lsp.DiagnosticSeverity.Warning if warns else lsp.DiagnosticSeverity.Error,
+            severity=severity,
             code=inner.code,
             source="stlc",
             related_information=[
@@ -309,9 +319,9 @@ _FEATURES: dict[str, tuple[Any, Any]] = {
 }
 
 
-def make_server() -> Server:
-    """Return a language server with all request handlers registered."""
-    server = Server()
+def make_server(trace: Path | None = None) -> Server:
+    """Return a language server with all request handlers; `trace` is a recording whose facts it shows."""
+    server = Server(trace)
     for name, (feature, options) in _FEATURES.items():
         server.feature(name, options)(feature)
     return server

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,7 +21,7 @@ from stlc.source import Span
 from stlc.version import __version__
 
 if TYPE_CHECKING:
-    from stlc.lint.lint import Surroundings
+    from stlc.lint.lint import Selection, Surroundings
     from stlc.source import Source
 
 Format = Literal["text", "json", "github", "sarif"]
@@ -33,6 +33,7 @@ CLEAN, FOUND, INVALID = 0, 1, 3
     "stlc lint specs/traffic.stl",
     "stlc lint specs --strict --format github",
     "stlc lint specs/traffic.stl --system car.yaml --fix",
+    "stlc lint specs/traffic.stl --trace drive.csv",
 )
 def lint(
     files: SpecsArgument = None,
@@ -47,6 +48,10 @@ def lint(
     format_: Annotated[Format, typer.Option("--format", help="How findings are written.")] = "text",
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")] = False,
     system: SystemOption = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option("--trace", metavar="FILE", help="Also tell what this recording does not test."),
+    ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Look again whenever a file changes.")] = False,
     json: JsonOption = False,
 ) -> Answer[LintedFiles]:
@@ -85,14 +90,17 @@ def lint(
                 findings += error.diagnostics
                 within = None
             look = partial(lint_text, within=within, selection=selection)
-            if not fix:
-                findings += look(source)
-                continue
-            repaired = repair(source, look)
-            if repaired.count:
-                write_atomic(source.name, repaired.source.text)
-            repairs += repaired.count
-            findings += repaired.findings
+            if fix:
+                repaired = repair(source, look)
+                if repaired.count:
+                    write_atomic(source.name, repaired.source.text)
+                repairs += repaired.count
+                source, found = repaired.source, repaired.findings
+            else:
+                found = look(source)
+            findings += found
+            if trace is not None and not any(finding.severity == "error" for finding in found):
+                findings += _on_trace(source, trace, system, selection)
         errors = any(finding.severity == "error" for finding in findings)
         result: LintedFiles = {"files": list(names), "findings": len(findings), "fixed": repairs}
         code = INVALID if errors else FOUND if strict and findings else CLEAN
@@ -104,6 +112,14 @@ def lint(
 
     watch_files(names, lambda: linted().print("lint/1", as_json=json))
     raise typer.Exit
+
+
+def _on_trace(source: Source, trace: Path, system: str | None, selection: Selection) -> Iterator[Diagnostic]:
+    """Yield what a recording does not test of a specification, and what looks odd in it."""
+    from stlc.grammar.parse.parser import parse
+    from stlc.monitor.facts.findings import findings_on
+
+    yield from (each for each in findings_on(parse(source), trace, system) if selection.wants(each.code))
 
 
 def _codes(text: str | None) -> tuple[str, ...]:
@@ -163,7 +179,7 @@ def _summary(result: LintedFiles, findings: Sequence[Diagnostic]) -> str:
     fixed = f"fixed {_several(result['fixed'], 'finding')}; " if result["fixed"] else ""
     if not findings:
         return f"{fixed}{files}, nothing to say"
-    found = ", ".join(_several(count[kind], kind) for kind in ("error", "warning") if count[kind])
+    found = ", ".join(_several(count[kind], kind) for kind in ("error", "warning", "fact") if count[kind])
     repairable = sum(finding.fix is not None and finding.fix.same for finding in findings)
     more = f"; {repairable} can be repaired: stlc lint --fix" if repairable else ""
     return f"{fixed}{found} in {files}{more}"
@@ -179,7 +195,7 @@ _SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 
 
 def github(findings: Iterable[Diagnostic]) -> str:
-    """Findings as commands of GitHub Actions: one line `::error …` or `::warning …` per finding."""
+    """Findings as commands of GitHub Actions: a line `::error …`, `::warning …` or `::notice …` each."""
     return "\n".join(map(_command, findings))
 
 
@@ -195,7 +211,8 @@ def _command(finding: Diagnostic) -> str:
         if line == end_line:
             places += [f"col={column}", f"endColumn={end_column}"]
     text = "\n".join([finding.message, *finding.help])
-    return f"::{finding.severity} {','.join(places)}::{workflow_data(text)}"
+    level = "notice" if finding.severity == "fact" else finding.severity
+    return f"::{level} {','.join(places)}::{workflow_data(text)}"
 
 
 def sarif(findings: Sequence[Diagnostic]) -> dict[str, Any]:
@@ -216,7 +233,7 @@ def _result(finding: Diagnostic, rule: int) -> dict[str, Any]:
     result: dict[str, Any] = {
         "ruleId": finding.code,
         "ruleIndex": rule,
-        "level": finding.severity,
+        "level": "note" if finding.severity == "fact" else finding.severity,
         "message": {"text": sarif_message(text)},
     }
     if finding.span is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -10,11 +11,15 @@ from stlc.cli.framework.output import PULSE
 from stlc.cli.framework.program import command
 
 
-@command("stlc lsp")
+@command("stlc lsp", "stlc lsp --trace drive.csv")
 def lsp(
     _stdio: Annotated[
         bool, typer.Option("--stdio", help="Over the standard input and output, which is the only way.")
     ] = True,
+    trace: Annotated[
+        Path | None,
+        typer.Option("--trace", metavar="FILE", help="Show what this recording does not test, too."),
+    ] = None,
 ) -> None:
     """Serve an editor: findings, hover, completion, rename, format.
 
@@ -24,4 +29,4 @@ def lsp(
     from stlc.editor.server import make_server
 
     with PULSE.doing(""):  # waits for the editor
-        make_server().start_io()
+        make_server(trace).start_io()

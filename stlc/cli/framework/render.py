@@ -23,6 +23,7 @@ _RESET = "\x1b[0m"
 _STYLES = {
     "error": "\x1b[1;31m",
     "warning": "\x1b[1;33m",
+    "fact": "\x1b[1;34m",
     "headline": "\x1b[1m",
     "frame": "\x1b[1;34m",
     "secondary": "\x1b[34m",
