@@ -232,7 +232,7 @@ WANTED = [
     {"name": "low", "verdict": "violated", "at": 1.15, "judged": {}},
     {"name": "near", "verdict": "violated", "at": 1.15, "judged": {"first": 1.0, "last": 5.75, "of": 6.0}},
     {"name": "quiet", "judged": {"first": 0.4, "last": 6.0, "of": 6.0}},
-    {"name": "never", "verdict": "violated", "judged": {"first": 1.0, "last": 5.75, "of": 6.0}},
+    {"name": "never", "verdict": "violated", "judged": {"first": 1.0, "last": 3.0, "of": 6.0}},
 ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,9 +15,12 @@ from stlc.cli.framework.assured import UncertainSignal
 from stlc.cli.framework.documents import record
 from stlc.escape import xml
 from stlc.monitor.explain.report import Cause
+from stlc.monitor.facts.fact import Fact
+from stlc.monitor.facts.requirements import parts_read
 from stlc.monitor.judgement import Judgement
 from stlc.monitor.signals import Gap
 from stlc.provenance import sha256
+from stlc.trace.resample import TimeRange
 
 if TYPE_CHECKING:
     from stlc.cli.check.judge import Question
@@ -72,6 +75,8 @@ def result_record(result: Checked, end: str) -> documents.CheckedTrace:
         clocks=[
             record(documents.ClockRecord, clock, others=list(clock.others)) for clock in result.trace.clocks
         ],
+        facts=fact_records(result.facts_on("")),
+        lint=list(result.lint),
     )
 
 
@@ -124,15 +129,26 @@ def _requirement(judged: Judgement, result: Checked) -> documents.CheckedRequire
         satisfied_share=judged.share,
         violated_traces=judged.statuses.count("violated"),
         judged=_part(judged, result),
+        facts=fact_records(result.facts_on(judged.name)),
     )
 
 
+def fact_records(facts: Iterable[Fact]) -> list[documents.FactRecord]:
+    """JSON records of facts."""
+    return [record(documents.FactRecord, fact, advice=list(fact.advice)) for fact in facts]
+
+
 def _part(judged: Judgement, result: Checked) -> documents.JudgedPart | None:
-    """The part of the recording on which a requirement is judged, in mission time; None for all of it."""
-    seen, whole = None if judged.part is None else judged.part.seen, result.verdict.subject.whole
-    if seen is None or whole is None:
+    """The part of the recording that a requirement could read, in mission time; None for all of it."""
+    subject = result.verdict.subject
+    return part_record(parts_read(judged, subject), subject.duration)
+
+
+def part_record(parts: Sequence[TimeRange], whole: TimeRange) -> documents.JudgedPart | None:
+    """JSON record of the parts of a recording that a requirement could read; None for all of it."""
+    if not parts:
         return None
-    first, last = seen.first - whole.first, seen.last - whole.first
+    first, last = parts[0].first - whole.first, parts[-1].last - whole.first
     return {"first": first, "last": last, "of": whole.last - whole.first}
 
 
@@ -191,19 +207,19 @@ def _cause(cause: Cause) -> documents.CauseRecord:
     )
 
 
-def junit(outcomes: Sequence[Outcome]) -> str:
-    """The results as a JUnit XML document."""
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites{_counts(outcomes)}>"]
+def junit(outcomes: Sequence[Outcome], *, strict: bool = False) -> str:
+    """The results as a JUnit XML document; with `strict`, what was not fully judged is skipped."""
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites{_counts(outcomes, strict=strict)}>"]
     for outcome in outcomes:
-        lines += _suite(outcome)
+        lines += _suite(outcome, strict=strict)
     return "\n".join([*lines, "</testsuites>", ""])
 
 
-def _counts(outcomes: Sequence[Outcome]) -> str:
+def _counts(outcomes: Sequence[Outcome], *, strict: bool) -> str:
     rows = [row for outcome in outcomes for row in outcome.rows]
     errors = sum(bool(outcome.errors) for outcome in outcomes)
     failures = sum(row.status == "violated" for row in rows)
-    skipped = sum(row.status in ("inconclusive", "out of scope") for row in rows)
+    skipped = sum(row.status in ("inconclusive", "out of scope") or (strict and row.unjudged) for row in rows)
     seconds = sum(outcome.seconds for outcome in outcomes)
     return (
         f' tests="{len(rows) + errors}" failures="{failures}" errors="{errors}" skipped="{skipped}"'
@@ -211,8 +227,8 @@ def _counts(outcomes: Sequence[Outcome]) -> str:
     )
 
 
-def _suite(outcome: Outcome) -> Iterator[str]:
-    yield f"  <testsuite name={_attribute(outcome.name)}{_counts([outcome])}>"
+def _suite(outcome: Outcome, *, strict: bool) -> Iterator[str]:
+    yield f"  <testsuite name={_attribute(outcome.name)}{_counts([outcome], strict=strict)}>"
     for error in outcome.errors[:1]:
         yield f'    <testcase classname={_attribute(outcome.name)} name="trace">'
         detail = xml("\n".join(f"{e.code}: {e.message}" for e in outcome.errors))
@@ -221,16 +237,24 @@ def _suite(outcome: Outcome) -> Iterator[str]:
         yield "    </testcase>"
     for row in outcome.rows:
         head = f"    <testcase classname={_attribute(outcome.name)} name={_attribute(row.name)}"
-        if row.status == "satisfied":
+        told = "\n".join([row.verdict, *row.remarks]) if row.facts else ""
+        if row.status == "satisfied" and not told:
             yield f"{head}/>"
             continue
         yield f"{head}>"
         if row.status == "violated":
             message = f"robustness {row.robustness}{', ' + row.where if row.where else ''}"
             yield f'      <failure type="violated" message={_attribute(message)}>{xml(row.why)}</failure>'
-        else:
+        elif row.status != "satisfied":
             yield f"      <skipped message={_attribute(row.why or row.status)}/>"
+        elif strict and row.unjudged:
+            yield f"      <skipped message={_attribute(told)}/>"
+        if told:
+            yield f"      <system-out>{xml(told)}</system-out>"
         yield "    </testcase>"
+    if outcome.facts:
+        told = "\n".join(fact.text for fact in outcome.facts)
+        yield f"    <system-out>{xml(told)}</system-out>"
     yield "  </testsuite>"
 
 

@@ -190,7 +190,9 @@ def _judged(trace: Trace, loaded: Loaded, question: Question, remarks: tuple[str
         strict=question.strict,
     )
     causes, options = explain_all(verdict), _options(question)
-    return Checked(trace, loaded.source, verdict, causes, options, remarks, question.uncertain)
+    lint = _lint_codes(loaded.monitor)
+    known = (trace, loaded.source, verdict, causes, options, remarks, question.uncertain)
+    return Checked(*known, facts=verdict.facts, lint=lint)
 
 
 def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
@@ -293,6 +295,14 @@ def _monitor(
 
     parsed = replace(parse(source), library=None if library is None else dict(library))
     return Monitor(parsed, system=system, overrides=dict(overrides))
+
+
+@lru_cache(maxsize=8)
+def _lint_codes(monitor: Monitor) -> tuple[str, ...]:
+    """Codes of the warnings that the lint rules have of a specification."""
+    from stlc.lint.lint import rule_findings
+
+    return tuple(finding.code for finding in rule_findings(monitor.spec))
 
 
 # ------------------------------------------------------------------------ instants

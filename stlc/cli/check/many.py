@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,8 +15,8 @@ from stlc.cli.check.judge import Work, found, judge
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
 from stlc.cli.framework.documents import InvalidTrace
 from stlc.cli.framework.output import COLOR, table
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, usage
-from stlc.escape import operand
+from stlc.diagnostics import CODES, Diagnostic, MissingError, StlcError, usage
+from stlc.escape import operand, visible
 from stlc.files import require_folder
 
 if TYPE_CHECKING:
@@ -168,7 +169,7 @@ def outcomes_of(work: Work) -> list[Outcome]:
 
 def _outcome(result: Checked, work: Work, seconds: float) -> Outcome:
     from stlc.cli.check.document import result_record
-    from stlc.cli.check.text import result_text, rows_of
+    from stlc.cli.check.text import lint_text, result_text, rows_of
 
     rows = rows_of(result, violated_at=_violated_at(result, work.question) if work.table else {})
     return Outcome(
@@ -185,6 +186,8 @@ def _outcome(result: Checked, work: Work, seconds: float) -> Outcome:
         warnings=result.warnings,
         remarks=result.remarks,
         sample=_sample(result) if work.certify else None,
+        facts=result.facts_on(""),
+        lint=lint_text(result),
     )
 
 
@@ -243,11 +246,7 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     parts += [f"{broken} cannot be judged"] if broken else []
     parts += [f"{lost} not judged"] if lost else []
     parts += [f"{outside} out of scope"] if outside else []
-    rows = [_per_requirement(name, outcomes) for name in names]
-    tables = [
-        table(lines, header=head),
-        table(rows, header=("requirement", "violated in", "inconclusive in")),
-    ]
+    tables = [table(lines, header=head), _per_requirement(names, outcomes), *_about_recordings(outcomes)]
     return "\n\n".join([*tables, f"{overall(outcomes)}; {', '.join(parts)}"])
 
 
@@ -272,10 +271,37 @@ def _worst(rows: Sequence[VerdictRow]) -> VerdictRow:
     return min(rows, key=lambda row: (order[row.status], row.least))
 
 
-def _per_requirement(name: str, outcomes: Sequence[Outcome]) -> tuple[str, ...]:
-    rows = [row for outcome in outcomes for row in outcome.rows if row.name == name]
-    counts = [sum(row.status == status for row in rows) for status in ("violated", "inconclusive")]
-    return (name, *(str(count) if count else "" for count in counts))
+_COUNTED = {"W711": "read in part in", "W712": "never triggered in", "": "other facts in"}
+"""Code of a fact -> heading of the column that counts the files; "" for all other codes."""
+
+
+def _per_requirement(names: Sequence[str], outcomes: Sequence[Outcome]) -> str:
+    """Table of the number of files in which each requirement is violated, inconclusive, or has facts."""
+    columns: list[list[int]] = []
+    for name in names:
+        rows = [row for outcome in outcomes for row in outcome.rows if row.name == name]
+        told = [{f.code if f.code in _COUNTED else "" for f in row.facts} for row in rows]
+        counts = [sum(row.status == status for row in rows) for status in ("violated", "inconclusive")]
+        columns.append([*counts, *(sum(code in codes for codes in told) for code in _COUNTED)])
+    heads = ["violated in", "inconclusive in", *_COUNTED.values()]
+    kept = [i for i in range(len(heads)) if i < 2 or any(counts[i] for counts in columns)]
+    lines = [
+        (name, *(str(counts[i]) if counts[i] else "" for i in kept))
+        for name, counts in zip(names, columns, strict=True)
+    ]
+    return table(lines, header=("requirement", *(heads[i] for i in kept)))
+
+
+def _about_recordings(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield a paragraph with the number of files in which each fact about a recording is true, if any is."""
+    counts = Counter((fact.code, fact.signal) for outcome in outcomes for fact in outcome.facts)
+    total = f"of {len(outcomes):,} files"
+    lines = [
+        f"  {f'`{visible(signal)}`: ' if signal else ''}{CODES[code]}, in {count:,} {total}"
+        for (code, signal), count in counts.items()
+    ]
+    if lines:
+        yield "\n".join(lines)
 
 
 def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stlc.cli.check.document import requirement_record, trace_record
+from stlc.cli.check.document import fact_records, part_record, requirement_record, trace_record
 from stlc.cli.check.judge import Question, Work, instant_of, monitor_of, reading_options, specification
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow
 from stlc.cli.check.text import in_unit, percent, robustness_text, signed, text_of
@@ -26,11 +26,16 @@ from stlc.compile.ir.support import columns
 from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.escape import visible
 from stlc.files import find_spec, read_source
+from stlc.monitor.facts.extent import samples_read
+from stlc.monitor.facts.requirements import part_facts
+from stlc.monitor.facts.rules import unsilenced
 from stlc.monitor.judgement import beside
 from stlc.monitor.signals import gap_text
 from stlc.source import Source
+from stlc.trace.resample import TimeRange
 
 if TYPE_CHECKING:
+    from stlc.compile.pipeline import CompiledRequirement
     from stlc.monitor.explain.report import Cause
     from stlc.monitor.judgement import Status
     from stlc.monitor.online.online import Decision, Online
@@ -104,9 +109,7 @@ def _outcome(
             robustness=math.nan if any(map(math.isnan, known)) else min(known),
             satisfied_traces=int(status == "satisfied"),
             satisfied_share=share,
-            requirements=[
-                _requirement(rule, tally, online, causes.get(rule)) for rule, tally in tallies.items()
-            ],
+            requirements=[_requirement(row, tallies[row.name], online, causes.get(row.name)) for row in rows],
         ),
         status=status,
         rows=rows,
@@ -140,7 +143,19 @@ def _row(
         short = tally.first + tally.instants - 1 + rule.reach >= online.samples
         why = why or ("the trace is too short to say" if short else "it has no value where it was judged")
     least = tally.low if tally.status == "inconclusive" else tally.robustness
-    return VerdictRow(name, tally.status, value, share, where, why, least, unit)
+    facts = unsilenced([*part_facts(rule, _parts(tally, online, rule), _duration(online))])
+    return VerdictRow(name, tally.status, value, share, where, why, least, unit, facts=facts)
+
+
+def _parts(tally: RequirementSummary, online: Online, rule: CompiledRequirement) -> list[TimeRange]:
+    """Times in seconds at which a requirement could read the stream; empty for all of it."""
+    starts = range(tally.first, tally.first + tally.instants)
+    ranges = samples_read(rule.formula, starts, online.samples)
+    return [TimeRange(online.time(each.start), online.time(each.stop - 1)) for each in ranges]
+
+
+def _duration(online: Online) -> TimeRange:
+    return TimeRange(online.time(0), online.time(online.samples - 1))
 
 
 def _moment(online: Online, sample: int) -> str:
@@ -154,11 +169,11 @@ def _violation(name: str, tally: RequirementSummary, cause: Cause, *, color: boo
 
 
 def _requirement(
-    name: str, tally: RequirementSummary, online: Online, cause: Cause | None
+    row: VerdictRow, tally: RequirementSummary, online: Online, cause: Cause | None
 ) -> CheckedRequirement:
-    least = tally.robustness
+    least, rule = tally.robustness, online.rule(row.name)
     return requirement_record(
-        online.rule(name),
+        rule,
         cause,
         {"min": least, "mean": least, "low": tally.low, "high": tally.high},
         0,
@@ -167,7 +182,8 @@ def _requirement(
         starts=tally.instants,
         satisfied_share=tally.share,
         violated_traces=int(tally.status == "violated"),
-        judged=None,
+        judged=part_record(_parts(tally, online, rule), _duration(online)),
+        facts=fact_records(row.facts),
     )
 
 

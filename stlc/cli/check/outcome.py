@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from stlc.cli.framework.documents import CheckedTrace, InvalidTrace
 from stlc.diagnostics import Diagnostic
 from stlc.monitor.explain.report import Cause
+from stlc.monitor.facts.fact import Fact
 from stlc.monitor.judgement import Verdict
 from stlc.source import Source
 from stlc.trace import Trace
@@ -47,9 +48,9 @@ class VerdictRow:
         why: reason in one line, if the requirement is not satisfied.
         least: least robustness as a number, or its lower bound if inconclusive; 0 if there is none.
         unit: unit of the robustness.
-        judged: the part of the recording on which the requirement is judged, in words; "" for all of it.
         violated_at: time in seconds from which the requirement is certainly violated, whatever follows; None
             if it is not violated, or if the time was not looked for.
+        facts: facts about the requirement, such as the part of the recording that it read.
     """
 
     name: str
@@ -61,7 +62,22 @@ class VerdictRow:
     least: float = 0.0
     unit: str = ""
     violated_at: float | None = None
-    judged: str = ""
+    facts: tuple[Fact, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """The verdict with the facts that stand beside it: `satisfied, never triggered (0 of 5)`."""
+        return ", ".join([WORDS[self.status], *(fact.text for fact in self.facts if fact.beside)])
+
+    @property
+    def remarks(self) -> list[str]:
+        """The facts that do not stand beside the verdict, in words."""
+        return [fact.text for fact in self.facts if not fact.beside]
+
+    @property
+    def unjudged(self) -> bool:
+        """True if the requirement is satisfied, but was not fully judged."""
+        return self.status == "satisfied" and any(fact.unjudged for fact in self.facts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +100,8 @@ class Outcome:
         exit_code: exit code of the command for these errors; 0 without errors.
         sample: its traces as observations, with `--certify`; None if no trace is in scope.
         track: the object in the file, such as `agent=2`; "" if the file holds one.
+        facts: facts about the recording.
+        lint: what `stlc lint` would say of the specification, in one line; "" if nothing.
     """
 
     name: str
@@ -101,6 +119,8 @@ class Outcome:
     exit_code: int = 0
     sample: Sample | None = None
     track: str = ""
+    facts: tuple[Fact, ...] = ()
+    lint: str = ""
 
     @property
     def file(self) -> str:
@@ -108,18 +128,25 @@ class Outcome:
         return self.name.removesuffix(f" ({self.track})")
 
 
-def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None) -> int:
+def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None, *, strict: bool = False) -> int:
     """Return the exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
 
     With `fail_under`, the code depends on the share of the judged instants at which all requirements hold.
     The code is 0 if this share is at least `fail_under`. It is 1 if the share stays below `fail_under`
-    whatever samples follow. It is 4 if this is undecided. If a file cannot be judged, its exit code is
+    whatever samples follow. It is 4 if this is undecided. With `strict`, it is 4 instead of 0 if a satisfied
+    requirement was not fully judged. If a file cannot be judged, its exit code is
     returned, whatever the verdicts of the other files. Traces to which the specification does not apply (out
     of scope) do not count.
     """
     broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
     if broken:
         return max(broken)
+    code = _verdict_code(outcomes, fail_under)
+    unjudged = any(row.unjudged for outcome in outcomes for row in outcome.rows)
+    return INCONCLUSIVE if strict and unjudged and code == SATISFIED else code
+
+
+def _verdict_code(outcomes: Sequence[Outcome], fail_under: float | None) -> int:
     traces = sum(outcome.traces for outcome in outcomes)
     if fail_under is not None and traces:
         holds = sum(outcome.holds * outcome.traces for outcome in outcomes) / traces
@@ -153,6 +180,8 @@ class Checked:
         options: command-line options of reading and judging.
         remarks: messages for the user.
         uncertain: signal -> greatest error of its samples.
+        facts: facts about the requirements and about the recording.
+        lint: codes of the warnings that `stlc lint` has of the specification, besides the compiler's.
     """
 
     trace: Trace
@@ -162,8 +191,19 @@ class Checked:
     options: tuple[str, ...]
     remarks: tuple[str, ...]
     uncertain: Mapping[str, Uncertainty] = field(default_factory=dict)
+    facts: tuple[Fact, ...] = ()
+    lint: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
         """Warnings of the compiler, and about the file."""
-        return (*self.trace.remarks, *self.verdict.subject.compiled.warnings)
+        doubts = (fact.finding for fact in self.facts if fact.severity == "warning")
+        return (*self.trace.remarks, *self.verdict.subject.compiled.warnings, *doubts)
+
+    def facts_on(self, requirement: str) -> tuple[Fact, ...]:
+        """Facts about a requirement, without places; "" selects those about the recording.
+
+        Warnings are left out.
+        """
+        chosen = (f for f in self.facts if f.requirement == requirement and f.severity == "fact")
+        return tuple(replace(fact, finding=replace(fact.finding, span=None)) for fact in chosen)

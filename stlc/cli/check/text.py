@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stlc.cli.check.outcome import WORDS, Checked, VerdictRow
+from stlc.cli.check.outcome import Checked, VerdictRow
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns
@@ -21,6 +21,7 @@ from stlc.monitor.judgement import Judgement, Part, Verdict, beside
 from stlc.monitor.signals import gap_text
 
 if TYPE_CHECKING:
+    from stlc.monitor.facts.fact import Fact
     from stlc.monitor.judgement import Status
 
 
@@ -47,8 +48,16 @@ def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> 
     ending, folder = [_summary(verdict)], Path(trace.name).parent
     if (folder / "run.json").is_file():
         ending.append(f"next: {shell(('stlc', 'report', str(folder)))}")
-    gaps = (*_clock_texts(result), *_error_texts(result), *_gap_texts(result).values())
+    gaps = (
+        *(*_clock_texts(result), *_error_texts(result), *_gap_texts(result).values()),
+        *map(fact_text, result.facts_on("")),
+    )
     return text_of(title, rows, gaps, reasons, ending, several=verdict.traces > 1)
+
+
+def fact_text(fact: Fact) -> str:
+    """Line on a fact about a recording: the fact, and a way out."""
+    return "; ".join([fact.text, *fact.advice])
 
 
 def text_of(
@@ -74,10 +83,10 @@ def text_of(
     cells = [
         (
             row.name,
-            WORDS[row.status],
+            row.verdict,
             row.robustness,
             row.share,
-            "; ".join(filter(None, (row.where, row.judged))),
+            "; ".join(filter(None, (row.where, *row.remarks))),
         )
         for row in rows
     ]
@@ -160,19 +169,10 @@ def rows_of(result: Checked, violated_at: Mapping[str, float]) -> tuple[VerdictR
         rows.append(
             VerdictRow(
                 *(judged.name, status, robustness, share, where, why, least, unit, at),
-                judged_text(judged, result),
+                facts=result.facts_on(judged.name),
             )
         )
     return tuple(rows)
-
-
-def judged_text(judged: Judgement, result: Checked) -> str:
-    """Text on the part of a recording on which a requirement is judged, in mission time; "" for all of it."""
-    seen, whole = None if judged.part is None else judged.part.seen, result.verdict.subject.whole
-    if seen is None or whole is None:
-        return ""
-    ends = [f"{time - whole.first:.6g} s" for time in (seen.first, seen.last, whole.first, whole.last)]
-    return f"judged {ends[0]} to {ends[1]} of {ends[2]} to {ends[3]}"
 
 
 # ------------------------------------------------------------------------ reasons
@@ -238,6 +238,16 @@ def _inconclusive(judged: Judgement, result: Checked) -> str:
             "A shorter step (--resample), or --between SIGNAL=hold or =linear, may decide it."
         )
     return f"{name} is inconclusive: it has no value where it was judged."
+
+
+def lint_text(result: Checked) -> str:
+    """Line on what `stlc lint` would say of a specification; "" if nothing."""
+    if not result.lint:
+        return ""
+    count = f"{len(result.lint)} warning{'s' if len(result.lint) > 1 else ''}"
+    file = result.source.name
+    command = f"; {shell(('stlc', 'lint', operand(file)))}" if Path(file).is_file() else ""
+    return f"lint: {count}: {', '.join(dict.fromkeys(result.lint))}{command}"
 
 
 def _summary(verdict: Verdict) -> str:

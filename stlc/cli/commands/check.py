@@ -30,6 +30,7 @@ from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, sh
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.escape import visible
 from stlc.files import has_wildcard, matching_traces, real, write_atomic
 from stlc.registry import SEMANTICS
 
@@ -81,7 +82,8 @@ def check(
     strict: Annotated[
         bool,
         typer.Option(
-            "--strict", help="What was left out, as signals were not seen there, counts as unknown."
+            "--strict",
+            help="Times at which signals were not seen are unknown; 4 if a requirement was not fully judged.",
         ),
     ] = False,
     fail_under: FailUnderOption = None,
@@ -118,8 +120,10 @@ def check(
     A trace is looked for at the given path, then in the newest run. It is judged by SPEC or --spec, if given.
     Otherwise it is judged by the specification and the constants that it stores. If the trace is -, samples
     come from the standard input, as CSV with a header or as one JSON object per line. A file larger than
-    memory is judged in chunks. A file whose process is lost is judged up to three times. Exit code: 0 all
-    satisfied, 1 violated, 4 inconclusive (trace too short), 5 a file is not judged, as its process was lost
+    memory is judged in chunks. A file whose process is lost is judged up to three times. A row says which
+    part of the recording the requirement could read, unless it is all, and whether anything triggered it.
+    Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short), or satisfied without being fully
+    judged and --strict, 5 a file is not judged, as its process was lost
     each time; with --certify 0 certified, 1 refuted, 4 undecided; with -q nothing is printed.
     """
     from stlc.cli.check.document import document
@@ -170,12 +174,13 @@ def check(
     if table is not None:
         write_table(table, outcomes)
     if junit is not None:
-        write_atomic(junit, junit_xml(outcomes))
+        write_atomic(junit, junit_xml(outcomes, strict=strict))
     findings = dict.fromkeys(f for outcome in outcomes for f in (*outcome.errors, *outcome.warnings))
-    code, record = exit_code(outcomes, fail_under), document(outcomes)
+    code, record = exit_code(outcomes, fail_under, strict=strict), document(outcomes)
     if certify is not None:
         code = _bounded(record, outcomes, certify, code)
-    show = partial(_print, outcomes, record.get("assurance")) if talk else lambda: None
+    open_ = dict.fromkeys(row.name for outcome in outcomes for row in outcome.rows if strict and row.unjudged)
+    show = partial(_print, outcomes, record.get("assurance"), [*open_]) if talk else lambda: None
     return Answer(record, show, code, findings)
 
 
@@ -208,8 +213,10 @@ def _bounded(record: CheckResult, outcomes: Sequence[Outcome], share: float, cod
     return code if any(outcome.errors for outcome in outcomes) else found.exit_code
 
 
-def _print(outcomes: Sequence[Outcome], assurance: Assurance | None) -> None:
+def _print(outcomes: Sequence[Outcome], assurance: Assurance | None, unjudged: Sequence[str]) -> None:
     """Print remarks, errors and warnings, then the results of the judged files, then bounds, if any.
+
+    `unjudged` are the requirements that `--strict` counts as not fully judged.
 
     A single result is printed in full. Of several results, those that are not satisfied are printed in full,
     and a summary table follows.
@@ -229,6 +236,10 @@ def _print(outcomes: Sequence[Outcome], assurance: Assurance | None) -> None:
     else:
         parts = [outcome.text for outcome in outcomes if outcome.text and outcome.status != "satisfied"]
         emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
+    if unjudged:
+        emit(f"not fully judged (--strict): {', '.join(map(visible, unjudged))}")
+    for line in dict.fromkeys(outcome.lint for outcome in outcomes if outcome.lint):
+        emit(line)
     if assurance is not None:
         emit("\n".join(["", *bounds_lines(assurance)]))
 

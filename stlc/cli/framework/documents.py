@@ -115,6 +115,17 @@ class JudgedPart(TypedDict):
     of: Num
 
 
+class FactRecord(TypedDict):
+    code: str
+    text: str
+    advice: list[str]
+    signal: str
+    time: Num | None
+    count: int | None
+    of: int | None
+    unjudged: bool
+
+
 class ClockRecord(TypedDict):
     name: str
     unit: str
@@ -131,6 +142,7 @@ class CheckedRequirement(TypedDict):
     satisfied_share: Num
     violated_traces: int
     judged: NotRequired[JudgedPart | None]
+    facts: NotRequired[list[FactRecord]]
     cause: CauseRecord | None
 
 
@@ -145,6 +157,8 @@ class CheckedTrace(TypedDict):
     traces: int
     samples: int
     clocks: NotRequired[list[ClockRecord]]
+    facts: NotRequired[list[FactRecord]]
+    lint: NotRequired[list[str]]
     unknown: dict[str, UnknownSamples]
     uncertain: NotRequired[dict[str, UncertainSignal]]
     in_scope: int

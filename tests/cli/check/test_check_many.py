@@ -345,6 +345,8 @@ def test_a_stream_at_one_of_its_samples(
     whole = document(capsys, "s.stl", "stream.csv", "--at", at)["result"]
     stream(monkeypatch, text, "--json", "--at", at)
     found = json.loads(capsys.readouterr().out)["result"]
+    for row in (*found["requirements"], *whole["requirements"]):
+        del row["facts"]  # a stream tells fewer
     assert found["requirements"] == whole["requirements"]
 
 

@@ -82,7 +82,7 @@ def test_what_was_judged_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["check", "s.stl", "l.npz", "--resample", "0.1s", "--map", "a=a.v", "--map", "b=b.v"]
     assert main(words) == 1
     out = capsys.readouterr().out
-    assert "judged 1 s to 60 s of 0 s to 60.2 s" in out
+    assert "read 1 s to 60 s of 60.2 s" in out
     assert main([*words, "--json"]) == 1
     found: dict[str, Any] = json.loads(capsys.readouterr().out)["result"]
     one, both = found["requirements"]
