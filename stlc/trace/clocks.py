@@ -127,6 +127,9 @@ class Candidate:
         return not len(steps) or bool((steps >= 0).all() and steps.any())
 
 
+_WHY = ("its name", "its name and magnitude", "its unit is stated")
+"""Reasons of the choice of a clock, by `Candidate.sure`."""
+
 # ------------------------------------------------------------------------------ candidates
 
 
@@ -346,7 +349,8 @@ def clocked(recording: Recording, setting: ClockSetting, read: Read) -> Recordin
             shift = 0.0 if clock.origin is None or origin is None else (clock.origin - origin) * 1e-9
             times = clock.seconds + shift if shift else clock.seconds
             group = replace(group, clock=times, named=clock.name)
-            clocks.append(Clock(clock.name, clock.unit, others))
+            why = "--clock" if clock.name == setting.name else _WHY[clock.sure]
+            clocks.append(Clock(clock.name, clock.unit, others, why))
         groups.append(group)
     meta = recording.meta if origin is None else replace(recording.meta, origin=origin)
     there = {part for group in groups for name in (*group.arrays, group.named) for part in name.split("+")}

@@ -120,11 +120,13 @@ class Clock:
         name: name of the array.
         unit: unit of its numbers, or the kind of its words; "" if nothing says it (then it is seconds).
         others: names of further candidates.
+        why: reason of the choice: `--clock`, or what states the unit.
     """
 
     name: str
     unit: str = ""
     others: tuple[str, ...] = ()
+    why: str = ""
 
     @property
     def plain(self) -> bool:

@@ -176,8 +176,10 @@ def requirement_record(
         "argmin": {"trace": trace, "start": start, "time": start if cause is None else cause.time},
     }
     told = None if cause is None else _cause(cause)
-    tags = sorted(rule.tags)
-    return record(documents.CheckedRequirement, rule, tags=tags, robustness=robustness, cause=told, **found)
+    made = {"tags": sorted(rule.tags), "robustness": robustness, "cause": told, **found}
+    if rule.typed.id:
+        made["id"] = rule.typed.id
+    return record(documents.CheckedRequirement, rule, **made)
 
 
 def _least(values: NDArray[np.float64]) -> float | None:

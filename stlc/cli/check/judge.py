@@ -98,6 +98,7 @@ class Work:
         mode: value of `--color`; the worker process uses the same value.
         certify: whether the traces are returned as a sample for bounds.
         table: whether the times of first violations are looked for.
+        evidence: whether the record of the result says what it was made from.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Work:
     mode: ColorMode = "never"
     certify: bool = False
     table: bool = False
+    evidence: bool = False
 
 
 def found(name: str, runs: Path) -> Path:
@@ -189,7 +191,7 @@ def _judged(trace: Trace, loaded: Loaded, question: Question, remarks: tuple[str
         uncertain=question.uncertain,
         strict=question.strict,
     )
-    causes, options = explain_all(verdict), _options(question)
+    causes, options = explain_all(verdict), _replayed(question)
     lint = _lint_codes(loaded.monitor)
     known = (trace, loaded.source, verdict, causes, options, remarks, question.uncertain)
     return Checked(*known, facts=verdict.facts, lint=lint)
@@ -203,27 +205,52 @@ def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
     return () if path == Path(name) else (f"taking {path}, of the newest run",)
 
 
-def _options(question: Question) -> tuple[str, ...]:
-    """Return the command-line options that are equivalent to `question`, as a list of words."""
-    words = [] if question.spec is None else [operand(str(question.spec))]
-    words += [] if question.system is None else ["--system", question.system]
-    for option, pairs in (("--map", question.names), ("--set", question.overrides)):
-        words += [word for name, value in pairs.items() for word in (option, f"{name}={value}")]
-    times = {"--resample": question.resample, "--dt": question.dt, "--max-gap": question.max_gap}
-    for option, seconds in times.items():
-        words += [] if seconds is None else [option, f"{seconds:.10g}s"]
-    for signal, each in question.between.items():
-        words += ["--between", f"{signal}={each.how}" + ("" if each.age is None else f":{each.age:.10g}s")]
-    if question.clock is not None and question.clock.name:
-        unit = f":{question.clock.unit}" if question.clock.unit else ""
-        words += ["--clock", f"{question.clock.name}{unit}"]
-    if question.clock is not None and question.clock.step is not None:
-        words += ["--fps", f"{1.0 / question.clock.step:.10g}"]
-    words += ["--group", question.group] if question.group == "none" else []
-    words += ["--columns", ",".join(question.columns)] if question.columns else []
-    for signal, error in question.uncertain.items():
-        words += ["--uncertain", f"{signal}={str(error).replace(' ', '')}"]
-    return tuple(words)
+def options_of(question: Question) -> dict[str, tuple[str, ...]]:
+    """Command-line options that state `question`: name -> the values of all its occurrences."""
+
+    def seconds(value: float | None) -> tuple[str, ...]:
+        return () if value is None else (f"{value!r}s",)
+
+    clock, aged = question.clock, {name: f"{each.how}" for name, each in question.between.items()}
+    aged |= {name: f"hold:{each.age!r}s" for name, each in question.between.items() if each.age is not None}
+    found: dict[str, tuple[str, ...]] = {
+        "--spec": () if question.spec is None else (str(question.spec),),
+        "--system": () if question.system is None else (question.system,),
+        "--map": tuple(f"{name}={value}" for name, value in question.names.items()),
+        "--set": tuple(f"{name}={value}" for name, value in question.overrides.items()),
+        "--resample": seconds(question.resample),
+        "--dt": seconds(question.dt),
+        "--max-gap": seconds(question.max_gap),
+        "--between": tuple(f"{name}={how}" for name, how in aged.items()),
+        "--clock": (f"{clock.name}:{clock.unit}".rstrip(":"),) if clock is not None and clock.name else (),
+        "--fps": () if clock is None or clock.step is None else (repr(1.0 / clock.step),),
+        "--group": (question.group,) if question.group else (),
+        "--columns": (",".join(question.columns),) if question.columns else (),
+        "--uncertain": tuple(
+            f"{signal}={str(error).replace(' ', '')}" for signal, error in question.uncertain.items()
+        ),
+        "--require": question.require,
+        "--at": () if question.at is None else (question.at,),
+        "--end": (question.end,),
+        "--tolerance": (repr(question.tolerance),),
+        "--semantics": (question.semantics,),
+        "--strict": ("",) if question.strict else (),
+    }
+    return {name: values for name, values in found.items() if values}
+
+
+_REPLAYED = (
+    *("--system", "--map", "--set", "--resample", "--dt", "--max-gap", "--between", "--clock", "--fps"),
+    *("--columns", "--uncertain"),
+)
+
+
+def _replayed(question: Question) -> tuple[str, ...]:
+    """Words of a command line that reads the same trace, to explain one of its violations."""
+    given = options_of(question)
+    words = [operand(spec) for spec in given.get("--spec", ())]
+    words += [word for name in _REPLAYED for value in given.get(name, ()) for word in (name, value)]
+    return (*words, *(("--group", "none") if question.group == "none" else ()))
 
 
 def reading_options(monitor: Monitor | None, question: Question) -> Reading:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stlc.cli.check.judge import Work, found, judge
 from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
@@ -147,8 +147,18 @@ def safe_outcomes(work: Work) -> list[Outcome]:
 def outcomes_of(work: Work) -> list[Outcome]:
     """Judge one file and return the outcomes of its objects, usually one. Raises StlcError if that fails."""
     COLOR.set(work.mode)
-    begun = time.perf_counter()
     path = found(work.name, work.runs)
+    outcomes = _outcomes(path, work)
+    if not work.evidence:
+        return outcomes
+    from stlc.cli.check.evidence import evidence_of
+
+    made: Any = {"evidence": evidence_of(path, work.question)}
+    return [replace(each, entry=each.entry | made) for each in outcomes]
+
+
+def _outcomes(path: Path, work: Work) -> list[Outcome]:
+    begun = time.perf_counter()
     if work.chunk or _too_large(path):
         if work.question.uncertain:
             raise usage(f"`--uncertain` needs the whole trace, and {path} does not fit into memory")

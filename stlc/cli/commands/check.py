@@ -35,6 +35,7 @@ from stlc.files import has_wildcard, matching_traces, real, write_atomic
 from stlc.registry import SEMANTICS
 
 if TYPE_CHECKING:
+    from stlc.cli.check.evidence import Repetition
     from stlc.cli.check.outcome import Outcome
 
 MOST_SAMPLES = 2**31 - 1
@@ -52,13 +53,13 @@ MOST_SAMPLES = 2**31 - 1
 )
 def check(
     files: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
             metavar="[SPEC] TRACE…",
             help="Traces (.npz, .csv, .parquet, .mat, .mcap, bags of ROS, or -), or patterns of their "
             "names such as 'logs/**/*.csv', after a spec.",
         ),
-    ],
+    ] = None,
     at: Annotated[
         str | None,
         typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts."),
@@ -112,6 +113,12 @@ def check(
             min=0, metavar="SAMPLES", help="Read in chunks of this size; 0: only if the file is large."
         ),
     ] = 0,
+    again: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RESULT.json", help="Judge the files of a stored --json result again, and compare."
+        ),
+    ] = None,
     reading: given.Traces = given.TRACES,
     json: JsonOption = False,
 ) -> Answer[CheckResult]:
@@ -124,7 +131,8 @@ def check(
     part of the recording the requirement could read, unless it is all, and whether anything triggered it.
     Exit code: 0 all satisfied, 1 violated, 4 inconclusive (trace too short), or satisfied without being fully
     judged and --strict, 5 a file is not judged, as its process was lost
-    each time; with --certify 0 certified, 1 refuted, 4 undecided; with -q nothing is printed.
+    each time; with --certify 0 certified, 1 refuted, 4 undecided; with --again 0 the same result, 1 another;
+    with -q nothing is printed.
     """
     from stlc.cli.check.document import document
     from stlc.cli.check.document import junit as junit_xml
@@ -132,8 +140,12 @@ def check(
     from stlc.cli.check.outcome import exit_code
     from stlc.cli.check.table import require_table, write_table
 
-    spec, names = _split_files(files, reading.spec)
-    traces = _expanded(names, [path for path in (table, out) if path is not None])
+    repetition = None if again is None else _repetition(again, files)
+    if repetition is None:
+        spec, names = _split_files(files or [], reading.spec)
+        traces = _expanded(names, [path for path in (table, out) if path is not None])
+    else:
+        spec, traces = None, repetition.traces
     require_table(table)
     require_no_jobs(cluster, jobs)
     if not 0 <= tolerance < math.inf:
@@ -151,6 +163,8 @@ def check(
     question = reading.question(
         spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics, uncertain=errors, strict=strict
     )
+    if repetition is not None:
+        question = repetition.question
     paths = out_paths(out, traces)
     written = [("--table", table), ("--junit", junit), *(("--out", path) for path in paths)]
     require_separate(written, (spec, reading.system, *traces))
@@ -167,6 +181,7 @@ def check(
                 *(name, question, reading.runs, path, min(chunk, MOST_SAMPLES), color, COLOR.get()),
                 certify=certify is not None,
                 table=table is not None,
+                evidence=json or again is not None,
             )
             for name, path in zip(traces, paths, strict=True)
         ]
@@ -180,8 +195,21 @@ def check(
     if certify is not None:
         code = _bounded(record, outcomes, certify, code)
     open_ = dict.fromkeys(row.name for outcome in outcomes for row in outcome.rows if strict and row.unjudged)
-    show = partial(_print, outcomes, record.get("assurance"), [*open_]) if talk else lambda: None
+    compared: list[str] = []
+    if repetition is not None:
+        compared = repetition.differences([outcome.entry for outcome in outcomes])
+        code, compared = int(bool(compared)), compared or [f"the same result as {visible(str(again))}"]
+    show = partial(_print, outcomes, record.get("assurance"), [*open_], compared) if talk else lambda: None
     return Answer(record, show, code, findings)
+
+
+def _repetition(result: Path, files: Sequence[str] | None) -> Repetition:
+    """The stored result that `--again` names. Raises UsageError (U101) if files are named beside it."""
+    from stlc.cli.check.evidence import Repetition
+
+    if files:
+        raise usage("`--again` judges the files of the stored result", f"stlc check --again {result}")
+    return Repetition(result)
 
 
 def _require_alone(
@@ -213,10 +241,16 @@ def _bounded(record: CheckResult, outcomes: Sequence[Outcome], share: float, cod
     return code if any(outcome.errors for outcome in outcomes) else found.exit_code
 
 
-def _print(outcomes: Sequence[Outcome], assurance: Assurance | None, unjudged: Sequence[str]) -> None:
+def _print(
+    outcomes: Sequence[Outcome],
+    assurance: Assurance | None,
+    unjudged: Sequence[str],
+    compared: Sequence[str],
+) -> None:
     """Print remarks, errors and warnings, then the results of the judged files, then bounds, if any.
 
-    `unjudged` are the requirements that `--strict` counts as not fully judged.
+    `unjudged` are the requirements that `--strict` counts as not fully judged, and `compared` the lines of a
+    comparison with a stored result.
 
     A single result is printed in full. Of several results, those that are not satisfied are printed in full,
     and a summary table follows.
@@ -242,6 +276,8 @@ def _print(outcomes: Sequence[Outcome], assurance: Assurance | None, unjudged: S
         emit(line)
     if assurance is not None:
         emit("\n".join(["", *bounds_lines(assurance)]))
+    for line in compared:
+        emit(line)
 
 
 def _expanded(names: Sequence[str], written: Sequence[Path]) -> list[str]:

@@ -129,11 +129,26 @@ class FactRecord(TypedDict):
 class ClockRecord(TypedDict):
     name: str
     unit: str
+    why: str
     others: list[str]
+
+
+class FileRecord(TypedDict):
+    path: str
+    sha256: str
+    bytes: int
+
+
+class EvidenceRecord(TypedDict):
+    stlc: str
+    trace: FileRecord
+    inputs: list[FileRecord]
+    options: dict[str, list[str]]
 
 
 class CheckedRequirement(TypedDict):
     name: str
+    id: NotRequired[str]
     doc: str
     tags: list[str]
     verdict: Literal["satisfied", "violated", "inconclusive"]
@@ -166,6 +181,7 @@ class CheckedTrace(TypedDict):
     robustness: Num | None
     satisfied_traces: int
     satisfied_share: Num
+    evidence: NotRequired[EvidenceRecord]
     requirements: list[CheckedRequirement]
 
 

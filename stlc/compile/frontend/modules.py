@@ -62,6 +62,11 @@ def library_of(spec: ast.Spec) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def imported_files(spec: ast.Spec) -> list[Path]:
+    """Paths of the files that `spec` imports, and of those that these import."""
+    return [Path(module.spec.source.name) for module in _every(load_modules(spec))]
+
+
 def spec_sha256(text: str, library: Mapping[str, str]) -> str:
     """Return the SHA-256 of a specification and its imports, in hexadecimal digits.
 
