@@ -96,7 +96,7 @@ class Monitor:
         if system is not None:
             found = system if isinstance(system, Source) else str(system)
             self._system, self._interface = system_of(found, self.spec, self._overrides)
-        self._resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
+        self.resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
         self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}
         known = self._given.or_else(self._system)
@@ -110,12 +110,12 @@ class Monitor:
 
     def reads(self, require: Sequence[str] = ()) -> frozenset[str]:
         """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
-        known = [each.name for each in self._resolved.requirements]
+        known = [each.name for each in self.resolved.requirements]
         for name in require:
             if name not in known:
                 raise unknown_requirement(name, known)
-        chosen = [each for each in self._resolved.requirements if not require or each.name in require]
-        formulas = [each.formula for each in (*chosen, *self._resolved.assumptions)]
+        chosen = [each for each in self.resolved.requirements if not require or each.name in require]
+        formulas = [each.formula for each in (*chosen, *self.resolved.assumptions)]
         return frozenset().union(*(columns_of(num) for formula in formulas for num in numbers(formula)))
 
     @property
@@ -306,13 +306,13 @@ class Monitor:
 
     def _lacks(self, times: Times) -> bool:
         """True if the specification needs a time step or horizon that is unknown in `times`."""
-        grid, spec = times.grid(), self._resolved
+        grid, spec = times.grid(), self.resolved
         return any(lacks(grid, each.formula) for each in (*spec.requirements, *spec.assumptions))
 
     def _compile(self, times: Times) -> Compiled:
         grid = times.grid()
         if grid not in self._compiled:
-            self._compiled[grid] = compile_resolved(self._resolved, grid, "check")
+            self._compiled[grid] = compile_resolved(self.resolved, grid, "check")
         return self._compiled[grid]
 
 

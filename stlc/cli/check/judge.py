@@ -192,7 +192,7 @@ def _judged(trace: Trace, loaded: Loaded, question: Question, remarks: tuple[str
         strict=question.strict,
     )
     causes, options = explain_all(verdict), _replayed(question)
-    lint = _lint_codes(loaded.monitor)
+    lint = _lint_codes(loaded.monitor, everywhere=question.at == "all")
     known = (trace, loaded.source, verdict, causes, options, remarks, question.uncertain)
     return Checked(*known, facts=verdict.facts, lint=lint)
 
@@ -325,11 +325,12 @@ def _monitor(
 
 
 @lru_cache(maxsize=8)
-def _lint_codes(monitor: Monitor) -> tuple[str, ...]:
-    """Codes of the warnings that the lint rules have of a specification."""
+def _lint_codes(monitor: Monitor, *, everywhere: bool) -> tuple[str, ...]:
+    """Codes of the warnings that the lint rules have of a specification; `everywhere`: for `--at all`."""
     from stlc.lint.lint import rule_findings
 
-    return tuple(finding.code for finding in rule_findings(monitor.spec))
+    found = rule_findings(monitor.spec, resolved=monitor.resolved)
+    return tuple(each.code for each in found if not (everywhere and each.code == "W311"))
 
 
 # ------------------------------------------------------------------------ instants
