@@ -12,6 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from pygments.lexers import find_lexer_class_by_name
+from pygments.util import ClassNotFound
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -79,6 +81,43 @@ def test_the_configuration_imports_what_exists():
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stlc"):
             module = import_module(str(node.module))
             assert all(hasattr(module, alias.name) for alias in node.names)
+
+
+def test_code_blocks_name_a_language_that_the_site_highlights():
+    """An unknown name is a warning of Sphinx, thus an error of `make site`; GitHub draws `stl` as a solid."""
+    named = {
+        (page.name, language)
+        for page in PAGES
+        for language in re.findall(r"^ *```([\w+-]+)", page.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert [each for each in sorted(named) if not highlighted(each[1])] == []
+
+
+def highlighted(language: str) -> bool:
+    try:
+        return language == "stlc" or bool(find_lexer_class_by_name(language))
+    except ClassNotFound:
+        return False
+
+
+def cells(row: str) -> int:
+    """Number of cells of a row of a table, as Markdown counts them: `|` parts cells even within code."""
+    return len(re.split(r"(?<!\\)\|", row.strip().strip("|")))
+
+
+def test_rows_of_tables_have_as_many_cells_as_their_heads():
+    wrong = []
+    for page in PAGES:
+        width = 0
+        for number, line in enumerate(FENCE.sub(blank, page.read_text(encoding="utf-8")).splitlines(), 1):
+            width = (width or cells(line)) if line.startswith("|") else 0
+            if width and cells(line) != width:
+                wrong.append(f"{page.name}:{number}")
+    assert wrong == []
+
+
+def blank(block: re.Match[str]) -> str:
+    return "\n" * block[0].count("\n")
 
 
 @pytest.mark.slow
