@@ -116,7 +116,7 @@ def argument_usage(param: Any) -> str:
 
 def row(param: Any) -> str:
     if is_argument(param):
-        shown = f"`{(param.metavar or param.name).upper()}`"
+        shown = f"`{escaped((param.metavar or param.name).upper())}`"
     else:
         shown = ", ".join(f"`{option}`" for option in (*param.opts, *param.secondary_opts))
         kind = param.metavar or choices(param)

@@ -72,7 +72,7 @@ def _stopped(code: int, argv: Sequence[str]) -> int:
 
 
 def wants_json(argv: Sequence[str]) -> bool:
-    """True if the options ask for a JSON document: `--json`, `--format json`."""
+    """True if the options ask for a JSON document: `--json` or `--format json`."""
     options = list(argv[: argv.index("--")] if "--" in argv else argv)
     joined = {f"{option}={value}" for option, value in pairwise([*options, ""])}
     return bool({"--json", "--format=json"} & ({*options} | joined))
