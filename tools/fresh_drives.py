@@ -32,16 +32,16 @@ def main() -> None:
         end = time.process_time() + options.seconds
         found = closed_loop(run, lambda end=end: end - time.process_time())
         for share in found.shares:
-            print(f"{run.task.compiled.name}: {share.guard} {share.satisfied} of {share.drives}", flush=True)
+            print(f"{run.task.compiled.name}: {share.guard} {share.satisfied} of {share.runs}", flush=True)
         best = found.recommended
         if best is None:
-            print(f"{run.task.compiled.name}: not driven {found.why}", flush=True)
+            print(f"{run.task.compiled.name}: nothing is recommended {found.why}".rstrip(), flush=True)
             continue
         fresh = fresh_share(run, best.guard, options.drives)
         low, high = best.interval
         print(
             f"{run.task.compiled.name}: {best.guard} recommended, {best.share:.3f} "
-            f"in [{low:.3f}, {high:.3f}]; fresh {fresh.satisfied} of {fresh.drives}, "
+            f"in [{low:.3f}, {high:.3f}]; fresh {fresh.satisfied} of {fresh.runs}, "
             f"difference {abs(fresh.share - best.share):.3f}",
             flush=True,
         )

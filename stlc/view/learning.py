@@ -128,8 +128,9 @@ def recommended(record: Mapping[str, Any]) -> str:
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
     """Lines on the closed-loop results of a run: one line per guard, then the recommended guard.
 
-    The best guard comes first. The list is empty if `result` contains no closed-loop results. If no
-    simulation was possible, the only line states the reason.
+    The best guard comes first. All lines count drives from the same initial states; guards are compared only
+    then. The list is empty if `result` contains no closed-loop results. If no simulation was possible, the
+    only line states the reason.
     """
     found = result.get("closed_loop")
     if not isinstance(found, Mapping):
@@ -142,12 +143,18 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
         best = found.get("recommended")
         first = sorted(guards, key=lambda each: each.get("guard") != best)
         lines = [_driven_line(each) for each in first]
-        lines += [line for each in first if (line := _changed_line(each))]
+        left_out = [guard_words(name).noun for name in found.get("left_out") or ()]
+        if left_out:
+            lines.append(f"too few drives in the time to compare {' and '.join(left_out)}")
+        if len({each["drives"] for each in guards}) > 1:
+            return lines  # a record of an older version, which counted different starts
+        if any(each["guard"] == "none" for each in guards):
+            lines += [_changed_line(each) for each in first if each["guard"] != "none"]
         if best in GUARDS:
-            words = GUARDS[str(best)]
-            lines.append(
-                f"recommended: {words.noun} (`{words.option or 'stlc simulate'}`), by what was driven"
-            )
+            option = " ".join(filter(None, ("stlc simulate", GUARDS[str(best)].option)))
+            better = max(each["share"] for each in guards) > first[0]["share"]
+            why = ", the cheapest within 2 % of the best" if better else ""
+            lines.append(f"recommended after these drives: {GUARDS[str(best)].noun} (`{option}`){why}")
         return lines
     except (KeyError, TypeError, ValueError):  # a damaged or foreign record
         return []
@@ -166,17 +173,13 @@ def _driven_line(each: Mapping[str, Any]) -> str:
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
-    """Line that compares the closed-loop runs with a guard to the same runs without a guard.
-
-    The line tells how many runs satisfy their requirements only with the guard, and how many only without it.
-    The line is "" if there are no runs to compare.
-    """
-    if not each.get("compared"):
-        return ""
+    """Line on the verdicts that a guard changes: drives that are satisfied only with it, or only without."""
+    changed, noun = each["gained"] + each["lost"], guard_words(each["guard"]).noun
+    if not changed:
+        return f"{noun} changes no verdict"
     return (
-        f"{guard_words(each['guard']).noun} changes {each['gained'] + each['lost']:,} of "
-        f"{each['compared']:,} drives: {each['gained']:,} are satisfied only with it, "
-        f"{each['lost']:,} only without"
+        f"{noun} changes the verdicts of {changed:,} of {each['drives']:,} drives: "
+        f"{each['gained']:,} satisfied only with it, {each['lost']:,} only without"
     )
 
 

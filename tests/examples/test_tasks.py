@@ -81,6 +81,7 @@ def test_a_minute_of_training_satisfies_the_task(
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["result"]["closed_loop"]
     (run,) = every_run(tmp_path)
+    assert told["recommended"] is not None, told
     fresh = fresh_share(Run.open(run.path), told["recommended"], DRIVES)
     with capsys.disabled():
         print(name, told["recommended"], told["share"], told["interval"], fresh)  # noqa: T201

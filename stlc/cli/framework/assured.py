@@ -339,6 +339,7 @@ class ClosedLoopRecord(TypedDict):
     share: Num | None
     interval: list[Num] | None
     guards: list[GuardResult]
+    left_out: list[Literal["none", "paper", "full"]]
     seed: int
     steps: int
     judge: str | None

@@ -5,9 +5,8 @@ intervenes, and the visited states differ from the training distribution. Theref
 from random seeds that neither training nor `stlc simulate` uses by default, and the runs are judged as `stlc
 simulate` judges them.
 
-All guards are simulated from the same initial states. A more expensive guard is simulated only if some runs
-fail under the cheaper ones. The remaining time is spent on more runs of the guards that may still be the
-best.
+All guards are simulated, counted and compared from the same initial states. A more expensive guard is
+simulated only if some runs fail under the cheaper ones. The remaining time is spent on more initial states.
 """
 
 from __future__ import annotations
@@ -49,9 +48,7 @@ NARROW = 0.005
 NEAR = 0.02
 """Largest difference in share at which the cheaper of two guards is recommended."""
 LEAST = 20
-"""A guard with at least this number of runs is compared by its share alone, without a probability test."""
-SURE = 0.9
-"""Probability of being better at which a guard with fewer than `LEAST` runs is recommended."""
+"""Minimum number of common initial states from which guards are compared, and one is recommended."""
 FEWER = 4
 """Factor by which the number of agents is reduced if a seed takes too long."""
 
@@ -66,16 +63,14 @@ class Share:
         satisfied: number of runs that satisfy the mission. The mission consists of the rules that the system
             file names (`test: judge`); if it names none, it is the specification.
         safe: number of runs that satisfy the requirements tagged `@safety`; None if there are none.
-        compared: number of runs that were also made without a guard from the same initial states.
-        gained: number of compared runs that satisfy the mission only with the guard.
-        lost: number of compared runs that satisfy the mission only without the guard.
+        gained: number of runs that satisfy the mission, and without a guard do not.
+        lost: number of runs that violate the mission, and without a guard do not.
     """
 
     guard: Mode
     runs: int
     satisfied: int
     safe: int | None
-    compared: int = 0
     gained: int = 0
     lost: int = 0
 
@@ -89,15 +84,6 @@ class Share:
         """95 % Wilson interval of the share."""
         return wilson(self.share, self.runs)
 
-    def better_than(self, other: Share) -> bool:
-        """True if this guard's share of satisfying runs exceeds that of `other` by more than `NEAR`.
-
-        If this guard has fewer than `LEAST` runs, a second condition must hold: with a probability of at
-        least `SURE`, its true share exceeds that of `other` by more than `NEAR`.
-        """
-        better = self.share > other.share + NEAR
-        return better and (self.runs >= LEAST or _superiority(self, other, NEAR) >= SURE)
-
     def summary(self) -> dict[str, object]:
         """The counts and shares under one guard as a JSON object."""
         safe = None if self.safe is None else self.safe / self.runs
@@ -108,7 +94,7 @@ class Share:
             "share": self.share,
             "interval": list(self.interval),
             "safe": safe,
-            "compared": self.compared,
+            "compared": 0 if self.guard == "none" else self.runs,
             "gained": self.gained,
             "lost": self.lost,
         }
@@ -119,32 +105,35 @@ class ClosedLoop:
     """Closed-loop results of a trained policy.
 
     Attributes:
-        shares: results of the simulated guards, one entry per guard, the cheapest guard first; empty if no
-            run was completed.
+        shares: results of the compared guards from the same initial states, one entry per guard, the cheapest
+            guard first; empty if no run was completed.
         steps: length of a run in steps.
         judge: name of the specification that judges the runs; None if the specification of the plans judges
             them.
         why: message of the error that prevented every run; empty if there was none.
+        left_out: guards that might be better, and made fewer than `LEAST` runs from the initial states of the
+            others in the time.
     """
 
     shares: tuple[Share, ...]
     steps: int
     judge: str | None = None
     why: str = ""
+    left_out: tuple[Mode, ...] = ()
 
     @property
     def recommended(self) -> Share | None:
         """Counts of the recommended guard: the cheapest one that is nearly as good as the best one.
 
         Guards are compared by the share of runs that satisfy the mission. A share that is at most `NEAR`
-        lower counts as nearly as good. A more expensive guard with few runs is preferred only if it is better
-        with high probability (see `Share.better_than`). None if there are no runs.
+        lower counts as nearly as good. None if there are fewer than `LEAST` runs, or if the cheapest guard
+        was compared with none of those that might be better.
         """
-        best: Share | None = None
-        for share in self.shares:
-            if best is None or share.better_than(best):
-                best = share
-        return best
+        alone = len(self.shares) == 1 and bool(self.left_out)
+        if not self.shares or self.shares[0].runs < LEAST or alone:
+            return None
+        best = max(share.share for share in self.shares)
+        return next(share for share in self.shares if share.share >= best - NEAR)
 
     def summary(self) -> dict[str, object]:
         """The recommended guard and the results of all guards as a JSON object."""
@@ -154,28 +143,12 @@ class ClosedLoop:
             "share": None if best is None else best.share,
             "interval": None if best is None else list(best.interval),
             "guards": [share.summary() for share in self.shares],
+            "left_out": list(self.left_out),
             "seed": SEED,
             "steps": self.steps,
             "judge": self.judge,
             "why": self.why,
         }
-
-
-def _superiority(first: Share, second: Share, by: float) -> float:
-    """Probability that the true share of `first` exceeds that of `second` by more than `by`.
-
-    The prior distributions of both shares are uniform.
-    """
-    grid = np.linspace(0.0, 1.0, 2001)
-    good = np.log(np.maximum(grid, np.finfo(np.float64).tiny))
-    mass = []
-    for share in (first, second):
-        failed = share.runs - share.satisfied
-        log = share.satisfied * good + failed * good[::-1]  # the density itself underflows with many runs
-        density = np.exp(log - log.max())
-        mass.append(density / density.sum())
-    below = np.interp(grid + by, grid, np.cumsum(mass[0]))
-    return float(((1.0 - below) * mass[1]).sum())
 
 
 class _LateError(Exception):
@@ -230,7 +203,8 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
         trial.simulate()
     except StlcError as error:
         return ClosedLoop((), test.steps, why=error.diagnostics[0].message)
-    return ClosedLoop(trial.shares(), test.steps, None if rules is None else rules.name)
+    judge, shares = None if rules is None else rules.name, trial.shares()
+    return ClosedLoop(shares, test.steps, judge, left_out=trial.left_out(shares))
 
 
 def fresh_share(run: Run, guard: Mode, runs: int, seed: int = 0) -> Share:
@@ -261,64 +235,68 @@ class _Trial:
 
     def simulate(self) -> None:
         """Simulate seeds until the time is used up, or until it is clear enough which guard is best."""
-        while (mode := self._next()) is not None:
-            self._more(mode)
+        while self.left() > 0.0 and (further := self._next()) is not None:
+            self._more(*further)
 
-    def _next(self) -> Mode | None:
-        """Guard to simulate next; None if the time is used up or no further runs are needed.
+    def _next(self) -> tuple[Mode, int] | None:
+        """Guard to simulate next and number of seeds; None if no further runs are needed or possible.
 
         At first, guards are simulated once each, from the cheapest one up to the first guard under which all
-        runs satisfy the mission. After that, a guard is left out if its confidence interval lies below the
-        best share of satisfying runs. Of the other guards, the one with the widest confidence interval is
-        returned.
+        runs satisfy the mission. Then a guard that has fewer seeds than others catches up. If all have the
+        same seeds, their number is doubled, unless the confidence interval of every guard that may be the
+        best is narrow.
         """
-        if self.left() <= 0.0:
-            return None
         for mode in COMPARED:
             known = self.known[mode]
             if known.seeds and known.share == 1.0:
                 break
             if not known.seeds and not known.given_up:
-                return mode
+                return mode, 1
         simulated = {mode: known for mode, known in self.known.items() if known.seeds and not known.given_up}
-        best = max((known.share for known in simulated.values()), default=0.0)
-        wide = {
-            mode: known.interval[1] - known.interval[0]
-            for mode, known in simulated.items()
-            if known.interval[1] >= best and len(known.found) < self.most
-        }
-        if not wide:
+        if not simulated:
             return None
-        mode = max(wide, key=wide.__getitem__)
-        return None if wide[mode] <= 2.0 * NARROW else mode
+        most = max(known.seeds for known in simulated.values())
+        for mode, known in simulated.items():
+            if known.seeds < most:
+                count = min(most - known.seeds, known.seeds, self._seeds_in_time([known]))
+                known.given_up = count < 1
+                return None if known.given_up else (mode, count)
+        best = max(known.share for known in simulated.values())
+        wide = any(
+            known.interval[1] - known.interval[0] > 2.0 * NARROW
+            for known in simulated.values()
+            if known.interval[1] >= best
+        )
+        first, known = next(iter(simulated.items()))
+        room = -(-(self.most - len(known.found)) // known.agents)
+        count = min(most, room, self._seeds_in_time([*simulated.values()]))
+        return (first, count) if wide and count >= 1 else None
 
-    def _more(self, mode: Mode) -> None:
-        """Simulate further seeds under the guard `mode` and store their results.
+    def _seeds_in_time(self, guards: Sequence[_Known]) -> int:
+        """Number of further seeds under each of `guards` for which the remaining time suffices."""
+        cost = sum(known.cost for known in guards)
+        return int(0.6 * self.left() / cost) if cost else 1
 
-        The first call simulates one seed. Each later call simulates as many seeds as all calls before, or
-        fewer if the remaining time does not suffice. If the first seed takes too long, the number of agents
-        is reduced.
+    def _more(self, mode: Mode, count: int) -> None:
+        """Simulate `count` further seeds under the guard `mode` and store their results.
+
+        If the first seed takes too long, the number of agents is reduced, also that of further seeds under
+        the other guards.
         """
         known = self.known[mode]
-        count = 1
-        if known.seeds:
-            time_for = int(0.6 * self.left() / known.cost) if known.cost else 1
-            room = -(-(self.most - len(known.found)) // known.agents)
-            count = min(max(1, known.seeds), room, time_for)
-            if count < 1:
-                known.given_up = True
-                return
         seeds = tuple(range(self.seed + known.seeds, self.seed + known.seeds + count))
+        used = [each.agents for each in self.known.values() if each.seeds]
+        agents = min(used) if known.seeds else known.agents
         whole = self.left()
         try:
-            recording = self._simulated(mode, seeds, known.agents, share=1.0 if known.seeds else 0.5)
+            recording = self._simulated(mode, seeds, agents, share=1.0 if known.seeds else 0.5)
         except _LateError:
             known.given_up = bool(known.seeds) or known.agents == 1 or self.left() <= 0.0
             known.agents = max(1, known.agents // FEWER)
             return
         good, safe = self._judged(recording)
         for row in range(len(good)):
-            where, agent = divmod(row, known.agents)
+            where, agent = divmod(row, agents)
             known.found[seeds[where], agent] = bool(good[row]), None if safe is None else bool(safe[row])
         known.cost = (whole - self.left()) / count
         known.seeds += count
@@ -363,23 +341,35 @@ class _Trial:
         return obeying(found, rows), safe
 
     def shares(self) -> tuple[Share, ...]:
-        """Counts of the runs under each simulated guard, the cheapest guard first."""
-        free = self.known["none"].found
-        shares = []
+        """Counts of the runs under each compared guard, from their common initial states, cheapest first.
+
+        A guard with fewer than `LEAST` runs from the initial states of the cheaper ones is left out.
+        """
+        compared: dict[Mode, _Known] = {}
+        starts: set[tuple[int, int]] = set()
         for mode, known in self.known.items():
-            if not known.found:
-                continue
-            both = [(good, free[start][0]) for start, (good, _) in known.found.items() if start in free]
-            safe = [kept for _, kept in known.found.values()]
+            common = starts & known.found.keys() if compared else set(known.found)
+            if common and (not compared or len(common) >= LEAST):
+                compared[mode], starts = known, common
+        free = compared["none"].found if "none" in compared else {}
+        shares = []
+        for mode, known in compared.items():
+            safe = [known.found[start][1] for start in starts]
+            pairs = [(known.found[start][0], free.get(start, known.found[start])[0]) for start in starts]
             shares.append(
                 Share(
                     mode,
-                    runs=len(known.found),
-                    satisfied=sum(good for good, _ in known.found.values()),
+                    runs=len(starts),
+                    satisfied=sum(good for good, _ in pairs),
                     safe=None if None in safe else sum(map(bool, safe)),
-                    compared=0 if mode == "none" else len(both),
-                    gained=sum(good and not alone for good, alone in both) if mode != "none" else 0,
-                    lost=sum(alone and not good for good, alone in both),
+                    gained=sum(good and not alone for good, alone in pairs),
+                    lost=sum(alone and not good for good, alone in pairs),
                 )
             )
         return tuple(shares)
+
+    def left_out(self, shares: Sequence[Share]) -> tuple[Mode, ...]:
+        """Guards that are not among `shares` although they are cheaper than a guard without a failure."""
+        perfect = next((share.guard for share in shares if share.share == 1.0), None)
+        wanted = COMPARED if perfect is None else COMPARED[: COMPARED.index(perfect)]
+        return tuple(mode for mode in wanted if mode not in {share.guard for share in shares})
