@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
@@ -110,9 +111,9 @@ class TrainingDisplay:
 
     def chosen(self, engine: Mapping[str, Any]) -> None:
         """Print the options that the training selected, such as the batch size, and the back ends it uses."""
-        self._print(f"  engine          {engine_text(engine)}")
+        self._print(f"  method          {engine_text(engine)}")
         if "by_torch" in engine:
-            self._print(f"  computed by     {native_text(engine['by_torch'])}")
+            self._print(f"  engine          {native_text(engine['by_torch'])}")
 
     def update(self, row: Mapping[str, Any]) -> None:
         """Update the display with a row of `train.jsonl`, which may contain only some of the keys."""
@@ -136,8 +137,9 @@ class TrainingDisplay:
         They are printed on the console `to`. If `to` is None, they are printed on the console of the panel.
         """
         self.stop()
+        console = to or self.console
         for line in lines:
-            (to or self.console).print(_emphasised(self._plain(line)), soft_wrap=True)
+            console.print(_emphasised(_folded(self._plain(line), console, 16)), soft_wrap=True)
 
     @property
     def spark(self) -> str:
@@ -154,7 +156,7 @@ class TrainingDisplay:
         return text if self._unicode else text.replace("·", "|")
 
     def _print(self, text: str) -> None:
-        self.console.print(Text(self._plain(text)), soft_wrap=True)
+        self.console.print(Text(_folded(self._plain(text), self.console, 18)), soft_wrap=True)
 
     def _steps(self) -> int | None:
         steps = self._row.get("steps")
@@ -214,6 +216,16 @@ class TrainingDisplay:
         return Group(*texts)
 
 
+def _folded(text: str, console: Console, indent: int) -> str:
+    """Break a line between words where a terminal would break it within one; further lines are indented."""
+    if not console.file.isatty() or len(text) <= console.width:
+        return text
+    beneath = " " * indent
+    return textwrap.fill(
+        text, console.width, subsequent_indent=beneath, break_long_words=False, break_on_hyphens=False
+    )
+
+
 def _spread(left: str, right: str, width: int) -> tuple[str, ...]:
     """Return one line with `left` and `right` at its two ends; two lines if they do not fit into `width`."""
     gap = width - len(left) - len(right)
@@ -268,10 +280,10 @@ def native_text(by_torch: Mapping[str, str]) -> str:
     """
     native = [part for part, reason in by_torch.items() if not reason]
     reasons = dict.fromkeys(reason for reason in by_torch.values() if reason)
-    lines = [f"{', '.join(native)}: C"] if native else []
+    lines = [f"compiled C ({', '.join(native)})"] if native else []
     for why in reasons:
         parts = ", ".join(part for part, reason in by_torch.items() if reason == why)
-        lines.append(f"{parts}: torch ({why})")
+        lines.append(f"torch ({parts}: {why})")
     return " · ".join(lines)
 
 

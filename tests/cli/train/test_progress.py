@@ -257,7 +257,7 @@ def test_what_the_engine_chose_is_said():
     chosen = {"method": "guided", "hidden": [64, 64], "plans": 4, "batch": 256, "hard": 128, "lr": 1e-3}
     progress.chosen({**chosen, "margin": 0.0512, "samples": 0})
     assert stream.getvalue().splitlines()[1] == (
-        "  engine          guided · 4 plans of a network 64x64 · 256 fresh + 128 hard states a step"
+        "  method          guided · 4 plans of a network 64x64 · 256 fresh + 128 hard states a step"
         " · rate 0.001 · margin 0.0512"
     )
     fixed = {**chosen, "method": "gradient", "plans": 1, "hard": 0, "samples": 50000, "margin": 0.5}
@@ -269,9 +269,9 @@ def test_which_parts_run_as_c_is_said():
     progress.start(*INFO)
     chosen = {"method": "guided", "hidden": [8], "plans": 1, "batch": 9, "hard": 0, "lr": 1.0, "margin": 0.1}
     progress.chosen({**chosen, "by_torch": {"verdicts": "", "search": "", "gradient": ""}})
-    assert stream.getvalue().splitlines()[2] == "  computed by     verdicts, search, gradient: C"
-    assert native_text({"verdicts": "", "gradient": "why"}) == "verdicts: C · gradient: torch (why)"
-    assert native_text({"verdicts": "why", "gradient": "why"}) == "verdicts, gradient: torch (why)"
+    assert stream.getvalue().splitlines()[2] == "  engine          compiled C (verdicts, search, gradient)"
+    assert native_text({"verdicts": "", "gradient": "why"}) == "compiled C (verdicts) · torch (gradient: why)"
+    assert native_text({"verdicts": "why", "gradient": "why"}) == "torch (verdicts, gradient: why)"
 
 
 def test_the_closing_screen_says_what_remains_and_where_it_is_drawn():
@@ -287,3 +287,16 @@ def test_the_engine_of_a_learner_from_rewards() -> None:
         "ppo · one control a step of a network 64x64 · 512 episodes side by side · rate 0.001 · reward task"
     )
     assert engine_text(engine) == text
+
+
+@given(width=st.integers(40, 140))
+def test_in_a_terminal_lines_break_between_words(width):
+    stream = Terminal()
+    display = TrainingDisplay(Console(file=stream, width=width, force_terminal=True, no_color=True))
+    lines = final_screen(RESULT, region=REGION, picture="runs/traffic/0001-quiet-heron/failures.png")
+    display.finish(lines)
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", stream.getvalue()).splitlines()
+    assert all(len(line) <= width or len(line.split()) == 1 for line in shown)
+    assert " ".join(shown).split() == " ".join(lines).split()
+    beneath = [line for line in shown if line.startswith(" ")]
+    assert all(line.startswith(" " * 16) and not line[16].isspace() for line in beneath)
