@@ -119,25 +119,26 @@ def drives_of(simulation: Mapping[str, Any] | None) -> dict[str, Mapping[str, An
     return {name: drives for name, drives in found.items() if isinstance(drives, Mapping)}
 
 
-def obeyed_sentence(simulation: Mapping[str, Any]) -> str:
-    """Sentence `198 of 200 drives obeyed every rule; without the guard 150`, from `eval/simulate.json`.
+def satisfied_sentence(simulation: Mapping[str, Any]) -> str:
+    """Sentence `198 of 200 drives satisfied driving_rules; without the guard 150`, from `eval/simulate.json`.
 
-    A drive is the closed-loop run of one agent with one seed. The rules are those of the separate
-    specification for drives. If there is none, the sentence counts the drives that satisfy, from every
-    instant on, the specification for which the controls were planned. It is "" if the file contains no
-    drives.
+    A drive is the closed-loop run of one agent with one seed, in the scenario that the sentence names. It is
+    judged by the separate specification for drives. If there is none, the sentence counts the drives that
+    satisfy, from every instant on, the specification of the plans. It is "" if the file contains no drives.
     """
     each = drives_of(simulation)
     if not each:
         return ""
     name, drives = list(each.items())[-1]
-    planned = f"satisfied {simulation['spec']} from every start"
-    did = "obeyed every rule" if simulation.get("judge") else planned
-    words = f"{drives['obeyed']} of {count(drives['count'], 'drive')} {did}"
+    judge, scenario = simulation.get("judge"), simulation.get("scenario")
+    what = judge["spec"] if judge else f"{simulation['spec']} at every instant"
+    words = f"{drives['obeyed']:,} of {count(drives['count'], 'drive')} satisfied {what}"
+    if scenario:
+        words = f"In scenario {scenario}, {words}"
     if drives["undecided"]:
-        words += f", {drives['undecided']} ended too early to say"
+        words += f", {drives['undecided']:,} ended too early to say"
     if name != "none" and "none" in each:
-        words += f"; without the guard {each['none']['obeyed']}"
+        words += f"; without the guard {each['none']['obeyed']:,}"
     return words
 
 
@@ -150,7 +151,7 @@ CAUSES = {
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:
-    """Sentence with the number of lost drives, and with the number of other drives that obeyed every rule.
+    """Sentence with the number of lost drives, and with the number of others that satisfied the requirements.
 
     A drive is the closed-loop run of one agent with one seed. A drive is lost if no satisfying plan is known
     from its start, or after an exogenous event. The sentence is "" if no drive was lost.
@@ -167,9 +168,8 @@ def viable_sentence(simulation: Mapping[str, Any]) -> str:
         number = f"{later:,}" if parts else count(later, "drive")
         were = "was" if later == 1 else "were"
         parts.append(f"{number} {were} lost by an exogenous event after which no plan is known")
-    return (
-        f"{', and '.join(parts)}: {drives['obeyed']} of the {drives['count'] - drives['lost']} others obeyed"
-    )
+    others = drives["count"] - drives["lost"]
+    return f"{', and '.join(parts)}: {drives['obeyed']} of the {others} others satisfied it"
 
 
 def cause_words(broken: Mapping[str, Any]) -> str:

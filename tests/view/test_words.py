@@ -7,7 +7,7 @@ from stlc.view.words import (
     count,
     interval,
     number,
-    obeyed_sentence,
+    satisfied_sentence,
     seconds,
     share,
     spread,
@@ -67,27 +67,30 @@ def drives(obeyed, lost=0, undecided=0, count=200, told=0):
     return {"drives": each}
 
 
-def test_how_many_drives_obeyed():
+def test_how_many_drives_are_satisfied():
     guards = {"none": drives(181), "paper": drives(200)}
     simulation = {"spec": "traffic", "judge": {"spec": "driving_rules"}, "guards": guards}
-    assert obeyed_sentence(simulation) == "200 of 200 drives obeyed every rule; without the guard 181"
+    told = "200 of 200 drives satisfied driving_rules; without the guard 181"
+    assert satisfied_sentence(simulation) == told
     assert viable_sentence(simulation) == ""
+    windy = {**simulation, "scenario": "gusts"}
+    assert satisfied_sentence(windy) == f"In scenario gusts, {told}"
     alone = {**simulation, "judge": None, "guards": {"none": drives(0, 1, 1, 1)}}
-    assert obeyed_sentence(alone) == (
-        "0 of 1 drive satisfied traffic from every start, 1 ended too early to say"
+    assert satisfied_sentence(alone) == (
+        "0 of 1 drive satisfied traffic at every instant, 1 ended too early to say"
     )
     assert viable_sentence(alone) == (
-        "1 drive was lost from the start, where no plan is known: 0 of the 0 others obeyed"
+        "1 drive was lost from the start, where no plan is known: 0 of the 0 others satisfied it"
     )
     some = {**simulation, "guards": {"full": drives(190, 8)}}
-    assert obeyed_sentence(some) == "190 of 200 drives obeyed every rule"
+    assert satisfied_sentence(some) == "190 of 200 drives satisfied driving_rules"
     assert viable_sentence(some) == (
-        "8 drives were lost from the start, where no plan is known: 190 of the 192 others obeyed"
+        "8 drives were lost from the start, where no plan is known: 190 of the 192 others satisfied it"
     )
     told = {**simulation, "guards": {"full": drives(190, 10, told=2)}}
     assert viable_sentence(told) == (
         "8 drives were lost from the start, where no plan is known, and 2 were lost by an exogenous "
-        "event after which no plan is known: 190 of the 190 others obeyed"
+        "event after which no plan is known: 190 of the 190 others satisfied it"
     )
     only = {**simulation, "guards": {"full": drives(198, 1, told=1)}}
     assert viable_sentence(only).startswith("1 drive was lost by an exogenous event")

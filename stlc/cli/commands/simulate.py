@@ -113,7 +113,7 @@ def simulate(
     windows: Annotated[
         bool,
         typer.Option(
-            "--windows", help="Also show results on plans, such as the share that satisfies the spec."
+            "--windows", help="Also show results on plans and planning windows, such as plan accuracy."
         ),
     ] = False,
     method: PlannerOption = None,

@@ -529,6 +529,7 @@ class BrokenRun(TypedDict):
 class JudgedRuns(TypedDict):
     count: Count
     obeyed: Count
+    safe: Count | None
     undecided: Count
     lost: Count
     told: Count

@@ -15,7 +15,7 @@ Record: TypeAlias = "Mapping[str, Any]"
 
 MOST_LISTED = 12
 MOST_BROKEN = 6
-"""Maximum number of listed drives that violated rules."""
+"""Maximum number of listed drives that violate requirements."""
 ERRORS = {
     "actuator_gain": "wrong: gains of actuators",
     "parameters": "wrong: numbers of the dynamics",
@@ -23,20 +23,16 @@ ERRORS = {
     "sensor_noise": "noise: what agents see",
 }
 """Model errors of a scenario, in words."""
-COMPARED = ("obeyed every rule", "plan accuracy")
-"""Columns of the comparison of scenarios; lost drives are not counted."""
 
 
 def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     """Lines of text that show the results of a simulation, whose record is `document`.
 
-    Results on drives (closed-loop runs) are always shown. Results on plans, such as the share of satisfying
-    plans, are shown if `windows` is True. They are also shown if the system names no specification for
-    drives, because drives are then judged by the specification of the plans.
+    These are results on drives (closed-loop runs). Results on plans and planning windows, such as the share
+    of satisfying plans, are shown if `windows` is True.
     """
     from stlc.cli.framework.output import table
 
-    windows = windows or document["judge"] is None
     guards = document["guards"]
     seeds, agents, steps = len(document["seeds"]), document["agents"], document["steps"]
     size = f"{seeds} seed{'s' * (seeds > 1)} x {agents} agents x {steps} steps"
@@ -52,18 +48,18 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     yield from _drives(document)
     header = ("", *(guard_words(name).title for name in guards))
     shares = _shares(guards, safe=bool(document.get("safety", True))) if windows else ()
-    yield table([*_rules(document), *shares, *_progress(guards), *_times(guards)], header=header)
+    yield table([*_counts(guards), *_progress(guards), *_times(guards), *shares], header=header)
     for name, guard in guards.items():
         if name != "none":
             yield f"  guard acted in {_acted(guard['decisions'])}"
     last = list(guards.values())[-1]
-    yield from _broken(last["drives"])
+    yield from _broken(last["drives"], judged="" if document["judge"] else "judged from ")
     if windows and document.get("safety", True):
         yield f"  {_unsafe(last['unsafe'], seeds * agents)}"
     if windows:
         yield from _foreseen(last["metrics"].get("foreseen"))
     if document.get("scenarios"):
-        yield from compared(document)
+        yield from compared(document, windows=windows)
 
 
 def _starts(document: Record) -> Iterator[str]:
@@ -78,43 +74,49 @@ def _drives(document: Record) -> Iterator[str]:
 
     A drive is lost if no satisfying plan was known at its start, or after an exogenous event.
     """
-    from stlc.view.words import obeyed_sentence, viable_sentence
+    from stlc.view.words import satisfied_sentence, viable_sentence
 
-    yield f"  {obeyed_sentence(document)}"
+    yield f"  {satisfied_sentence(document)}"
     lost = viable_sentence(document)
     if lost:
         yield f"  {lost}"
     judge = document["judge"]
     if judge is None:
-        yield f"  {document['system']} names no specification of drives (test: judge); plans' is taken"
+        yield f"  judged as plans are; {document['system']} has no rules for drives (test: judge)"
     else:
         yield f"  judged by {judge['path']}"
 
 
-def _rules(document: Record) -> Iterator[tuple[str, ...]]:
-    """Table rows: name of a requirement on drives, then one cell per guard, such as `37 of 40`."""
-    guards = [guard["drives"] for guard in document["guards"].values()]
-    for name in guards[-1]["rules"]:
-        yield (name, *(f"{each['rules'][name]['obeyed']} of {each['count']}" for each in guards))
+def _counts(guards: Mapping[str, Record]) -> Iterator[tuple[str, ...]]:
+    """Table rows with one cell per guard, such as `37 of 40`: the drives that satisfy each requirement.
+
+    Two more rows count the drives that satisfy all requirements, and all that are tagged `@safety`.
+    """
+    each = [guard["drives"] for guard in guards.values()]
+    for name in each[-1]["rules"]:
+        yield (name, *(f"{drives['rules'][name]['obeyed']} of {drives['count']}" for drives in each))
+    for label, key in (("satisfied", "obeyed"), ("safe", "safe")):
+        if all(drives[key] is not None for drives in each):
+            yield (label, *(f"{drives[key]} of {drives['count']}" for drives in each))
 
 
-def _broken(drives: Record) -> Iterator[str]:
-    """Lines such as `broken by seed 3, agent 7: full_stop (4.3 s)` on drives that broke a requirement.
+def _broken(drives: Record, judged: str) -> Iterator[str]:
+    """Lines such as `violated: seed 3, agent 7: full_stop (4.3 s)` on drives that violate a requirement.
 
     A drive is the closed-loop run of one agent with one seed. Only the first few drives are listed. Viable
-    drives, for which a satisfying plan was known, come first.
+    drives, for which a satisfying plan was known, come first. `judged` stands before times.
     """
     from stlc.view.words import cause_words
 
     for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
         rules = ", ".join(
-            name if time is None else f"{name} ({time:.3g} s)" for name, time in each["rules"].items()
+            name if time is None else f"{name} ({judged}{time:.3g} s)" for name, time in each["rules"].items()
         )
         cause = cause_words(each)
-        yield f"  broken by seed {each['seed']}, agent {each['agent']}: {rules}{cause and f'; {cause}'}"
+        yield f"  violated: seed {each['seed']}, agent {each['agent']}: {rules}{cause and f'; {cause}'}"
     more = len(drives["broken"]) - MOST_BROKEN
     if more > 0:
-        yield f"  broken by {more} more: see eval/simulate.json"
+        yield f"  violated in {more} more: see eval/simulate.json"
 
 
 def _foreseen(foreseen: Record | None) -> Iterator[str]:
@@ -135,37 +137,30 @@ def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
         yield f"  exact, as conditions or limits read them: {listing(errors['exact'])}"
 
 
-def compared(document: Record) -> Iterator[str]:
+def compared(document: Record, *, windows: bool = False) -> Iterator[str]:
     """Lines of a table that compares all scenarios, one row per scenario.
 
-    Each row has two cells per guard. The first is the number of drives (closed-loop runs) that obeyed every
-    requirement, among those for which a satisfying plan was known. The second is the share of plans that
-    satisfy the specification.
+    Each row has a cell per guard: the number of drives (closed-loop runs) that satisfy every requirement. If
+    `windows` is True, each guard has a second cell: the share of plans that satisfy the specification.
     """
     from stlc.cli.framework.output import table
 
     guards = list(document["guards"])
-    header = ("scenario", *(f"{guard_words(name).title}: {label}" for name in guards for label in COMPARED))
+    labels = ["satisfied", *(["plan accuracy"] if windows else [])]
+    header = ("scenario", *(f"{guard_words(name).title}: {label}" for name in guards for label in labels))
     rows = []
-    for name, each in {"as it is": document, **document["scenarios"]}.items():
+    for name, each in {"none": document, **document["scenarios"]}.items():
         cells: list[str] = []
         for guard in guards:
             found = each["guards"].get(guard)
-            cells += ["", ""] if found is None else _both(found)
+            if found is None:
+                cells += [""] * len(labels)
+                continue
+            cells.append(f"{found['drives']['obeyed']} of {found['drives']['count']}")
+            cells += [_number(found["metrics"]["plan_accuracy"], "", 3)] if windows else []
         rows.append((name, *cells))
     yield ""
     yield table(rows, header=header)
-
-
-def _both(guard: Record) -> list[str]:
-    """Return the two cells for one guard in a table that compares scenarios.
-
-    The first is the number of drives that obeyed everything, of those for which a plan was known: `37 of 40`.
-    The second is the share of plans that satisfy the specification.
-    """
-    drives = guard["drives"]
-    obeyed = f"{drives['obeyed']} of {drives['count'] - drives['lost']}"
-    return [obeyed, _number(guard["metrics"]["plan_accuracy"], "", 3)]
 
 
 def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: str | None) -> Iterator[str]:

@@ -26,7 +26,13 @@ from stlc.controller.deployment.simulator import (
 )
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
-from stlc.controller.evaluation.rules import Rules, judge_runs_by_plans, obeying, rules_of, verdict_on_runs
+from stlc.controller.evaluation.rules import (
+    Rules,
+    RunVerdicts,
+    judge_runs_by_plans,
+    rules_of,
+    verdict_on_runs,
+)
 from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.guard import Guard
 from stlc.controller.training.config import DRIVES
@@ -333,12 +339,12 @@ class _Trial:
         if self.rules is None:
             executed = judge_executed(self.task, recording, viable=np.ones(rows, dtype=bool))
             runs = judge_runs_by_plans(executed, self.task.system.dt)
-            return runs.obeyed, executed.agents(executed.safety) if executed.safety else None
+            return runs.obeyed, runs.safe
         verdict = verdict_on_runs(self.rules, self.task, recording)
         found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
-        names = [rule.name for rule in verdict.subject.compiled.safety]
-        safe = obeying({name: found[name] for name in names}, rows) if names else None
-        return obeying(found, rows), safe
+        names = tuple(rule.name for rule in verdict.subject.compiled.safety)
+        runs = RunVerdicts(found, (), np.ones(rows, dtype=bool), names)
+        return runs.obeyed, runs.safe
 
     def shares(self) -> tuple[Share, ...]:
         """Counts of the runs under each compared guard, from their common initial states, cheapest first.

@@ -125,16 +125,24 @@ class RunVerdicts:
             for a run that obeyed them. It is False for a run that broke a rule if no good plan (see `Lost`)
             was known at the start, or none after an exogenous event. It is True for other runs that broke a
             rule, and for inconclusive runs from whose start a safe plan is known.
+        safety: names of the rules tagged `@safety`.
     """
 
     rules: Mapping[str, NDArray[np.str_]]
     broken: tuple[Broken, ...]
     viable: NDArray[np.bool_]
+    safety: tuple[str, ...] = ()
 
     @property
     def obeyed(self) -> NDArray[np.bool_]:
         """Mask of the runs that satisfy every rule, (rows,)."""
         return obeying(self.rules, len(self.viable))
+
+    @property
+    def safe(self) -> NDArray[np.bool_] | None:
+        """Mask of the runs that satisfy the rules tagged `@safety`, (rows,); None if no rule has this tag."""
+        kept = {name: self.rules[name] for name in self.safety}
+        return obeying(kept, len(self.viable)) if kept else None
 
 
 def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool_]:
@@ -265,7 +273,8 @@ def judge_runs(
     viable = viable.copy()
     for each in broken:
         viable[each.row] = not each.excused
-    return RunVerdicts(found, broken, viable | obeying(found, len(viable)))
+    kept = tuple(name for name in found if name in safety)
+    return RunVerdicts(found, broken, viable | obeying(found, len(viable)), kept)
 
 
 def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
@@ -363,7 +372,7 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
         for row, each in names.items()
         if each
     )
-    return RunVerdicts(rules, tuple(broken), viable | obeying(rules, len(viable)))
+    return RunVerdicts(rules, tuple(broken), viable | obeying(rules, len(viable)), executed.safety)
 
 
 def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator[Broken]:
@@ -396,6 +405,7 @@ def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str,
 
     - `count`: number of runs.
     - `obeyed`: number of runs that satisfy every rule.
+    - `safe`: number of runs that satisfy every rule tagged `@safety`; null if no rule has this tag.
     - `undecided`: number of inconclusive runs.
     - `lost`: number of runs that could not obey the rules (see `RunVerdicts.viable`).
     - `told`: number of the lost runs in which a good plan was known until an exogenous event. In the other
@@ -409,6 +419,7 @@ def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str,
     return {
         "count": rows,
         "obeyed": obeyed,
+        "safe": None if runs.safe is None else int(runs.safe.sum()),
         "undecided": rows - obeyed - len(runs.broken),
         "lost": int((~runs.viable).sum()),
         "told": sum(each.lost is not None and each.lost.why == "told" for each in runs.broken),

@@ -56,7 +56,7 @@ def test_the_newest_run_is_simulated_with_and_without_guard(
     assert lines[1] == ""
     document = there.read_json("eval/simulate.json")
     drives = {name: guard["drives"] for name, guard in document["guards"].items()}
-    told = f"  {drives['paper']['obeyed']} of 8 drives obeyed every rule; without the guard "
+    told = f"  {drives['paper']['obeyed']} of 8 drives satisfied driving_rules; without the guard "
     assert lines[2] == f"{told}{drives['none']['obeyed']}"
     assert ["no", "guard", "paper's", "guard"] in [line.split() for line in lines]
     (rule,) = (line for line in lines if line.strip().startswith("red_light"))
@@ -122,7 +122,7 @@ def test_safety_is_spoken_of_only_where_something_is_tagged(
     result = json.loads(capsys.readouterr().out)["result"]
     assert result["safety"]
     assert any("safely" in line for line in screen(result, windows=True))
-    assert not any("safe" in line for line in screen(result | {"safety": []}, windows=True))
+    assert not any("plan safety" in line for line in screen(result | {"safety": []}, windows=True))
 
 
 def test_without_rules_drives_are_judged_as_plans_are(
@@ -130,7 +130,7 @@ def test_without_rules_drives_are_judged_as_plans_are(
 ) -> None:
     command = ["simulate", there.name, *SMALL, "--steps", "30", "--set", "test.judge=null"]
     assert main(command) == 0
-    assert "of 8 drives satisfied traffic from every start\n" in capsys.readouterr().out
+    assert "of 8 drives satisfied traffic at every instant\n" in capsys.readouterr().out
     assert load_trace(there.path / "trace.npz").meta.judge_text == ""
     assert main([*command, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -333,7 +333,7 @@ def test_margins_may_be_the_standard_output(there: RunDir, capsys: pytest.Captur
     assert main(["simulate", there.name, *SMALL, "--robustness", "-"]) == 0
     captured = capsys.readouterr()
     assert [json.loads(line)["step"] for line in captured.out.splitlines()][::8] == list(range(7))
-    assert "of 8 drives obeyed every rule" in captured.err
+    assert "of 8 drives satisfied driving_rules" in captured.err
 
 
 @pytest.mark.slow
