@@ -1,6 +1,5 @@
 """`make demo`: train, check, simulate and report a controller, with the run time of each stage."""
 
-import json
 import platform
 import subprocess
 import sys
@@ -36,18 +35,8 @@ def newest():
     return (environment.ROOT / "runs" / "latest").resolve()
 
 
-def drives(run):
-    """Results of the closed-loop runs of a run folder, in a sentence."""
-    guards = json.loads((run / "eval" / "simulate.json").read_text())["guards"]
-    with_guard, without = guards["paper"]["drives"], guards["none"]["drives"]
-    sentence = f"{with_guard['obeyed']} of {with_guard['count']} drives obeyed every rule"
-    if with_guard["lost"]:
-        sentence += f" ({with_guard['lost']} were lost)"
-    return f"{sentence}; without the guard {without['obeyed']}"
-
-
 def main():
-    """Run all stages and print the table, then how many drives obeyed every rule."""
+    """Run all stages and print the table of their run times."""
     seconds = environment.ensure()
     rows = [("environment", f".venv (Python {platform.python_version()})", seconds)]
     for name, arguments, text, answers in STAGES:
@@ -59,7 +48,6 @@ def main():
     print()
     for name, text, seconds in rows:
         print(f"  {name:<13} {text:<58} {seconds:4.0f} s")
-    print(f"\n  {drives(newest())}")
     print(f"\n  Next:  open the report · stlc compile {SPEC} · docs/quickstart.md")
 
 

@@ -14,21 +14,17 @@ Record = Mapping[str, Any]
 
 MOST_BROKEN = 12
 """Maximum number of listed runs that violated rules."""
+WINDOWS = "Planning windows: how the plans, and the drives from every start, are judged"
+"""Title of what is folded away, because its numbers are not those of drives."""
 SOURCES = ("policy", "polished", "backup", "safest", "")
 
 
 def deployment_tiles(contents: RunContents) -> list[tuple[str, str]]:
     """Key figures of the closed-loop runs for the head of the report: (name, value) pairs."""
-    guards = _guards(contents)
-    if not guards:
-        return []
-    name, guard = list(guards.items())[-1]
-    accuracy = share(_mean(guard.get("metrics") or {}, "plan_accuracy"))
-    tiles = [
-        (f"{drives['obeyed']:,} of {drives['count']:,}", f"drives obeyed, {guard_words(each).beside}")
+    return [
+        (f"{drives['obeyed']:,} of {drives['count']:,}", f"drives satisfied {guard_words(each).beside}")
         for each, drives in reversed(drives_of(contents.simulation).items())
     ]
-    return tiles + ([(accuracy, f"of deployed plans, {guard_words(name).beside}")] if accuracy else [])
 
 
 def deployment_section(contents: RunContents) -> Section | None:
@@ -45,11 +41,15 @@ def deployment_section(contents: RunContents) -> Section | None:
         _broken(contents.simulation),
         _compared("Progress", guards, _progress_rows(guards)),
         _compared("Decisions", guards, _decision_rows(guards)),
-        _compared("Plans and starts, window by window", guards, _share_rows(guards)),
-        _model_gap(guards),
-        _compared("Requirements of plans on the executed trajectories", guards, _requirement_rows(guards)),
+        el(
+            "details",
+            el("summary", WINDOWS),
+            _compared("", guards, _share_rows(guards)),
+            _model_gap(guards),
+            _compared("Requirements at each start", guards, _requirement_rows(guards)),
+        ),
     )
-    return Section("deployment", "Closed-loop runs", body)
+    return Section("deployment", "Drives", body)
 
 
 def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, ...]]) -> Html | None:
@@ -96,7 +96,7 @@ def _mean(metrics: Record, name: str) -> float | None:
 
 
 def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows: how many closed-loop runs satisfied all rules, then how many satisfied each single rule.
+    """Table rows: how many closed-loop runs satisfied all rules, the safety rules, and each single rule.
 
     A run is lost if no satisfying plan is known from its start, or from its state after an exogenous event.
     If any runs are lost, a second row counts the runs that satisfied all rules among those that are not lost.
@@ -110,12 +110,16 @@ def _drive_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
         return label, *(None if each is None else f"{each[0]:,} of {each[1]:,}" for each in counts)
 
     meaning = el("small", "a drive is one agent over one seed, judged from its first instant to its last")
-    label = join("drives that obeyed every rule", meaning)
+    label = join("satisfied", meaning)
     rows = [row(label, [None if d is None else (d["obeyed"], d["count"]) for d in each])]
     if any(drives["lost"] for drives in known):
         others = el("small", "without drives from whose start, or after an exogenous event, no plan is known")
         label = join("of those that were not lost", others)
         rows.append(row(label, [None if d is None else (d["obeyed"], d["count"] - d["lost"]) for d in each]))
+    if any(drives.get("safe") is not None for drives in known):
+        label = join("safe", el("small", "all requirements tagged @safety"))
+        safe = [None if d is None or d.get("safe") is None else (d["safe"], d["count"]) for d in each]
+        rows.append(row(label, safe))
     for rule in known[-1]["rules"]:
         found = [None if d is None else d["rules"].get(rule) for d in each]
         rows.append(row(rule, [None if r is None else (r["obeyed"], sum(r.values())) for r in found]))

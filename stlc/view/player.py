@@ -24,7 +24,7 @@ from stlc.view.animation import VectorAnimation, dark_colors, speed_up, still_by
 from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table
 from stlc.view.run_animation import STILL, RunPanel, animation_name, animation_of, current, run_panels
-from stlc.view.signals import Floats, Strip, constant_ranges, finite, margin_limits, margin_text
+from stlc.view.signals import MARGINS, Floats, Strip, constant_ranges, finite, margin_limits, margin_text
 from stlc.view.style import SCENES_ON_DARK
 from stlc.view.verdicts import Event
 from stlc.view.words import count, labelled
@@ -171,7 +171,7 @@ def _columns(panels: Sequence[RunPanel], tracks: Sequence[Sequence[_Track]]) -> 
         ends = [el("span", f"{time:g} s") for time in panel.strip.times[[0, -1]]]
         foot = classed("div", "track axis", el("span"), classed("div", "ends", ends), el("span"))
         words = f"{panel.title}: " if panel.title else ""
-        heading = classed("p", "quiet", f"{words}{panel.strip.words}, red where violated")
+        heading = classed("p", "quiet", f"{words}{MARGINS}, red where violated")
         columns.append(classed("div", "tracks", heading, rows, foot))
     return classed("div", "columns", columns)
 

@@ -14,13 +14,15 @@ from stlc.monitor.judgement import beside
 from stlc.monitor.verdict import Judgement, Monitor, Verdict
 from stlc.trace import Trace
 from stlc.view.contents import RunContents, untagged
+from stlc.view.deployment import WINDOWS
 from stlc.view.html import Child, Html, Section, classed, el, figure, join, table, with_code
-from stlc.view.region_map import draw_map, map_of
+from stlc.view.region_map import draw_map
+from stlc.view.run_animation import map_of_drives
 from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals, left_out
 from stlc.view.verdicts import judged_at_start, margins_of, monitor_of, trace_names, units_of
 from stlc.view.words import count, share
 
-TITLE = "Recorded runs"
+TITLE = "Recorded drives"
 MAP_CAPTION = (
     "Paths over the regions that the specification names, from the hollow points to the full ones. Beside "
     "the map the share of traces in each region over time (shaded: times at which it is active; dashed: the "
@@ -29,15 +31,16 @@ MAP_CAPTION = (
 
 
 def recorded_section(contents: RunContents) -> Section | None:
-    """Section with verdicts on the recorded traces, their signals, and causes of violations.
+    """Section with verdicts on the recorded drives, their signals, and causes of violations.
 
-    None without a trace.
+    If the trace stores a separate specification for drives, that one judges them, and the verdicts by which
+    plans are judged, window by window, are folded away. None without a trace.
     """
     trace = contents.trace
     if trace is None:
         return None
     try:
-        monitor = _monitor(contents, trace)
+        monitor = _monitor(contents, trace, drives=True)
         verdict = monitor.check(trace)
         margins = margins_of(monitor, verdict, trace)
     except StlcError as error:
@@ -48,35 +51,36 @@ def recorded_section(contents: RunContents) -> Section | None:
     choices = choose_traces(robustness, names, acted_in(trace))
     picture = draw_signals(trace, margins, choices, units_of(verdict))
     body = join(
-        _rules_part(contents, trace, names),
-        el("p", _summary(verdict)),
+        el("p", _summary(verdict, "" if trace.meta.judge_text else " at every instant")),
         _verdict_table(verdict, causes, names),
         figure(picture.data_uri(), picture.alt, _caption(trace, judged_at_start(verdict))),
         causes_of(causes, names, monitor.spec),
+        _windows_part(contents, trace, names),
     )
     return Section("driven", TITLE, body, picture)
 
 
-def _rules_part(contents: RunContents, trace: Trace, names: list[str]) -> Html | None:
-    """Verdicts on the trace by the specification for closed-loop runs; None if the trace has none.
-
-    A trace always stores the specification for which the controls were planned. It may also store a separate
-    one, which evaluates closed-loop runs.
-    """
+def _windows_part(contents: RunContents, trace: Trace, names: list[str]) -> Html | None:
+    """Verdicts by which plans are judged, folded away; None if the trace has no other ones."""
     if not trace.meta.judge_text:
         return None
     try:
-        monitor = monitor_of(trace, system=contents.system, drives=True)
+        monitor = _monitor(contents, trace)
         verdict = monitor.check(trace)
     except StlcError as error:
-        return el("p", f"The drives could not be judged by their rules: {_messages(error)}.")
-    obeyed = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'drive')} obeyed every rule of "
+        return el("p", f"The planning windows could not be judged: {_messages(error)}.")
     causes = explain_all(verdict)
-    return join(
-        el("p", obeyed, el("code", monitor.compiled.name), ", judged from the first instant to the last."),
+    return el(
+        "details",
+        el("summary", WINDOWS),
+        el(
+            "p",
+            f"{share(verdict.share)} of all starts satisfy every requirement of ",
+            el("code", monitor.compiled.name),
+            ".",
+        ),
         _verdict_table(verdict, causes, names),
         causes_of(causes, names, monitor.spec),
-        el("h3", "Window by window, as plans are judged"),
     )
 
 
@@ -84,8 +88,8 @@ def _messages(error: StlcError) -> str:
     return "; ".join(diagnostic.message for diagnostic in error.diagnostics)
 
 
-def _monitor(contents: RunContents, trace: Trace) -> Monitor:
-    return monitor_of(trace, contents.texts.get("spec.stl", ""), system=contents.system)
+def _monitor(contents: RunContents, trace: Trace, *, drives: bool = False) -> Monitor:
+    return monitor_of(trace, contents.texts.get("spec.stl", ""), system=contents.system, drives=drives)
 
 
 def map_section(contents: RunContents) -> Section | None:
@@ -94,8 +98,7 @@ def map_section(contents: RunContents) -> Section | None:
     if trace is None:
         return None
     try:
-        monitor = _monitor(contents, trace)
-        region_map = map_of(monitor.spec, monitor.check(trace), trace)
+        region_map = map_of_drives(trace, contents.system, contents.texts.get("spec.stl", ""))
     except StlcError:
         return None
     if region_map is None:
@@ -104,14 +107,13 @@ def map_section(contents: RunContents) -> Section | None:
     return Section("map", "Where it drives", figure(picture.data_uri(), picture.alt, MAP_CAPTION), picture)
 
 
-def _summary(verdict: Verdict) -> str:
-    traces = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'trace')}"
-    whole = f"{traces} satisfy every requirement at every start"
-    return f"{whole}; from {share(verdict.share)} of all starts the trajectory satisfies all requirements."
+def _summary(verdict: Verdict, when: str) -> str:
+    drives = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'drive')}"
+    return f"{drives} satisfied {verdict.subject.compiled.name}{when}."
 
 
 def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[str]) -> Html:
-    counts = ("violating traces", "satisfying starts", "least robustness")
+    counts = ("violating drives", "least robustness")
     header = ("requirement", "verdict", *counts, "where")
     rows: list[tuple[Child, ...]] = []
     for judgement in verdict:
@@ -122,12 +124,11 @@ def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[st
                 el("strong", judgement.name),
                 classed("span", _KINDS.get(judgement.overall, "quiet"), judgement.overall),
                 f"{violating:,} of {verdict.traces:,}",
-                share(judgement.share, 2),
                 _least(judgement),
                 ", ".join(filter(None, (names[trace], where_of(judgement, verdict, causes)))),
             )
         )
-    return table(header, rows, numeric=(2, 3, 4))
+    return table(header, rows, numeric=(2, 3))
 
 
 def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
@@ -156,11 +157,11 @@ def _least(judgement: Judgement) -> str:
 
 def _caption(trace: Trace, once: list[str]) -> Html:
     words = (
-        "Beneath the signals the robustness of each requirement at every start "
+        "Beneath the signals the robustness of each requirement at every instant "
         "(red: violated; large margins are cut). "
     )
     if once:
-        words += f"Judged once, for the whole trace: {', '.join(once)}. "
+        words += f"Judged once, for the whole drive: {', '.join(once)}. "
     hidden = left_out(trace)
     if hidden:
         words += f"Not shown: {', '.join(hidden)}. "

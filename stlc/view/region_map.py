@@ -96,12 +96,16 @@ class RegionMap:
         return np.argsort(~self.violated, kind="stable")[:most]
 
 
-def map_of(spec: ast.Spec, verdict: Verdict, trace: Trace) -> RegionMap | None:
-    """The map of an evaluated trace; None if its specification names no planar regions."""
+def map_of(spec: ast.Spec, verdict: Verdict, trace: Trace, violated: Mask | None = None) -> RegionMap | None:
+    """The map of an evaluated trace; None if its specification names no planar regions.
+
+    `violated`: the traces to be drawn as violated, (traces,); by default those that `verdict` violates.
+    """
     plane = plane_of(spec, [judgement.rule for judgement in verdict], trace)
     if plane is None:
         return None
-    violated: Mask = np.logical_or.reduce([judgement.fails.any(0) for judgement in verdict])
+    if violated is None:
+        violated = np.logical_or.reduce([judgement.fails.any(0) for judgement in verdict])
     return RegionMap(drawable(trace), plane, violated)
 
 
@@ -285,8 +289,8 @@ def _draw_presence(axes: Axes, region_map: RegionMap, region: MapRegion) -> None
     axes.set(ylim=(-0.04, 1.12), xlim=(times[0], times[-1]))
     axes.set_yticks([0, 1], ["0", "all"])
     axes.grid(visible=False)
-    word = "not in" if region.role == "avoid" else "in"
-    axes.set_title(f"{word} {region.title}", color=INK, pad=3)
+    ending = " (forbidden)" if region.role == "avoid" else ""
+    axes.set_title(f"in {region.title}{ending}", color=INK, pad=3)
     axes.set_title(uses_text(region.uses), loc="right", pad=3, color=MUTED, fontsize=7.5, weight="normal")
 
 

@@ -45,7 +45,7 @@ from stlc.view.words import (
     guard_words,
     interval,
     number,
-    obeyed_sentence,
+    satisfied_sentence,
     seconds,
     share,
     viable_sentence,
@@ -92,8 +92,8 @@ def sections_of(contents: RunContents) -> list[Section]:
 def render_report(contents: RunContents, sections: list[Section]) -> str:
     """The report of a run as an HTML page."""
     animation = player_section(contents)
-    tiles = [(value, name) for value, name in _training_tiles(contents.result) if value]
-    tiles += deployment_tiles(contents)
+    tiles = deployment_tiles(contents)
+    tiles += [(value, name) for value, name in _training_tiles(contents.result, bool(tiles)) if value]
     shown = [classed("div", "tile", el("b", value), el("span", name)) for value, name in tiles]
     head = join(
         headline(contents),
@@ -119,16 +119,16 @@ def headline(contents: RunContents) -> Html:
     plans.
     """
     record, result, simulation = contents.record, contents.result, contents.simulation or {}
-    obeyed, viable = obeyed_sentence(simulation), viable_sentence(simulation)
+    driven, viable = satisfied_sentence(simulation), viable_sentence(simulation)
     verdict = _verdict(contents)
-    trial = [] if obeyed else driven_lines(result)
+    trial = [] if driven else driven_lines(result)
     names = dict.fromkeys((contents.spec, str(record.get("system", "")), f"run {contents.run.name}"))
     return join(
         classed("p", "eyebrow", " · ".join(name for name in names if name)),
-        el("h1", obeyed or (f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else verdict)),
+        el("h1", driven or (f"{trial[0][:1].upper()}{trial[0][1:]}" if trial else verdict)),
         el("p", _sentence(". ".join((*trial[1:], verdict)))) if trial else None,
         el("p", f"{viable}.") if viable else None,
-        el("p", f"{verdict}. {_beside(result)}" if obeyed else _beside(result)) if result else None,
+        el("p", f"{verdict}. {_beside(result)}" if driven else _beside(result)) if result else None,
         _advice(contents),
     )
 
@@ -174,15 +174,17 @@ def _sentence(advice: str) -> Html:
     return with_code(f"{advice[0].upper()}{advice[1:]}.")
 
 
-def _training_tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _training_tiles(result: Mapping[str, Any], driven: bool) -> list[tuple[str, str]]:
+    """Key figures of the training; its own drives are left out if the report has others (`driven`)."""
     accuracy, feasible = result.get("accuracy"), result.get("feasible")
     part = accuracy / feasible if accuracy is not None and feasible else None
     executed, rounds = result.get("closed_loop"), result.get("falsification")
+    drives = executed.get("share") if isinstance(executed, Mapping) and not driven else None
     return [
-        (share(executed.get("share")) if isinstance(executed, Mapping) else "", "of drives satisfied"),
+        (share(drives), "of drives satisfied"),
         (share(rounds.get("last_share")) if isinstance(rounds, Mapping) else "", "of the last search failed"),
-        (share(accuracy), "plan accuracy"),
-        (share(part), "of what is known feasible"),
+        (share(accuracy), "of plans from held-out starts satisfied"),
+        (share(part), "of the starts known to be feasible"),
         (seconds(result.get("seconds")), "of training and verdict"),
     ]
 

@@ -18,6 +18,7 @@ from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
 from stlc.escape import file_part, picture
 from stlc.rundir import MOST_ARRAYS, SCENE, SYSTEM, TRACE, UNGUARDED, RunDir
+from stlc.source import Source
 from stlc.trace import Trace, load_trace
 from stlc.trace.formats.npz import read_arrays
 from stlc.view import bullet
@@ -43,6 +44,7 @@ from stlc.view.verdicts import (
     monitor_of,
     strip_of,
     trace_names,
+    violating,
 )
 
 if TYPE_CHECKING:
@@ -187,8 +189,8 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
     judged = readable(lambda: _judged(run, trace_name, scene))
     if judged is None:
         return found
-    traces = judged.executed.traces
-    events = events_of(judged.executed, traces)
+    traces = judged.verdict.traces
+    events = events_of(judged.verdict, traces)
     marked = marks(events, found.frames, traces, judged.marked)
     return replace(found, scene={**scene, "violated": marked}, judged=judged, events=tuple(events))
 
@@ -294,7 +296,7 @@ def _scene_panel(found: RecordedScene, title: str) -> RunPanel:
         strip=found.strip,
         events=found.events,
         names=tuple(f"agent {agent}" for agent in range(agents)),
-        requirements=() if judged is None else tuple(j.name for j in judged.executed),
+        requirements=() if judged is None else tuple(j.name for j in judged.verdict),
         vector_frames=record,
     )
 
@@ -325,9 +327,9 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
             t0=trace.t0,
             keys=(),
             strip=None if judged is None else strip_of(judged, decided),
-            events=() if judged is None else tuple(events_of(judged.executed, trace.traces)),
+            events=() if judged is None else tuple(events_of(judged.verdict, trace.traces)),
             names=tuple(trace_names(trace)),
-            requirements=() if judged is None else tuple(j.name for j in judged.executed),
+            requirements=() if judged is None else tuple(j.name for j in judged.verdict),
             vector_frames=record,
         )
     ]
@@ -344,15 +346,26 @@ def _signal_animation(run: RunDir, title: str) -> Animation | None:
     trace = archived(run, TRACE, load_trace)
     if trace is None:
         return None
-    region_map = readable(lambda: _map_of(trace))
+    region_map = readable(lambda: map_of_drives(trace, run.source(SYSTEM) if run.has(SYSTEM) else None))
     return (
         signal_animation(trace, title=title) if region_map is None else map_animation(region_map, title=title)
     )
 
 
-def _map_of(trace: Trace) -> RegionMap | None:
-    monitor = monitor_of(trace)
-    return map_of(monitor.spec, monitor.check(trace), trace)
+def map_of_drives(trace: Trace, system: Source | None, text: str = "") -> RegionMap | None:
+    """Map of a trace over the regions that the specification of its plans names; None if it names none.
+
+    Args:
+        trace: the recorded trace.
+        system: text of the system file, which supplies external functions.
+        text: specification to use if the trace stores none.
+
+    Raises:
+        StlcError: the trace cannot be evaluated.
+    """
+    monitor = monitor_of(trace, text, system=system)
+    verdict = monitor.check(trace)
+    return map_of(monitor.spec, verdict, trace, violating(trace, verdict, system=system))
 
 
 def _load_scene(run: RunDir, name: str) -> Scene | None:

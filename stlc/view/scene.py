@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stlc.controller.sketch import DECIDED, DECIDERS, VIOLATED
 from stlc.view.animation import Animation, clear_artists, speed_up
-from stlc.view.signals import FrameUpdate, Strip, draw_strip
+from stlc.view.signals import MARGINS, FrameUpdate, Strip, draw_strip
 from stlc.view.style import INK, MUTED, new_figure, picture_style
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def _draw_over_time(figure: Figure, plan: _Plan, strip: Strip | None) -> list[Fr
     updates = draw_strip(strip, [_panel(figure, plan, box) for box in plan.rows])
     (width, height), (left, bottom, wide, high) = plan.size, plan.rows[0]
     narrow = wide < WIDTH / 2
-    words = f"{strip.words}, red where violated"
+    words = f"{MARGINS}, red where violated"
     words = words.replace(", ", ",\n") if narrow else words
     at = ((left - (_NAMES - 0.2 if narrow else 0.0)) / width, (bottom + high + 0.05) / height)
     figure.text(*at, words, color=MUTED, fontsize=7.5, va="bottom")

@@ -32,7 +32,7 @@ from stlc.view.style import (
     picture_style,
 )
 from stlc.view.thinning import extremes
-from stlc.view.words import labelled
+from stlc.view.words import count, labelled
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -58,6 +58,8 @@ MOST_ROWS = 7
 """Maximum number of requirements in the strip charts; those with the least margins are shown."""
 MOST_PANELS, MOST_AGENTS = 6, 40
 """Maximum numbers of signals and agents in the animation of a trace."""
+MARGINS = "smallest robustness over the agents at each instant"
+"""Heading of the strip charts."""
 GREATEST = 1e300
 """Greatest magnitude that is drawn; differences of greater values are infinite, which Matplotlib refuses."""
 _HEIGHTS = {"line": 0.62, "strip": 0.2, "robustness": 0.5, "decision": 0.2}
@@ -158,11 +160,12 @@ def choose_traces(
     order = np.argsort(least, kind="stable")
     worst, other, word = int(order[0]), int(order[max(1, int(np.isfinite(least).sum())) // 2]), "typical"
     if acted is not None and acted.any():
-        other, word = int(np.argmax(acted)), f"guard acted most, {int(acted.max())} times"
+        other, word = int(np.argmax(acted)), f"guard acted most, {count(int(acted.max()), 'time')}"
     called = names or [f"trace {index}" for index in range(len(least))]
     if worst == other:
         return (Choice(worst, called[worst]),)
-    return Choice(worst, f"worst: {called[worst]}"), Choice(other, f"{word}: {called[other]}")
+    first = "worst" if least[worst] < -TOLERANCE else "least robust"
+    return Choice(worst, f"{first}: {called[worst]}"), Choice(other, f"{word}: {called[other]}")
 
 
 def draw_signals(
@@ -317,21 +320,18 @@ def constant_ranges(values: NDArray[Any]) -> list[tuple[int, int, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """Strip charts below an animation: least margin of each requirement, and interventions of the guard.
+    """Strip charts below an animation: least robustness of each requirement, and interventions of the guard.
 
     Attributes:
         times: times of the frames in seconds, (frames,).
-        margins: requirement -> least robustness of all agents, (frames,). At each frame, the requirement is
-            evaluated from this instant on. NaN if unknown.
+        margins: requirement -> least robustness over the agents, (frames,); see `verdicts.margins_of`.
         decisions: source of each decision, (frames, agents); None if not recorded.
-        words: description of the margins, for a heading.
         units: requirement -> unit of its margin; it contains only requirements that have a unit.
     """
 
     times: Floats
     margins: Mapping[str, Floats]
     decisions: NDArray[np.int64] | None = None
-    words: str = "least margin of all agents, from each instant on"
     units: Mapping[str, str] = field(default_factory=dict)
 
     @property

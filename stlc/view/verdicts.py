@@ -11,10 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.backends.array.graph import robustness_signal
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import margin_unit
+from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.explain.report import violations
+from stlc.monitor.judgement import Judgement
 from stlc.monitor.verdict import Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
@@ -23,9 +27,6 @@ from stlc.view.signals import Strip
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-ENOUGH = 0.4
-"""Margins are shown only where the world agrees with the model if at least this share of them remains."""
-CONSISTENT_ONLY = "least margin from each instant on, of the agents for which the world did as the model says"
 MOST = 240
 """Maximum number of events per requirement."""
 FLASH = (True, True, True, False)
@@ -59,14 +60,55 @@ def monitor_of(
 def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Floats]:
     """Robustness of each requirement at each sample, (traces, samples); NaN where undefined.
 
-    At each sample, the requirement is evaluated from this sample on. A requirement that is evaluated only
-    once has the same value at every sample.
+    A requirement is evaluated from each sample on. One that is judged once, over the whole trace, and demands
+    something at all times (`always p`) has at each sample the robustness of what it demands there: its least
+    value is that of the requirement. Another one that is judged once has the same value at every sample.
     """
     found = monitor.requirement_robustness(trace)
     rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
-    for name in judged_at_start(verdict):
-        rows[name] = np.repeat(verdict[name].least[:, None], rows[name].shape[1], 1)
+    for judgement in _judged_once(verdict):
+        whole = np.repeat(judgement.least[:, None], rows[judgement.name].shape[1], 1)
+        rows[judgement.name] = _demanded(judgement, verdict, whole)
     return rows
+
+
+def _demanded(judgement: Judgement, verdict: Verdict, whole: Floats) -> Floats:
+    """Robustness at each sample of what a requirement demands at all times, (traces, samples).
+
+    The result is `whole` for a trace in which this is not known, or does not decide the requirement.
+    """
+    demands = demands_of(judgement.rule.formula)
+    if not demands:
+        return whole
+    record, rho = verdict.subject.record, np.full_like(whole, np.nan)
+    for demand in demands:
+        signal = robustness_signal(
+            demand.body, record.env, ops=record.ops, semantics=record.semantics, end="strict"
+        )
+        own = np.array(np.broadcast_to(np.asarray(signal, dtype=float).T, whole.shape))
+        own[:, : demand.first] = np.nan
+        rho = np.fmin(rho, own)
+    decides = np.isclose(np.where(np.isnan(rho), np.inf, rho).min(1), whole[:, 0], rtol=1e-6, atol=TOLERANCE)
+    return np.where(decides[:, None], rho, whole)
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """Formula that a requirement demands at all samples from `first` on."""
+
+    first: int
+    body: ir.Formula
+
+
+def demands_of(formula: ir.Formula) -> list[Demand]:
+    """What a formula demands at all times; empty if it is not `always p`, or several of these at once."""
+    match formula:
+        case ir.Temporal("always", ir.Window(first, None), body):
+            return [Demand(first, body)]
+        case ir.BoolOp("and", items):
+            each = [demands_of(item) for item in items]
+            return [demand for demands in each for demand in demands] if all(each) else []
+    return []
 
 
 def units_of(verdict: Verdict) -> dict[str, str]:
@@ -74,10 +116,25 @@ def units_of(verdict: Verdict) -> dict[str, str]:
     return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
 
 
-def judged_at_start(verdict: Verdict) -> list[str]:
-    """Names of the requirements that are evaluated once, at the start of a trace."""
+def _judged_once(verdict: Verdict) -> list[Judgement]:
     planned = verdict.subject.horizon is not None
-    return [j.name for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
+    return [j for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
+
+
+def judged_at_start(verdict: Verdict) -> list[str]:
+    """Names of the requirements that are evaluated once, and do not demand the same at all times."""
+    return [each.name for each in _judged_once(verdict) if not demands_of(each.rule.formula)]
+
+
+def violating(trace: Trace, verdict: Verdict, *, system: Source | None = None) -> Mask:
+    """Traces that violate a requirement by which drives are judged, (traces,).
+
+    These are the requirements of the separate specification for drives, if the trace stores one, else those
+    of `verdict`. `system` is the text of the system file, which supplies external functions.
+    """
+    if trace.meta.judge_text:
+        verdict = monitor_of(trace, system=system, drives=True).check(trace)
+    return np.asarray(np.logical_or.reduce([judgement.fails.any(0) for judgement in verdict]))
 
 
 def trace_names(trace: Trace) -> list[str]:
@@ -100,19 +157,13 @@ class SceneVerdicts:
 
     Attributes:
         trace: recorded traces of these agents.
-        monitor: monitor of the specification for which the controls were planned.
+        monitor: monitor of the specification for drives; of that of the plans if the trace stores no other.
         verdict: verdict of that monitor.
-        executed: verdict by the separate specification for closed-loop runs. It is `verdict` if the trace
-            stores no such specification.
-        consistent: whether the world (simulated environment) behaves as the model predicts, for the length of
-            a plan after each sample: (agents, samples). None if not recorded.
     """
 
     trace: Trace
     monitor: Monitor
     verdict: Verdict
-    executed: Verdict
-    consistent: Mask | None
 
     @property
     def marked(self) -> set[str]:
@@ -121,65 +172,41 @@ class SceneVerdicts:
         If the trace has a separate specification for closed-loop runs, all of its requirements are marked.
         Otherwise the requirements with the tag `@safety` are marked, or all if none has this tag.
         """
-        safety = {each.name for each in self.executed if "safety" in each.rule.tags}
+        safety = {each.name for each in self.verdict if "safety" in each.rule.tags}
         ruled = bool(self.trace.meta.judge_text)
-        return safety if safety and not ruled else {each.name for each in self.executed}
+        return safety if safety and not ruled else {each.name for each in self.verdict}
 
 
 def judge_agents(trace: Trace, agents: int, *, system: Source | None) -> SceneVerdicts:
-    """Evaluate the traces of the first `agents` agents by the specification stored in the trace.
+    """Evaluate the traces of the first `agents` agents by the specification that judges drives.
 
     Raises:
         StlcError: the trace cannot be evaluated.
     """
     data = {name: values[:agents] for name, values in trace.data.items()}
-    monitor, first = monitor_of(trace, system=system), replace(trace, data=data, extras={})
-    verdict = executed = monitor.check(first)
-    if trace.meta.judge_text:
-        executed = monitor_of(trace, system=system, drives=True).check(first)
-    return SceneVerdicts(first, monitor, verdict, executed, model_consistent(trace, agents))
+    first = replace(trace, data=data, extras={})
+    monitor = monitor_of(trace, system=system, drives=True)
+    return SceneVerdicts(first, monitor, monitor.check(first))
 
 
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
     """Strip charts of the agents' margins, and of the sources of decisions.
 
-    Margins are shown only at samples from which the world (simulated environment) behaves as the model
-    predicts. If too few margins would be shown, all are shown.
-
     Args:
         judged: verdicts on the agents.
         decisions: source of each decision, (frames, agents); None if not recorded.
     """
-    rows, units = margins_of(judged.monitor, judged.verdict, judged.trace), units_of(judged.verdict)
-    times, every = judged.trace.times, {name: least(rho) for name, rho in rows.items()}
-    if judged.consistent is not None:
-        margins = {name: least(rho, judged.consistent) for name, rho in rows.items()}
-        known, all_known = (np.isfinite([*each.values()]).sum() for each in (margins, every))
-        if known >= ENOUGH * all_known:
-            return Strip(times, margins, decisions, CONSISTENT_ONLY, units)
-    return Strip(times, every, decisions, units=units)
+    rows = margins_of(judged.monitor, judged.verdict, judged.trace)
+    margins = {name: least(rho) for name, rho in rows.items()}
+    return Strip(judged.trace.times, margins, decisions, units_of(judged.verdict))
 
 
-def model_consistent(trace: Trace, agents: int) -> Mask | None:
-    """Return for each agent and sample whether the world behaves as the model predicts: (agents, samples).
-
-    The world is the simulated environment. A sample is True if the prediction is right for the length of a
-    plan after this sample. None is returned if the trace does not record where the world deviates from the
-    model.
-    """
-    steps, horizon = trace.extras.get("foreseen"), trace.meta.horizon
-    if steps is None or horizon is None or steps.shape != (trace.traces, trace.samples - 1):
-        return None
-    wrong = np.cumsum(np.pad(steps[:agents] == 0, ((0, 0), (1, horizon))), axis=1)
-    return np.asarray(wrong[:, horizon : horizon + trace.samples] == wrong[:, : trace.samples])
-
-
-def least(rho: Floats, counts: Mask | bool = True) -> Floats:
+def least(rho: Floats) -> Floats:
     """Least robustness over the agents at each sample: (agents, samples) -> (samples,).
 
-    Only values where `counts` is True are used. The result is NaN where no robustness is known.
+    The result is NaN where no robustness is known.
     """
-    known = np.where(counts & ~np.isnan(rho), rho, np.inf).min(0)
+    known = np.where(np.isnan(rho), np.inf, rho).min(0)
     return np.where(np.isfinite(known), known, np.nan)
 
 

@@ -34,7 +34,7 @@ def test_the_picture_says_what_it_shows(region_map, tmp_path):
     picture = draw_map(region_map)
     assert "4 traces, 2 of which satisfy" in picture.alt
     plot, *rows = picture.figure.axes
-    assert [row.get_title(loc="left") for row in rows][:2] == ["not in marsh", "in gate"]
+    assert [row.get_title(loc="left") for row in rows][:2] == ["in marsh (forbidden)", "in gate"]
     texts = {text.get_text() for text in plot.texts}
     assert {"marsh", "gate", "yard"} <= texts
     labels = [text.get_text() for text in plot.get_legend().get_texts()]

@@ -1,14 +1,18 @@
 """The least margins of the agents that a scene shows."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta
 from stlc.units import parse_unit
 from stlc.view.verdicts import (
-    CONSISTENT_ONLY,
     FLASH,
     FLASHES,
     Event,
@@ -18,22 +22,54 @@ from stlc.view.verdicts import (
     least,
     margins_of,
     marks,
-    model_consistent,
     monitor_of,
     strip_of,
     units_of,
+    violating,
 )
 
 
-def test_margins_count_where_the_world_did_as_the_model_says():
+def test_the_least_of_all_agents_is_shown():
     rho = np.array([[1.0, 2.0, 3.0, np.nan], [-1.0, 5.0, np.nan, np.nan]])
-    steps = np.array([[1, 1, 1], [0, 1, 1]])
-    meta = TraceMeta(horizon=2)
-    trace = Trace(Signature(()), 0.1, {"x": np.zeros((2, 4))}, extras={"foreseen": steps}, meta=meta)
-    counts = model_consistent(trace, 2)
-    assert counts.tolist() == [[True] * 4, [False, True, True, True]]
     np.testing.assert_array_equal(least(rho), [-1, 2, 3, np.nan])
-    np.testing.assert_array_equal(least(rho, counts), [1, 2, 3, np.nan])
+
+
+RULES = """spec rules
+signal x
+require low: always x < 2
+require slow: (always[0.5 s, end] x - prev(x) < 3) and always x < 9
+require ends: eventually[0, 1 s] x > 0
+"""
+
+
+@given(st.lists(st.lists(st.floats(-9, 9), min_size=6, max_size=6), min_size=1, max_size=3))
+def test_a_strip_is_red_where_what_is_demanded_at_all_times_fails(rows):
+    """By the specification for drives, whatever the plans' says; its least value is the robustness."""
+    meta = TraceMeta(spec_text=TEXT, judge_text=RULES, horizon=3, dt=0.5)
+    trace = Trace(Signature((Column("x"),)), 0.5, {"x": np.array(rows)}, meta=meta)
+    judged = judge_agents(trace, len(rows), system=Path("none.yaml"))
+    found = margins_of(judged.monitor, judged.verdict, trace)
+    np.testing.assert_allclose(found["low"], 2 - trace.data["x"])
+    assert judged_at_start(judged.verdict) == ["ends"]
+    for judgement in judged.verdict:
+        np.testing.assert_allclose(np.nanmin(found[judgement.name], axis=1), judgement.least, atol=1e-6)
+    strip = strip_of(judged, None)
+    red = {name for name, rho in strip.margins.items() if np.nanmin(rho) < -1e-6}
+    violated = {event.requirement for event in events_of(judged.verdict, len(rows))}
+    assert {"low", "slow"} & red == {"low", "slow"} & violated
+
+
+def test_paths_are_violated_as_drives_are_judged():
+    meta = TraceMeta(
+        spec_text=TEXT, judge_text="spec rules\nsignal x\nrequire low: always x < 9\n", horizon=3, dt=0.5
+    )
+    trace = Trace(
+        Signature((Column("x"),)), 0.5, {"x": np.array([[1.0] * 5, [5.0] * 5, [10.0] * 5])}, meta=meta
+    )
+    planned = monitor_of(trace).check(trace)
+    assert violating(trace, planned).tolist() == [False, False, True]
+    alone = replace(trace, meta=replace(meta, judge_text=""))
+    assert violating(alone, planned).tolist() == [False, True, True]
 
 
 def test_the_agents_of_the_first_seed_are_shown(recording, tmp_path):
@@ -45,7 +81,6 @@ def test_the_agents_of_the_first_seed_are_shown(recording, tmp_path):
     assert judged.marked == {"no_collision", "give_way", "red_light"}
     assert strip.rows == ["no_collision", "stop_sign", "give_way", "red_light"]
     assert strip.decisions.shape == (151, 10)
-    assert strip.words != CONSISTENT_ONLY  # nobody recorded whether it was so
     assert np.isnan(strip.margins["red_light"][-25:]).all()
 
 
@@ -79,16 +114,6 @@ def test_a_margin_has_the_unit_of_its_predicates():
     trace = Trace(Signature(columns), 0.1, data, meta=TraceMeta(spec_text=text, horizon=2, dt=0.1))
     verdict = monitor_of(trace).check(trace)
     assert units_of(verdict) == {"place": "m", "speed": "km/h", "apart": "m"}
-
-
-@pytest.mark.parametrize("right", [0, 1])
-def test_where_little_goes_as_foreseen_all_agents_count(recording, tmp_path, right):
-    extras = {**recording.extras, "foreseen": np.full((20, 150), right, dtype=np.int8)}
-    told = Trace(recording.signature, 0.1, recording.data, extras=extras, meta=recording.meta)
-    judged = judge_agents(told, 10, system=tmp_path / "none.yaml")
-    strip = strip_of(judged, np.zeros((151, 10), dtype=np.int64))
-    assert (strip.words == CONSISTENT_ONLY) is bool(right)
-    assert np.isfinite(strip.margins["red_light"][0])
 
 
 # ---------------------------------------------------------------------- test_events

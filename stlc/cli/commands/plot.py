@@ -40,13 +40,16 @@ def plot(
     places: Annotated[
         bool, typer.Option("--places", help="Paths over the places of the specification.")
     ] = False,
+    windows: Annotated[
+        bool, typer.Option("--windows", help="Judge by the specification of the plans, from every start.")
+    ] = False,
     reading: given.Traces = given.TRACES,
 ) -> Answer[PlottedTrace]:
     """Draw signals, and below them the robustness of the requirements.
 
-    For a run, the trace in its folder is drawn. The worst and a typical trace are shown unless --trace
-    selects one. With --places all paths are drawn over the regions of the requirements, such as `dock` in
-    `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
+    For a run, the trace in its folder is drawn, judged as `stlc check` judges it. The worst and a typical
+    trace are shown unless --trace selects one. With --places all paths are drawn over the regions of the
+    requirements, such as `dock` in `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
     from stlc.cli.check.judge import load
     from stlc.rundir import recorded_trace
@@ -59,14 +62,15 @@ def plot(
     target = _target(output, path)
     require_separate([("--output", target)], (path, reading.spec, reading.system))
     question = reading.question(require=())
-    loaded = load(path, question, planned=True)  # margins over time are those of windows
+    loaded = load(path, question, planned=windows or places)  # plans name the places that they have to reach
     if len(loaded.traces) > 1:
         objects = f"{len(loaded.traces)} objects of different times"
         raise usage(f"`{path}` holds {objects}: choose one by --group NAME=VALUE")
     recorded, monitor, note = loaded.traces[0], loaded.monitor, loaded.note
     if places:
         shown = list(range(recorded.traces)) if trace is None else [trace]
-        picture = _map(monitor, _one(recorded, trace), reading.require or [])
+        own = windows or bool(reading.spec or reading.require)
+        picture = _map(monitor, _one(recorded, trace), reading.require or [], own=own)
     else:
         verdict = monitor.check(recorded, require=reading.require or [])
         margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
@@ -116,15 +120,18 @@ def _one(trace: Trace, wanted: int | None) -> Trace:
     )
 
 
-def _map(monitor: Monitor, trace: Trace, wanted: list[str]) -> Picture:
+def _map(monitor: Monitor, trace: Trace, wanted: list[str], *, own: bool) -> Picture:
     """Picture of paths over the regions of the requirements, such as `dock` in `[x, y] in dock`.
 
-    `wanted` are the names of the requirements; all if it is empty. Raises UsageError (U101) if the
-    requirements name no region.
+    `wanted` are the names of the requirements; all if it is empty. With `own`, they decide which paths are
+    violated; otherwise the specification for drives does, if the trace stores one. Raises UsageError (U101)
+    if the requirements name no region.
     """
     from stlc.view.region_map import draw_map, map_of
+    from stlc.view.verdicts import violating
 
-    chart = map_of(monitor.spec, monitor.check(trace, require=wanted), trace)
+    verdict = monitor.check(trace, require=wanted)
+    chart = map_of(monitor.spec, verdict, trace, None if own else violating(trace, verdict))
     if chart is None:
         advice = ("a place is a region of two signals: `[x, y] in circle([0, 0], 1 m)`",)
         message = f"no requirement of `{monitor.spec.name}` names a place"

@@ -26,11 +26,13 @@ def report(
     from stlc.view.contents import simulation_of
     from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended
     from stlc.view.report import write_report
+    from stlc.view.words import satisfied_sentence
 
     folder = RunDir.open(run, runs)
     with PULSE.doing("drawing the report"), driving(python):
         write_report(folder)
-    world = (simulation_of(folder) or {}).get("world")
+    simulation = simulation_of(folder) or {}
+    world = simulation.get("world")
     path = f"{folder.shown}/report.html"
     record = folder.record()
     learning = learning_of_run(folder, Commands.of(folder.shown, guard=recommended(record)))
@@ -41,7 +43,8 @@ def report(
     def show() -> None:
         if world and not python:
             say(f"the scene is drawn by {visible(world)}, Python of the run: `--python` runs it")
-        for line in driven_lines(record.get("result") or {}):
+        driven = satisfied_sentence(simulation) if simulation else ""
+        for line in [driven] if driven else driven_lines(record.get("result") or {}):
             say(line)
         if learning is not None:
             say(f"{learning.level}: {learning.sentence}")
