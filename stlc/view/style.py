@@ -188,10 +188,14 @@ class Picture:
 
 
 def _themed(svg: str) -> str:
-    """Replace the colours in an SVG by CSS variables, which have values for the light and the dark scheme."""
+    """Replace the colours in an SVG by CSS variables, which have values for the light and the dark scheme.
+
+    The picture has a ground of its own, since a page may be dark where the reader's scheme is light.
+    """
     inks = "|".join(ON_DARK)
     svg = re.sub(rf"({inks})\b", lambda ink: f"var(--c{ink[1][1:]})", svg[svg.index("<svg") :])
     light = ";".join(f"--c{ink[1:]}:{ink}" for ink in ON_DARK)
     dark = ";".join(f"--c{ink[1:]}:{other}" for ink, other in ON_DARK.items())
-    sheet = f"<style>svg{{{light}}}@media(prefers-color-scheme:dark){{svg{{{dark}}}}}</style>"
+    ground = f"background:var(--c{PAPER[1:]})"
+    sheet = f"<style>svg{{{light};{ground}}}@media(prefers-color-scheme:dark){{svg{{{dark}}}}}</style>"
     return svg.replace(">", f">{sheet}", 1)

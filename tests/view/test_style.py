@@ -9,7 +9,7 @@ from PIL import Image
 
 import stlc.view
 from stlc.diagnostics import MissingError
-from stlc.view.style import BLUE, INK, ON_DARK, Picture, new_figure, picture_style
+from stlc.view.style import BLUE, INK, ON_DARK, PAPER, Picture, new_figure, picture_style
 
 
 def draw():
@@ -33,6 +33,7 @@ def test_inks_follow_the_scheme():
     assert "prefers-color-scheme:dark" in svg
     assert f"var(--c{BLUE[1:]})" in svg
     assert f"--c{INK[1:]}:{ON_DARK[INK]}" in svg
+    assert f"background:var(--c{PAPER[1:]})" in svg  # a dark page may be read in a light scheme
     drawn = svg.split("</style>", 1)[1]
     assert not [ink for ink in ON_DARK if ink in drawn]
 
