@@ -151,8 +151,10 @@ def simulate(
     intervals (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets their
     strength in percent, as in mismatch-20. --scenario disturbed runs all of them. With --plant, RUN is a
     specification and FILE a plant file (docs/plants.md): a black box is simulated in processes of its own, at
-    --from or at a random point for each seed, and each trace is judged. The exit code is then 1 if a
-    simulation violates a requirement or gives no trace, and 4 if it is too short for a verdict.
+    --from or at a random point for each seed, and each trace is judged. The command measures: its exit code
+    is 0 whatever the drives satisfy, or with --fail-under 1 if fewer do; and 1 if a plant gives no trace.
+    The animation and the report take longer than short simulations: --no-pictures does without, and `stlc
+    report` draws them later.
     """
     require_separate([("--record", record), ("--robustness", margins)], (run, plant, system))
     if plant is not None:
