@@ -252,6 +252,16 @@ def test_a_result_that_is_no_finite_number_is_left_out(value, capsys):
     assert [row["accuracy"] for row in rows] == [None, 0.5]
 
 
+def test_an_interrupted_run_tells_its_steps_from_those_that_were_planned(capsys):
+    make_run("cart", "whole", steps=300)
+    stopped = make_run("cart", "stopped", steps=7500, status="interrupted")
+    (stopped.path / "train.jsonl").write_text('{"step": 0}\n{"step": 120}\n')
+    assert main(["runs", "list"]) == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if "cart/" in line}
+    assert lines["cart/0002-stopped"].rstrip().endswith(" 120 of 7500")
+    assert lines["cart/0001-whole"].split()[-1] == "300"
+
+
 def test_the_links_follow_when_a_run_is_removed(capsys):
     make_run("cart", "first")
     make_run("cart", "second")

@@ -176,10 +176,21 @@ def _cells(run: RunDir, record: Mapping[str, Any], status: str) -> tuple[str, ..
         Path(str(record.get("system_path", ""))).name,
         status,
         "" if accuracy is None else f"{accuracy:.4f}",
-        str(record.get("steps") or ""),
+        _steps(run, record, status),
         "" if seconds is None else f"{seconds:.0f} s",
         str(record.get("started", "")),
     )
+
+
+def _steps(run: RunDir, record: Mapping[str, Any], status: str) -> str:
+    """Number of steps of a finished run; of another one the steps made until now, and those planned."""
+    planned = str(record.get("steps") or "")
+    if status == "finished" or not planned:
+        return planned
+    with suppress(StlcError):
+        done = [row["step"] for row in run.rows() if isinstance(row.get("step"), int)]
+        return f"{done[-1] if done else 0} of {planned}"
+    return planned
 
 
 def _listed(run: RunDir, record: Mapping[str, Any], status: str) -> documents.ListedRun:
