@@ -60,7 +60,7 @@ def short(words: list[str]) -> list[str]:
     """The same command with less work in it."""
     match words[0]:
         case "train":
-            at = words.index("--budget")
+            at = next(index for index, word in enumerate(words) if word in ("--budget", "--steps"))
             return [*words[:at], "--steps", "15", "--held-out", "200", *words[at + 2 :]]
         case "simulate":
             return [*words, "--seeds", "0", "--agents", "2", "--steps", "35", "--no-pictures"]
