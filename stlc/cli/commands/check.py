@@ -336,5 +336,5 @@ def _split_files(files: Sequence[str], spec: Path | None) -> tuple[Path | None, 
     if len(specs) > 1 or (specs and spec is not None):
         raise usage(f"more than one specification: {', '.join([*specs, *([str(spec)] if spec else [])])}")
     if not traces:
-        raise usage("which trace?", "stlc check SPEC TRACE")
+        raise usage("missing: a trace file", "stlc check SPEC TRACE")
     return (Path(specs[0]) if specs else spec), traces

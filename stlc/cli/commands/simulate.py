@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
 
 ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"
+LONG = 10.0
+"""Seconds of drawing from which on a remark says how to do without."""
 
 
 @command(
@@ -200,7 +203,10 @@ def simulate(
     if not json:  # before the pictures, so that they do not affect the measurements
         for line in chain(screen(document, windows=windows), _bounds_shown(document, chosen)):
             printed(line)
+    begun = monotonic()
     drawn = _pictures(opened) if pictures else {}
+    if (took := monotonic() - begun) > LONG:
+        say(f"drawing took {took:.0f} s: --no-pictures does without, `stlc report` draws later")
 
     def show() -> None:
         # external functions are not stored in traces: judging needs the system file

@@ -269,7 +269,7 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
 
     if not specs:
         example = "stlc train specs/traffic.stl --system car.yaml"
-        raise usage("which specification is to be trained for?", example)
+        raise usage("missing: a specification", example)
     task = load_task(
         specs[0],
         system or None,
