@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 import pytest
 
 import stlc.view
+from stlc.controller.evaluation.metrics import METRICS
 from stlc.diagnostics import MissingError, RunError
 from stlc.rundir import RunDir
 from stlc.trace import save_trace
@@ -225,6 +226,33 @@ def test_a_world_that_no_plan_foresees_is_said(deployed):
     assert "model-consistent, starts" not in text  # a row of nothing
     assert "the backup decided" not in text
     assert "a polished plan" not in text
+
+
+def test_the_head_counts_one_population_of_drives(deployed):
+    """Drives of a simulation replace those of the training, and the scenario is named."""
+    record = json.loads((deployed.path / "run.json").read_text())
+    record["result"]["closed_loop"] = {"share": 1.0, "recommended": "none", "guards": []}
+    deployed.write_json("run.json", record)
+    document = json.loads((deployed.path / "eval/simulate.json").read_text())
+    rules = {"full_stop": {"obeyed": 74, "broken": 26, "undecided": 0}}
+    drives = {"count": 100, "safe": 80, "undecided": 0, "lost": 0, "told": 0, "rules": rules, "broken": []}
+    for guard, obeyed in (("none", 42), ("paper", 74)):
+        document["guards"][guard]["drives"] = drives | {"obeyed": obeyed}
+    deployed.write_json("eval/simulate.json", document | {"judge": None, "scenario": "gusts"})
+    contents = read_contents(deployed)
+    head = Page(render_report(contents, [])).text
+    assert (
+        "In scenario gusts, 74 of 100 drives satisfied traffic at every instant; without the guard 42" in head
+    )
+    assert "74 of 100drives satisfied with the paper's guard" in head
+    assert "of drives satisfied" not in head  # of those after the training
+    shown = deployment_section(contents).html
+    above, folded = shown.split("<details>")
+    assert "80 of 100" in above
+    assert METRICS["executed"].label in folded
+    assert METRICS["executed"].label not in above
+    (deployed.path / "eval/simulate.json").unlink()
+    assert "100.0 %of drives satisfied" in Page(render_report(read_contents(deployed), [])).text
 
 
 def test_the_deployment_can_be_repeated_as_it_was(deployed):
