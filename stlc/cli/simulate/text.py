@@ -52,8 +52,8 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     for name, guard in guards.items():
         if name != "none":
             yield f"  guard acted in {_acted(guard['decisions'])}"
-    last = list(guards.values())[-1]
-    yield from _broken(last["drives"], judged="" if document["judge"] else "judged from ")
+    name, last = list(guards.items())[-1]
+    yield from _broken(name, last["drives"], judged="" if document["judge"] else "judged from ")
     if windows and document.get("safety", True):
         yield f"  {_unsafe(last['unsafe'], seeds * agents)}"
     if windows:
@@ -100,23 +100,25 @@ def _counts(guards: Mapping[str, Record]) -> Iterator[tuple[str, ...]]:
             yield (label, *(f"{drives[key]} of {drives['count']}" for drives in each))
 
 
-def _broken(drives: Record, judged: str) -> Iterator[str]:
-    """Lines such as `violated: seed 3, agent 7: full_stop (4.3 s)` on drives that violate a requirement.
+def _broken(guard: str, drives: Record, judged: str) -> Iterator[str]:
+    """Lines on the drives under a guard that violate a requirement.
 
-    A drive is the closed-loop run of one agent with one seed. Only the first few drives are listed. Viable
-    drives, for which a satisfying plan was known, come first. `judged` stands before times.
+    An example is `violated with the full guard: seed 3, agent 7: full_stop (4.3 s)`. A drive is the
+    closed-loop run of one agent with one seed. Only the first few drives are listed. Viable drives, for which
+    a satisfying plan was known, come first. `judged` stands before times.
     """
     from stlc.view.words import cause_words
 
+    violated = f"  violated {guard_words(guard).beside}"
     for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
         rules = ", ".join(
             name if time is None else f"{name} ({judged}{time:.3g} s)" for name, time in each["rules"].items()
         )
         cause = cause_words(each)
-        yield f"  violated: seed {each['seed']}, agent {each['agent']}: {rules}{cause and f'; {cause}'}"
+        yield f"{violated}: seed {each['seed']}, agent {each['agent']}: {rules}{cause and f'; {cause}'}"
     more = len(drives["broken"]) - MOST_BROKEN
     if more > 0:
-        yield f"  violated in {more} more: see eval/simulate.json"
+        yield f"{violated}: {more} more, see eval/simulate.json"
 
 
 def _foreseen(foreseen: Record | None) -> Iterator[str]:
