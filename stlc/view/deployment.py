@@ -131,8 +131,9 @@ def _broken(simulation: Record | None) -> Html | None:
 
     It shows the runs under the guard that is listed last.
     """
-    each = list(drives_of(simulation).values())
-    broken = each[-1]["broken"] if each else []
+    each = drives_of(simulation)
+    guard = next(reversed(each), "")
+    broken = each[guard]["broken"] if each else []
     if not broken:
         return None
     rows: list[tuple[Child, ...]] = []
@@ -143,7 +144,8 @@ def _broken(simulation: Record | None) -> Html | None:
         rows.append((f"seed {drive['seed']}, agent {drive['agent']}", rules, cause_words(drive)))
     more = len(broken) - MOST_BROKEN
     note = el("p", f"{more} more are in eval/simulate.json.") if more > 0 else None
-    return join(el("h3", "Drives that violated a rule"), table(("drive", "rules", "why"), rows), note)
+    title = f"Drives that violate a requirement, {guard_words(guard).beside}"
+    return join(el("h3", title), table(("drive", "violated", "why"), rows), note)
 
 
 def _names(guards: Mapping[str, Record]) -> list[str]:

@@ -184,7 +184,7 @@ def _training_tiles(result: Mapping[str, Any], driven: bool) -> list[tuple[str, 
         (share(drives), "of drives satisfied"),
         (share(rounds.get("last_share")) if isinstance(rounds, Mapping) else "", "of the last search failed"),
         (share(accuracy), "of plans from held-out starts satisfied"),
-        (share(part), "of the starts known to be feasible"),
+        (share(part), "of those known to be feasible satisfied"),
         (seconds(result.get("seconds")), "of training and verdict"),
     ]
 
