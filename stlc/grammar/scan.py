@@ -27,7 +27,7 @@ LexemeKind = Literal["word", "quoted", "number", "string", "sign"]
 
 _LEXEME = re.compile(
     rf"""
-    {SPACE}+ | (?P<comment>(?:\\#|//)[^\\n]*)
+    {SPACE}+ | (?P<comment>(?:\#|//)[^\n]*)
     | (?P<string>"[^"\n]*")
     | (?P<quoted>`[^`\n]+`)
     | (?P<word>[^\W\d¹²³⁰⁴-⁹][^\W¹²³⁰⁴-⁹]*)
