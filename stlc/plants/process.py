@@ -200,6 +200,7 @@ class PlantProcess:
     def end(self) -> None:
         """Kill the process and its children, and remove its temporary files; any thread may call it."""
         self._watchdog.end()  # before the process is waited for: then its number may be another's
+        self._process.kill()
         self._process.wait()
         self._listener.join(_LAST_WORDS)
         for stream in (self._process.stdin, self._process.stdout):

@@ -20,7 +20,7 @@ mkdir -m 700 -- "$1" || exit 1
 echo made
 read -r group
 cat > /dev/null
-[ -z "$group" ] || kill -KILL -- "-$group"
+[ -z "$group" ] || kill -s KILL -- "-$group"
 for _ in 1 2 3 4 5 6 7 8 9 10; do rm -rf -- "$1" && exit; sleep 0.1; done
 """
 
