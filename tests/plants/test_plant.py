@@ -177,7 +177,7 @@ def test_processes_are_used_again_and_end(folder):
         (process,) = plant._processes
         plant.simulate(point)
         assert plant._processes == [process]
-        pid, scratch = process._process.pid, process._scratch
+        pid, scratch = process._process.pid, process._watchdog.folder
     assert not Path(f"/proc/{pid}").exists()
     assert not Path(scratch).exists()
 
