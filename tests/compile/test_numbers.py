@@ -52,7 +52,7 @@ ROW |= {"q[0]": 3.0, "q[1]": -4.0}
 def scope(**settings: object) -> Scope:
     entries = {**column_entries(COLUMNS), **member_entries([LABELS]), **CONSTANTS}
     entries["has_lead"] = Definition("has_lead", parse_expr(Source("d", "x >= 0")))
-    given_ = {"error": SystemFileError, "facts": enforced(COLUMNS), **settings}
+    given_ = {"error": SystemFileError, "ranges": enforced(COLUMNS), **settings}
     return Scope(entries, **given_)  # type: ignore[arg-type]
 
 
