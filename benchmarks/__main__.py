@@ -22,6 +22,7 @@ PROGRAM = Program(
         *("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step", "robustness"),
         *("gym", "falsify", "certificates", "uncertain", "verify", "ainncs"),
     ),
+    drives=True,
 )
 
 

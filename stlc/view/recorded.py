@@ -76,7 +76,7 @@ def _windows_part(contents: RunContents, trace: Trace, names: list[str]) -> Html
         el(
             "p",
             f"{share(verdict.share)} of all starts satisfy every requirement of ",
-            el("code", monitor.compiled.name),
+            el("code", verdict.subject.compiled.name),
             ".",
         ),
         _verdict_table(verdict, causes, names),

@@ -90,21 +90,21 @@ def test_states_that_explode(push: str, what: str, method: str, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("changed", "rules", "named"),
-    [
-        ({}, LOW + NEAR, "the gradient of `low` is not a number"),
-        ({}, NEAR + ENDLESS, "the robustness of `hot` is minus infinity"),
-        ({"terms": TERM}, NEAR, "the performance term `soft`, or its gradient, is not a number"),
-    ],
+    ("changed", "rules"), [({}, LOW + NEAR), ({"terms": TERM}, NEAR)], ids=["requirement", "term"]
 )
-def test_a_gradient_that_is_no_number(
-    changed: dict[str, str], rules: str, named: str, capsys: pytest.CaptureFixture[str]
+def test_a_root_of_zero_does_not_end_a_training(
+    changed: dict[str, str], rules: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, said = _trained(capsys, {**STUCK, **changed}, rules)
+    assert code in (0, 1)
+    assert "error[" not in said
+
+
+def test_a_robustness_that_is_no_number(capsys: pytest.CaptureFixture[str]) -> None:
+    code, said = _trained(capsys, STUCK, NEAR + ENDLESS)
     assert code == 3
-    assert f"error[R401]: {named}" in said
-    assert ("--> s.stl:4:1" in said) == ("low" in named)
-    assert ("--> s.stl:5:1" in said) == ("hot" in named)
+    assert "error[R401]: the robustness of `hot` is minus infinity" in said
+    assert "--> s.stl:5:1" in said
     assert "the run keeps the weights before that step" in said
     run = Run.open(RunDir.newest().path)
     assert run.dir.status == "failed"

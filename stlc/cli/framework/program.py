@@ -155,6 +155,7 @@ class Program:
         package: dotted name of the package of commands.
         order: names of commands in the order of the help text; other commands follow in alphabetical order.
         moved: name of a former command -> command line that replaces it.
+        drives: whether all commands run the Python that the files of a run name.
     """
 
     name: str
@@ -162,6 +163,7 @@ class Program:
     package: str
     order: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
+    drives: bool = False
 
     def names(self) -> list[str]:
         """Return the names of all commands, in the order of the help text."""
@@ -218,7 +220,7 @@ class Program:
         QUIET.set(bool({"-q", "--quiet"} & {*front}))
         stopped: list[int] = []
         try:
-            with _stoppable() as stopped, noticing(), driving(False):
+            with _stoppable() as stopped, noticing(), driving(self.drives):
                 name = rest[0] if rest else ""
                 if name in self.moved:
                     finding = Diagnostic("U101", f"there is no command `{name}`", help=(self.moved[name],))

@@ -142,6 +142,7 @@ class SystemDecl:
             text += repr((self.updates, self.init.computed, self.tables))
         text += "".join(f"located {jump.name}" for jump in self.jumps if jump.located)
         text = re.sub(r"\b[A-Z]\w+(?=\()", lambda found: _HASHED_AS.get(found[0], found[0]), text)
+        text = re.sub(r"(dims=\([^()]*), 0, 0\)", r"\1)", text)  # mol and cd came later
         return hashlib.sha256(text.encode()).hexdigest()
 
     @property

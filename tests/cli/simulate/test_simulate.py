@@ -237,7 +237,12 @@ def test_margins_are_measured_and_what_is_wrong_is_told(
     assert set(told["margin"]) <= {"no_collision", "give_way", "red_light"}
     assert 0.0 < told["margin"]["red_light"] < 3.0
     assert f"give_way 0.25, red_light {told['margin']['red_light']:.3g}" in text
-    assert told["errors"] == {"actuator_gain": 0.2, "parameters": 0.2, "numbers": []}
+    assert told["errors"] == {
+        "actuator_gain": 0.2,
+        "parameters": 0.2,
+        "numbers": [],
+        "exact": ["T_total", "x_stop"],
+    }
     assert main([*command, "--json"]) == 0
     assert misfits(json.loads(capsys.readouterr().out), load_schema("simulate/1")) == []
 

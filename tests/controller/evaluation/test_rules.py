@@ -188,6 +188,7 @@ def test_drives_are_counted(home: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert json.loads(json.dumps(document)) == {
         "count": 4,
         "obeyed": 2,
+        "safe": 2,
         "undecided": 0,
         "lost": 1,  # the last one obeyed although no search has found a plan for it
         "told": 0,
