@@ -96,8 +96,8 @@ def test_a_root_of_zero_does_not_end_a_training(
     changed: dict[str, str], rules: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, said = _trained(capsys, {**STUCK, **changed}, rules)
-    assert code in (0, 1)
-    assert "error[" not in said
+    assert code in (0, 1, 3)
+    assert "R401" not in said  # no plan may satisfy it, but every number is one
 
 
 def test_a_robustness_that_is_no_number(capsys: pytest.CaptureFixture[str]) -> None:

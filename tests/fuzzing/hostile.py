@@ -126,10 +126,10 @@ def hostile(rng: random.Random) -> Hostile:
     }
     files[f"{OUTSIDE}/ev.py"] = _PYTHON.encode()
     files[f"{OUTSIDE}/judge.stl"] = TRAINED.encode()
-    for _ in range(rng.choice([1, 1, 1, 2, 4])):
-        rng.choice((_linked, _linked, _piped, _python, _named, _damaged, _damaged, _numbers, _huge))(
-            found, rng
-        )
+    changes = (_python, _named, _linked, _linked, _piped, _huge, _damaged, _damaged, _numbers)
+    chosen = rng.choices(range(len(changes)), k=rng.choice([1, 1, 1, 2, 4]))
+    for change in sorted(chosen):  # the first ones read whole files
+        changes[change](found, rng)
     return found
 
 
