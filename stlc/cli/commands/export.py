@@ -18,7 +18,7 @@ from stlc.foreign import driving
 @command(
     "stlc export latest --to c",
     "stlc export latest --to onnx -o controller",
-    "stlc export latest --to onnx --precision float32",
+    "stlc export latest --to onnx --precision float64",
     "stlc export latest --to torch",
 )
 def export(
@@ -29,9 +29,12 @@ def export(
         typer.Option("--output", "-o", "--out", metavar="DIR", help="By default in the run's folder."),
     ] = None,
     precision: Annotated[
-        str,
-        typer.Option(metavar="TYPE", help="Numbers of ONNX graphs: float64, or float32 for other runtimes."),
-    ] = "float64",
+        str | None,
+        typer.Option(
+            metavar="TYPE",
+            help="Numbers of ONNX graphs: float32 (by default), as every runtime has them, or float64, exact.",
+        ),
+    ] = None,
     python: PythonOption = False,
     runs: RunsOption = Path("runs"),
 ) -> Answer[ExportedRun]:
@@ -48,7 +51,7 @@ def export(
     from stlc.export.write import precision_of, target_of
 
     target = target_of(to)
-    real = precision_of(precision, target)
+    real = precision_of(precision or ("float32" if target == "onnx" else "float64"), target)
     with driving(python):
         opened = Run.open(run, root=runs)
         if output is None:
