@@ -32,7 +32,7 @@ def export(
         str | None,
         typer.Option(
             metavar="TYPE",
-            help="Numbers of ONNX graphs: float32 (by default), as every runtime has them, or float64, exact.",
+            help="Numbers of ONNX graphs: float32 (default), which every runtime has, or float64, exact.",
         ),
     ] = None,
     python: PythonOption = False,
