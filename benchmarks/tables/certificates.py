@@ -22,7 +22,7 @@ from benchmarks.table import Columns, Table, listed, provenance, publish
 from stlc.assurance.bounds import Tally, betting_lower, clopper_pearson_lower, drives_needed
 from stlc.assurance.campaign import SEED
 from stlc.assurance.certificate import Sample, joined
-from stlc.assurance.conformal import SAME, DistributionShift, lower_bound
+from stlc.assurance.conformal import lower_bound
 from stlc.assurance.drives import PolicyDrives
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
@@ -32,7 +32,7 @@ from stlc.controller.training.run import Run
 from stlc.rundir import RunDir
 
 SHARE, CONFIDENCE = 0.99, 0.95
-SHIFT = DistributionShift("tv", 0.02)
+SHIFT = 0.02
 _OUTPUT = Output(Path("docs/assurance.md"))
 TEXT = """\
 Written by `python -m benchmarks certificates` from `benchmarks/results/certificates.json`: drives of one
@@ -97,11 +97,11 @@ def coverage(result: Result, recalibrations: int, drives: int) -> Row:
     for _ in range(recalibrations):
         drawn = rng.integers(len(good), size=drives)
         total = int(good[drawn].sum())
-        plain, aware = (lower_bound(robustness[drawn], CONFIDENCE, shift) for shift in (SAME, SHIFT))
+        plain, aware = (lower_bound(robustness[drawn], CONFIDENCE, shift) for shift in (0.0, SHIFT))
         here, there = (
             [float((each >= bound).mean()) for bound in (plain, aware)] for each in (robustness, other)
         )
-        after = [(1 - SHIFT.size) * a + SHIFT.size * b for a, b in zip(here, there, strict=True)]
+        after = [(1 - SHIFT) * a + SHIFT * b for a, b in zip(here, there, strict=True)]
         exact = clopper_pearson_lower(total, drives, CONFIDENCE) <= share
         bet = betting_lower(Tally.counted(total, drives), CONFIDENCE) <= share
         found.append((exact, bet, here[0], after[1], after[0]))

@@ -27,14 +27,11 @@ from stlc.assurance.bounds import (
     drives_needed,
 )
 from stlc.assurance.conformal import (
-    SAME,
-    AdaptiveBound,
-    DistributionShift,
     OnlineBound,
-    adaptive_bound,
     calibrate_online,
     drives_for_bound,
     lower_bound,
+    parse_shift,
     tolerance_bound,
 )
 
@@ -196,21 +193,19 @@ class Claim:
     Attributes:
         share: share of future drives to certify; None if the share is only measured.
         confidence: confidence of each bound.
-        shift: distance of the distribution of future drives from that of the observed ones.
+        shift: total variation between the distributions of future drives and of the observed ones.
         any_time: whether the drives were stopped by their results; only betting bounds are then valid.
         calibration: number of first units that calibrate the conformal bounds, fixed in advance; None: all.
         online: whether the bound while driving is calibrated.
-        adaptive: whether the drives are in order, and the adaptive bound is computed.
         further: conditions in words under which the bounds hold, beside those that are always stated.
     """
 
     share: float | None = 0.99
     confidence: float = 0.95
-    shift: DistributionShift = SAME
+    shift: float = 0.0
     any_time: bool = False
     calibration: int | None = None
     online: bool = False
-    adaptive: bool = False
     further: tuple[str, ...] = ()
 
     @property
@@ -376,8 +371,8 @@ def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
         satisfied=int(judged.satisfied.sum()),
         undecided=int((~judged.satisfied & ~judged.violated).sum()),
         shares=found,
-        deployed=claim.shift.least(found.lower),
-        most=claim.shift.least(found.upper),
+        deployed=max(0.0, found.lower - claim.shift),
+        most=max(0.0, found.upper - claim.shift),
         whole=int((values == 1.0).sum()),
         whole_lower=shares_of(whole, whole, claim.confidence, any_time=claim.any_time).lower,
         next_robustness=lower_bound(least[: claim.calibration], claim.confidence, claim.shift),
@@ -392,21 +387,10 @@ def _reached(least: NDArray[np.float64], claim: Claim) -> float:
 
     `least` is the least robustness of each observed unit, (units,). The result is -inf if there is no bound.
     """
-    share = 1.0 - _before(claim.shift, 1.0 - claim.target)
-    if not 0.0 < share < 1.0:
+    share = claim.target + claim.shift
+    if share >= 1.0:
         return -math.inf
     return tolerance_bound(least, share, claim.confidence, any_time=claim.any_time)
-
-
-def _before(shift: DistributionShift, miss: float) -> float:
-    """Greatest probability of an event before the shift, such that it is at most `miss` after the shift."""
-    low, high = 0.0, miss
-    if shift.greatest(high) <= miss:
-        return high
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if shift.greatest(middle) <= miss else (low, middle)
-    return low
 
 
 # ---------------------------------------------------------------------- the whole answer
@@ -423,7 +407,6 @@ class Assessment:
         noun: what an independent unit is.
         sizes: smallest and greatest number of drives in a unit.
         online: bound while driving, on the plans' robustness; None if it was not asked for or not recorded.
-        adaptive: adaptive bound on the next drive; None if it was not asked for.
         calibration: number of units that calibrated the conformal bounds.
         left_out: number of further drives, in which an assumption of the specification does not hold.
     """
@@ -434,7 +417,6 @@ class Assessment:
     noun: Noun
     sizes: tuple[int, int]
     online: OnlineBound | None
-    adaptive: AdaptiveBound | None
     calibration: int
     left_out: int = 0
 
@@ -459,12 +441,12 @@ class Assessment:
 
     def summary(self) -> dict[str, Any]:
         """Everything as a JSON object."""
-        claim, online, adaptive = self.claim, self.online, self.adaptive
+        claim, online = self.claim, self.online
         return {
             "answer": self.answer,
             "share": claim.share,
             "confidence": claim.confidence,
-            "shift": None if claim.shift == SAME else str(claim.shift),
+            "shift": f"tv={claim.shift}" if claim.shift else None,
             "sequential": claim.any_time,
             "unit": self.noun,
             "calibration": self.calibration,
@@ -482,15 +464,6 @@ class Assessment:
                 "confidence": online.confidence,
                 "units": online.drives,
             },
-            "adaptive": None
-            if adaptive is None
-            else {
-                "next_robustness": adaptive.low,
-                "level": adaptive.level,
-                "judged": adaptive.judged,
-                "missed": adaptive.missed,
-                "slack": adaptive.slack,
-            },
             "assumptions": self.assumptions(),
         }
 
@@ -498,7 +471,6 @@ class Assessment:
 def assess(sample: Sample, claim: Claim) -> Assessment:
     """Compute the bounds on future drives from a sample of at least one drive."""
     sizes = sample.sizes
-    ordered = sample.least(sample.overall.robustness).tolist() if claim.adaptive else None
     return Assessment(
         claim,
         statement(sample.overall, sample, claim),
@@ -506,7 +478,6 @@ def assess(sample: Sample, claim: Claim) -> Assessment:
         sample.noun,
         (int(sizes.min()), int(sizes.max())),
         _online(sample, claim) if claim.online else None,
-        None if ordered is None else adaptive_bound(ordered, claim.confidence),
         min(sample.count, claim.calibration or sample.count),
         sample.left_out,
     )
@@ -536,10 +507,11 @@ def _assumptions(found: Assessment) -> Iterator[str]:
     claim, noun = found.claim, found.noun
     plural = "simulations" if noun == "simulation" else "drives"
     yield from _units(noun, found.sizes[1])
-    if claim.shift == SAME:
-        yield _SAME[noun]
+    if claim.shift:
+        distance = f"total variation {claim.shift:g}"
+        yield f"the distribution of future {plural} is within {distance} of that of these"
     else:
-        yield f"the distribution of future {plural} is within {_distance(claim.shift)} of that of these"
+        yield _SAME[noun]
     if claim.any_time:
         yield f"the {plural} were stopped by their results; bounds on shares hold at any stopping time"
         yield (
@@ -579,11 +551,6 @@ def _units(noun: Noun, most: int) -> Iterator[str]:
     yield "worlds of different seeds are independent, as the numbers of a pseudo-random generator are"
 
 
-def _distance(shift: DistributionShift) -> str:
-    names = {"tv": "total variation", "kl": "Kullback-Leibler divergence", "chi2": "chi-square divergence"}
-    return f"{names[shift.kind]} {shift.size:g}"
-
-
 # ---------------------------------------------------------------------- certificate files
 
 
@@ -600,7 +567,7 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
     claim = Claim(
         None if document["share"] is None else float(document["share"]),
         confidence,
-        SAME if document["shift"] is None else DistributionShift.parse(str(document["shift"])),
+        0.0 if document["shift"] is None else parse_shift(str(document["shift"])),
         any_time,
     )
     wrong = []
@@ -632,8 +599,8 @@ def _expected(low: Tally, high: Tally, drives: int, claim: Claim) -> dict[str, f
         "interval": found.interval,
         "lower_any_time": found.any_time,
         "lower_fixed": found.fixed,
-        "lower_deployed": claim.shift.least(found.lower),
-        "upper_deployed": claim.shift.least(found.upper),
+        "lower_deployed": max(0.0, found.lower - claim.shift),
+        "upper_deployed": max(0.0, found.upper - claim.shift),
         "whole_units": whole,
         "whole_units_lower": shares_of(tally, tally, claim.confidence, any_time=claim.any_time).lower,
     }

@@ -136,11 +136,6 @@ def _more(record: Mapping[str, Any]) -> Iterator[str]:
             sure = percent(record["online"]["confidence"])
             parts = f"less {margins[0]:.3g} at the start, at most {max(margins):.3g} later ({sure})"
             yield f"  while driving, robustness is at least that of the plan followed {parts}"
-    if record["adaptive"] is not None:
-        found = record["adaptive"]
-        least, missed = robustness(found["next_robustness"], ""), found["missed"]
-        told = f"{missed} of {found['judged']} below their bound"
-        yield f"  next {noun}, if their distribution drifts: {least} ({told})"
 
 
 def percent(share: float) -> str:

@@ -70,6 +70,6 @@ def assess_outcomes(outcomes: Sequence[Outcome], share: float) -> Assessment | N
     if not samples:
         return None
     try:
-        return assess(joined(samples), Claim(share, adaptive=True))
+        return assess(joined(samples), Claim(share))
     except ValueError as error:
         raise usage(f"`--certify`: {error}", "--spec SPEC judges all traces by one specification") from None

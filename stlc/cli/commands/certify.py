@@ -121,8 +121,8 @@ def certify(
     shift: Annotated[
         str | None,
         typer.Option(
-            metavar="[tv|kl|chi2=]D",
-            help="Distance of the distribution of future drives from that of these; total variation.",
+            metavar="D",
+            help="Total variation between the distribution of future drives and that of these.",
         ),
     ] = None,
     how: Driving = DRIVING,
@@ -173,13 +173,13 @@ def certify(
             return _verified(verify, run, what, runs)
     from stlc.assurance.campaign import Campaign
     from stlc.assurance.certificate import Claim
-    from stlc.assurance.conformal import SAME, DistributionShift
+    from stlc.assurance.conformal import parse_shift
 
     wanted = share if share is not None or width is not None else DEFAULT_SHARE
     claim = Claim(
         None if wanted is None else checked_share("--share", wanted),
         checked_share("--confidence", confidence),
-        SAME if shift is None else DistributionShift.parse(shift),
+        0.0 if shift is None else parse_shift(shift),
         online=True,
     )
     if width is not None:

@@ -42,16 +42,6 @@ class OnlineMargins(TypedDict):
     units: Count
 
 
-class AdaptiveRecord(TypedDict):
-    """Adaptive bound on the next trace; see `stlc.assurance.conformal.AdaptiveBound`."""
-
-    next_robustness: Num
-    level: float
-    judged: Count
-    missed: Count
-    slack: Num
-
-
 class NeededUnits(TypedDict):
     """Numbers of units without a failure that certify the share, and that bound the next robustness."""
 
@@ -74,7 +64,6 @@ class Assurance(TypedDict):
     overall: ShareStatement
     requirements: list[ShareStatement]
     online: OnlineMargins | None
-    adaptive: AdaptiveRecord | None
     assumptions: list[str]
 
 

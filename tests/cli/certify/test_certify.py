@@ -109,7 +109,7 @@ def test_drives_stop_when_the_share_is_certified(there: RunDir, capsys: pytest.C
     assert any("at any stopping time" in text for text in document["assumptions"])
 
 
-GOLDEN = """adaptive answer assumptions batches calibration certificate conditions confidence finished
+GOLDEN = """answer assumptions batches calibration certificate conditions confidence finished
 hardware inputs left_out made needed online overall requirements run sequential share shift spec system unit
 versions width"""
 GOLDEN_INPUTS = "functions guard_version policy rules spec system world"
@@ -211,7 +211,7 @@ def test_agents_of_a_world_that_says_nothing_are_one_observation(capsys: pytest.
         ["--share", "1"],
         ["--confidence", "0"],
         ["--width", "2"],
-        ["--shift", "l1=.2"],
+        ["--shift", "kl=.2"],
         ["--guard", "fool"],
         ["--scenario", "storm"],
         ["--require", "nearer"],
@@ -397,7 +397,6 @@ def test_recorded_traces_bound_the_share_of_all(
     assert found["overall"]["lower"] == clopper_pearson_lower(60, 60)
     least = sorted(min(2 - number / 40, 1.0) for number in range(60))
     assert found["overall"]["next_robustness"] == pytest.approx(least[2])  # the floor of 61 x .05 = 3rd
-    assert found["adaptive"]["judged"] == 60
     assert main(["check", "s.stl", *traces, "--certify", ".95", "--jobs", "2"]) == 0
     out = capsys.readouterr().out
     assert "satisfied; 60 of 60 files satisfy every requirement" in out
