@@ -253,15 +253,7 @@ try:
 except SystemFileError as error:
     assert "there is no file" in str(error)
 """,
-    "video": """
-from stlc.view.animation import video
-from PIL import Image
-with video("a.mp4", (64, 64), 40) as write:
-    for _ in range(3):
-        write(Image.new("RGB", (64, 64)))
-""",
 }
-NEEDS = {"video": ("plot",)}
 
 
 @pytest.mark.apart
@@ -275,11 +267,11 @@ def test_the_language_server(wheel, bare, folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("extra", PROGRAMS)
 def test_an_extra_of_the_library(extra, wheel, folder):
-    ready = install(wheel, folder / "ready", *NEEDS.get(extra, ()))
+    ready = install(wheel, folder / "ready")
     without = ready.python(folder, PROGRAMS[extra])
     assert without.code == 1
     assert "is not installed" in without.err, without.err
-    with_it = install(wheel, folder / "env", extra, *NEEDS.get(extra, ())).python(folder, PROGRAMS[extra])
+    with_it = install(wheel, folder / "env", extra).python(folder, PROGRAMS[extra])
     assert with_it.code == 0, with_it.err
 
 

@@ -1,27 +1,20 @@
-"""Animations drawn frame by frame, and their encoding as GIF, video or still picture."""
+"""Animations drawn frame by frame, and their encoding as GIF or still picture."""
 
 from __future__ import annotations
 
 import io
-import shutil
-import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, MissingError
-from stlc.files import atomic_path, write_atomic
+from stlc.files import write_atomic
 from stlc.view.style import PAPER, new_figure, picture_style
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from PIL.Image import Image
@@ -32,7 +25,7 @@ MAX_BYTES = 4_000_000
 LONGEST = 16.0
 """Maximum duration of an animation in seconds; longer recordings are sped up."""
 DPI, FINE = 100, 2
-"""Dots per inch of a GIF; factor by which videos and still pictures have more."""
+"""Dots per inch of a GIF; factor by which still pictures have more."""
 QUALITY = 86
 """WebP quality of a still."""
 
@@ -135,36 +128,26 @@ def speed_up(frames: int, dt: float) -> int:
 def save_animation(
     animation: Animation,
     gif: Path,
-    mp4: Path | None = None,
     *,
     max_frames: int = MAX_FRAMES,
     max_bytes: int = MAX_BYTES,
 ) -> None:
-    """Write an animation as a GIF and, if `mp4` is given, as a video; every instant is drawn once.
+    """Write an animation as a GIF.
 
     Args:
         animation: the animation.
         gif: path of the GIF, whose width is reduced if the file would exceed `max_bytes`.
-        mp4: path of the video; None for none.
         max_frames: maximum number of frames. If there are more instants, only every second, third, … instant
             is shown.
         max_bytes: maximum size of the GIF.
 
     Raises:
-        MissingError: R201, a file cannot be written; R301, there is no ffmpeg for the video.
+        MissingError: R201, the file cannot be written.
     """
     stride = max(1, -(-animation.frames // max_frames))
     milliseconds = max(20, round(1000 * stride * animation.dt / animation.speed))
-    fine = FINE if mp4 is not None else 1
-    small: list[Image] = []
-    with ExitStack() as stack:
-        write: Callable[[Image], None] | None = None
-        for picture in frames_in(animation, range(0, animation.frames, stride), fine * DPI):
-            if mp4 is not None:
-                write = write or stack.enter_context(video(mp4, picture.size, milliseconds))
-                write(picture)
-            small.append(picture.reduce(fine) if fine > 1 else picture)
-    write_atomic(gif, fitting(small, milliseconds, max_bytes))
+    pictures = list(frames_in(animation, range(0, animation.frames, stride), DPI))
+    write_atomic(gif, fitting(pictures, milliseconds, max_bytes))
 
 
 def save_still(animation: Animation, path: Path, *, at: int | None = None, dpi: int = FINE * DPI) -> Path:
@@ -280,68 +263,3 @@ def _palette(sheet: Image) -> Image:
 def _apart(colours: NDArray[np.float64], one: NDArray[np.float64]) -> NDArray[np.float64]:
     """Squared distances of `colours` (colours, 3) from the colour `one` (3,)."""
     return np.asarray(((colours - one) ** 2).sum(1))
-
-
-# ---------------------------------------------------------------------- video
-
-
-ADVICE = "pip install 'stlc[video]', or ffmpeg on the path"
-_CODING = ("-c:v", "libx264", "-preset", "veryfast", "-crf", "23", "-pix_fmt", "yuv420p")
-
-
-def encoder() -> str | None:
-    """Path of the program that writes videos; None if there is none.
-
-    It is `ffmpeg` if installed, else the ffmpeg of the package imageio-ffmpeg.
-    """
-    found = shutil.which("ffmpeg")
-    if found is not None or find_spec("imageio_ffmpeg") is None:
-        return found
-    from imageio_ffmpeg import get_ffmpeg_exe
-
-    try:
-        return str(get_ffmpeg_exe())
-    except RuntimeError:  # a platform without a bundled program
-        return None
-
-
-@contextmanager
-def video(path: Path, size: tuple[int, int], milliseconds: int) -> Iterator[Callable[[Image], None]]:
-    """Context in which an H.264 video is written that every browser plays.
-
-    It yields a function that appends an RGB picture to the video.
-
-    Args:
-        path: path of the file. It is replaced only if no exception occurs in the context.
-        size: width and height of all pictures; an odd last row or column is cut off.
-        milliseconds: duration of each picture.
-
-    Raises:
-        MissingError: R301, there is no ffmpeg, or it fails; R201, the file cannot be written.
-    """
-    program = encoder()
-    if program is None:
-        raise MissingError(Diagnostic("R301", "a video needs ffmpeg, which is not installed", help=(ADVICE,)))
-    width, height = (side - side % 2 for side in size)
-    with atomic_path(path) as beside:
-        command = [program, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-        command += ["-s", f"{width}x{height}", "-r", f"{1000 / milliseconds:.6g}", "-i", "-", "-an"]
-        command += [*_CODING, "-movflags", "+faststart", "-f", "mp4", str(beside)]
-        running = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
-        assert running.stdin is not None
-
-        def write(picture: Image) -> None:
-            assert running.stdin is not None
-            with suppress(BrokenPipeError):  # the reason is reported below
-                running.stdin.write(picture.crop((0, 0, width, height)).tobytes())
-
-        try:
-            yield write
-        except BaseException:
-            running.kill()
-            raise
-        finally:
-            _, complaint = running.communicate()
-        if running.returncode:
-            said = complaint.decode(errors="replace").strip().splitlines()
-            raise MissingError(Diagnostic("R301", "ffmpeg cannot write the video", note=tuple(said[-1:])))

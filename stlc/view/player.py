@@ -144,10 +144,11 @@ def _inks(color: str) -> str:
 
 
 def _files(contents: RunContents) -> Html | None:
-    """Links to the animation files beside the page; None if there are none."""
-    names = [f"{animation_name(contents.run)}{suffix}" for suffix in (".gif", ".mp4")]
-    links = [join(el("a", name, attrs={"href": name}), " ") for name in names if contents.run.has(name)]
-    return classed("p", "quiet", "The same as a file: ", links) if links else None
+    """Link to the animation file beside the page; None if there is none."""
+    name = f"{animation_name(contents.run)}.gif"
+    if not contents.run.has(name):
+        return None
+    return classed("p", "quiet", "The same as a file: ", el("a", name, attrs={"href": name}))
 
 
 # ------------------------------------------------------------------------------ tracks

@@ -27,7 +27,6 @@ from stlc.view.animation import (
     MAX_FRAMES,
     Animation,
     VectorAnimation,
-    encoder,
     save_animation,
     save_still,
 )
@@ -55,14 +54,6 @@ PANEL = 5.8
 """Width of one run on a page, in inches."""
 
 
-@dataclass(frozen=True, slots=True)
-class AnimationFiles:
-    """Paths of the files of an animation; the video `mp4` is None if ffmpeg is not installed."""
-
-    gif: Path
-    mp4: Path | None
-
-
 def animation_of(run: RunDir, *, title: str | None = None) -> Animation | None:
     """Return the animation of the run's latest closed-loop simulation; None if nothing was recorded.
 
@@ -80,9 +71,7 @@ def animation_name(run: RunDir) -> str:
     return file_part(str(run.record().get("spec", "")), empty="deployment")
 
 
-def animate(
-    run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES
-) -> AnimationFiles | None:
+def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES) -> Path | None:
     """Write the animation of the closed-loop run of `run` into its folder, with a still picture beside it.
 
     Args:
@@ -92,7 +81,7 @@ def animate(
         max_bytes: maximum size of the GIF; the picture is made smaller to meet it.
 
     Returns:
-        The files, or None if nothing was recorded.
+        The path of the GIF, or None if nothing was recorded.
 
     Raises:
         MissingError: R301, matplotlib or Pillow is missing; R201, a file cannot be written.
@@ -100,13 +89,10 @@ def animate(
     animation = animation_of(run)
     if animation is None:
         return None
-    gif, video = (run.place(f"{animation_name(run)}{suffix}") for suffix in (".gif", ".mp4"))
-    mp4 = video if encoder() is not None else None
+    gif = run.place(f"{animation_name(run)}.gif")
     save_still(animation, run.place(STILL))
-    save_animation(animation, gif, mp4, max_frames=max_frames, max_bytes=max_bytes)
-    if mp4 is None:
-        video.unlink(missing_ok=True)  # of an older deployment
-    return AnimationFiles(gif, mp4)
+    save_animation(animation, gif, max_frames=max_frames, max_bytes=max_bytes)
+    return gif
 
 
 def current(run: RunDir) -> bool:

@@ -1,16 +1,13 @@
 """Films: frames, time, size."""
 
 import io
-import re
-import subprocess
 
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
 from stlc.controller.sketch import DECIDED
-from stlc.diagnostics import MissingError
-from stlc.view.animation import COLOURS, encoded, encoder, fitting, save_animation, save_still
+from stlc.view.animation import COLOURS, encoded, fitting, save_animation, save_still
 from stlc.view.scene import SceneOptions, scene_animation
 from stlc.view.signals import signal_animation
 from stlc.view.style import GREEN, RED
@@ -89,41 +86,6 @@ def test_what_takes_long_is_shown_faster(tmp_path):
     assert animation.speed == 3
     frames = frames_of(saved(animation, tmp_path, max_frames=8))
     assert {duration for _, duration in frames} == {1660}  # 5 s, in hundredths
-
-
-@pytest.mark.skipif(encoder() is None, reason="without ffmpeg there is no video")
-def test_a_video_has_the_same_pictures_twice_as_fine(tmp_path):
-    animation = animation_of({"x": np.linspace(1, 19, 6)})
-    save_animation(animation, tmp_path / "a.gif", tmp_path / "a.mp4")
-    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
-    with Image.open(tmp_path / "a.gif") as image:
-        assert image.n_frames == 6
-    told = subprocess.run(
-        [encoder(), "-i", tmp_path / "a.mp4", "-f", "null", "-"], capture_output=True, text=True, check=True
-    ).stderr
-    width, height = (round(2 * 100 * side) for side in animation.size)
-    assert f"{width}x{height - height % 2}" in told
-    assert re.search(r"frame= *6 ", told)
-
-
-def test_without_ffmpeg_there_is_no_video(tmp_path, monkeypatch):
-    monkeypatch.setattr("stlc.view.animation.encoder", lambda: None)
-    animation = animation_of({"x": np.linspace(1, 19, 2)})
-    with pytest.raises(MissingError, match="R301"):
-        save_animation(animation, tmp_path / "a.gif", tmp_path / "a.mp4")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_ffmpeg_that_fails_leaves_nothing(tmp_path, monkeypatch):
-    broken = tmp_path / "ffmpeg"
-    broken.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
-    broken.chmod(0o755)
-    monkeypatch.setattr("stlc.view.animation.encoder", lambda: str(broken))
-    animation = animation_of({"x": np.linspace(1, 19, 2)})
-    with pytest.raises(MissingError) as raised:
-        save_animation(animation, tmp_path / "a.gif", tmp_path / "a.mp4")
-    assert raised.value.diagnostics[0].note == ("no such codec",)
-    assert list(tmp_path.iterdir()) == [broken]
 
 
 # ---------------------------------------------------------------------- test_gif

@@ -44,7 +44,7 @@ def test_a_world_draws_its_scene(seen):
     animation = animation_of(seen)
     assert animation.frames == 7
     assert animation.dt == pytest.approx(0.1)
-    path = animate(seen).gif
+    path = animate(seen)
     assert path.name == "traffic.gif"
     assert frame_count(path) == 7
     assert (seen.path / "scene.png").exists()
@@ -90,7 +90,7 @@ def test_a_run_without_a_deployment_has_no_film(trained):
 
 def test_an_animation_is_current_until_there_is_a_newer_recording(seen):
     assert not current(seen)
-    path = animate(seen).gif
+    path = animate(seen)
     assert current(seen)
     later = path.stat().st_mtime_ns + 2_000_000_000
     os.utime(seen.path / "scene.npz", ns=(later, later))

@@ -512,7 +512,6 @@ def _pictures(run: Run) -> dict[str, str]:
     if not available():
         say("no pictures: they need matplotlib and pillow (pip install 'stlc[plot]')")
         return {}
-    from stlc.view.animation import ADVICE as VIDEO
     from stlc.view.bullet import ADVICE as BODIES
     from stlc.view.bullet import available as in_space
     from stlc.view.report import write_report
@@ -522,17 +521,11 @@ def _pictures(run: Run) -> dict[str, str]:
     if seen is not None and seen.stage is not None and not in_space():
         say(f"robots are drawn as lines: bodies need pybullet ({BODIES})")
     with PULSE.doing("drawing the animation"):
-        film = animate(run.dir)
+        gif = animate(run.dir)
     with PULSE.doing("drawing the report"):
         write_report(run.dir)
     drawn = {"report": f"{run.dir.shown}/report.html"}
-    if film is None:
-        return drawn
-    if film.mp4 is None:
-        say(f"the animation is a GIF alone: an MP4 needs ffmpeg ({VIDEO})")
-    else:
-        drawn = {"video": f"{run.dir.shown}/{film.mp4.name}", **drawn}
-    return {"animation": f"{run.dir.shown}/{film.gif.name}", **drawn}
+    return drawn if gif is None else {"animation": f"{run.dir.shown}/{gif.name}", **drawn}
 
 
 def _require_robots(run: Run) -> None:

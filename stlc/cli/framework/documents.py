@@ -609,7 +609,6 @@ class Simulation(TypedDict):
     interval: str
     guards: dict[str, GuardedRuns]
     animation: NotRequired[str]
-    video: NotRequired[str]
     report: NotRequired[str]
     errors: NotRequired[ModelErrors]
     margin: NotRequired[dict[str, Positive]]

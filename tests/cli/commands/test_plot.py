@@ -52,6 +52,14 @@ def test_no_picture_replaces_the_specification(tmp_path, capsys):
     assert (tmp_path / "tank.svg").read_text() == TANK
 
 
+def test_a_suffix_without_a_picture_names_the_formats(tmp_path, capsys):
+    assert main(["plot", "walk.npz", "-o", "walk.mp4"]) == 2
+    err = capsys.readouterr().err
+    assert "error[U101]: `walk.mp4` is no picture" in err
+    assert ".svg .png .pdf" in err
+    assert not (tmp_path / "walk.mp4").exists()
+
+
 def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
     (tmp_path / "tank.stl").write_text(TANK)
     (tmp_path / "tank.csv").write_text("t,level\n" + "".join(f"{k},{1.5 + 0.1 * k}\n" for k in range(6)))
