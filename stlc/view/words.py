@@ -56,10 +56,10 @@ def seconds(value: float | None) -> str:
     return f"{minutes} min {rest} s" if rest else f"{minutes} min"
 
 
-def listing(names: Sequence[str], most: int = 12) -> str:
-    """Join names, of which the first `most` are shown, and the others are counted."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")
+def listing(names: Sequence[str]) -> str:
+    """Join names, of which the first 12 are shown, and the others are counted."""
+    more = len(names) - 12
+    return ", ".join(names[:12]) + (f" and {more:,} more" if more > 0 else "")
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,14 +46,10 @@ def emit(text: str, *, styled: bool = False) -> None:
     _write(sys.stdout, screen(text, styled=styled))
 
 
-def say(text: str, *, styled: bool = False) -> None:
-    """Write a line to the standard error; with `--quiet`, write nothing.
-
-    A `styled` text may consist of several lines and contain colour codes. Its caller must have applied
-    `stlc.escape.visible` to all names that come from files.
-    """
+def say(text: str) -> None:
+    """Write a line to the standard error; with `--quiet`, write nothing."""
     if not QUIET.get():
-        _write(sys.stderr, screen(text, styled=True) if styled else visible(text))
+        _write(sys.stderr, visible(text))
 
 
 def emit_json(
@@ -158,17 +154,15 @@ def wants_color(stream: TextIO) -> bool:
     return stream.isatty()
 
 
-def console(*, stderr: bool = False, width: int | None = None) -> Console:
+def console(*, stderr: bool = False) -> Console:
     """Return a rich console without markup, for results or, with `stderr`, for messages.
 
-    If `width` is None, lines are as wide as the terminal, or 120 columns wide in a pipe or a file.
+    Lines are as wide as the terminal, or 120 columns wide in a pipe or a file.
     """
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
     colored = wants_color(stream)
-    if width is None and not stream.isatty():
-        width = 120
     return Console(
         file=cast(TextIO, _Noted(stream)),
         force_terminal=colored or None,
@@ -176,7 +170,7 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
         highlight=False,
         markup=False,
         quiet=stderr and QUIET.get(),
-        width=width,
+        width=None if stream.isatty() else 120,
         soft_wrap=not stream.isatty(),
     )
 

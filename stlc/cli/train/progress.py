@@ -68,11 +68,9 @@ class TrainingDisplay:
         console: Console | None = None,
         *,
         clock: Callable[[], float] = time.monotonic,
-        every: float = LINE_EVERY,
     ) -> None:
         self.console = console or open_console(stderr=True)
         self._clock = clock
-        self._every = every
         self._unicode = "utf" in (self.console.encoding or "").lower()
         self._title, self._spec = "", ""
         self._row: dict[str, Any] = {}
@@ -121,7 +119,7 @@ class TrainingDisplay:
         if row.get("accuracy") is not None:
             self._accuracies.append(float(row["accuracy"]))
         self._row_at = self._clock()
-        if self._live is None and self._title and self._row_at - self._line_at >= self._every:
+        if self._live is None and self._title and self._row_at - self._line_at >= LINE_EVERY:
             self._line_at = self._row_at
             self._print(self._line())
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal, NoReturn, TypeAlias
 
-from stlc.compile.frontend.values import EnumMember, Number, Origin, Value, VectorValue
+from stlc.compile.frontend.values import EnumMember, Number, Value, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds, callable_names, sampler_names
 from stlc.diagnostics import Diagnostic, Findings, SpecError, StlcError, SystemFileError, tell
@@ -296,17 +296,16 @@ class Scope:
         return f"  ({entry.about})" if entry is not None and entry.about else ""
 
 
-def column_value(column: Column, origin: Origin | None = None) -> Number:
+def column_value(column: Column) -> Number:
     """Return the value of a column as a number in SI units.
 
-    The number is counted from the zero of its own unit: 20 degC is 20, not 293.15. `origin` is the
-    declaration of the column.
+    The number is counted from the zero of its own unit: 20 degC is 20, not 293.15.
     """
     num: ir.Num = ir.Signal(column.name)
     if column.unit.ratio != 1:
         num = ir.Op("mul", (num, ir.Const(column.unit.scale)))
     flexible = column.kind in ("real", "int") and not column.unit.text
-    return Number(num, column.unit, flexible, kind=column.kind, labels=column.labels, origin=origin)
+    return Number(num, column.unit, flexible, kind=column.kind, labels=column.labels)
 
 
 def column_entries(

@@ -189,14 +189,13 @@ class _Known:
         return wilson(self.share, len(self.found)) if self.found else (0.0, 1.0)
 
 
-def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: int = SEED) -> ClosedLoop:
+def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES) -> ClosedLoop:
     """Simulate a policy in the world of its system, without and with guards, within the time limit.
 
     Args:
         run: trained run.
         left: function that returns the remaining seconds; simulation stops once they are 0.
         most: maximum number of runs of each guard.
-        seed: first seed; further seeds are the integers after it.
 
     Returns:
         Results of the completed runs. If the world fails, or the rules (specification of closed-loop runs) do
@@ -205,7 +204,7 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
     test = run.task.system.decl.test
     try:
         rules = rules_of(run)
-        trial = _Trial(run, rules, left, most, seed)
+        trial = _Trial(run, rules, left, most, SEED)
         trial.simulate()
     except StlcError as error:
         return ClosedLoop((), test.steps, why=error.diagnostics[0].message)
@@ -213,16 +212,16 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, seed: i
     return ClosedLoop(shares, test.steps, judge, left_out=trial.left_out(shares))
 
 
-def fresh_share(run: Run, guard: Mode, runs: int, seed: int = 0) -> Share:
+def fresh_share(run: Run, guard: Mode, runs: int) -> Share:
     """Simulate at least `runs` runs under one guard, without time limit, from the seeds of `stlc simulate`.
 
     Raises:
         SystemFileError: a method of the world raises an exception or returns wrong values.
         SpecError: the rules (specification of closed-loop runs) do not fit the system.
     """
-    trial = _Trial(run, rules_of(run), lambda: 1e9, runs, seed)
+    trial = _Trial(run, rules_of(run), lambda: 1e9, runs, 0)
     agents = trial.test.agents
-    seeds = tuple(range(seed, seed + -(-runs // agents)))
+    seeds = tuple(range(-(-runs // agents)))
     good, safe = trial._judged(trial._simulated(guard, seeds, agents, share=1.0))
     return Share(guard, len(good), int(good.sum()), None if safe is None else int(safe.sum()))
 

@@ -195,14 +195,14 @@ def decided(recording: DeploymentRecording) -> dict[str, float]:
     return found
 
 
-def latency(guard: Guard, recording: DeploymentRecording, samples: int = LATENCY_SAMPLES) -> DecisionLatency:
+def latency(guard: Guard, recording: DeploymentRecording) -> DecisionLatency:
     """Measure the time of single-agent decisions in random visited states, for a few seconds at most.
 
     As in a deployment, the guard gets the remainder of a previous plan together with each state. The previous
     plan is made in the preceding state, before the time is measured.
     """
     rows, steps = recording.actions.shape[:2]
-    picked = np.linspace(0, rows * steps - 1, min(samples, rows * steps)).astype(int)
+    picked = np.linspace(0, rows * steps - 1, min(LATENCY_SAMPLES, rows * steps)).astype(int)
     picked, seconds, stop = np.random.default_rng(0).permutation(picked), [], perf_counter() + LATENCY_SECONDS
     for row, step in zip(picked // steps, picked % steps, strict=True):
         before, now = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]

@@ -216,11 +216,12 @@ def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
     return (int(known.sum()) + left * found / max(1, tried)) / len(known)
 
 
-def wilson(share: float, n: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's score interval (low, high) of a share of successes in `n` trials (E. B. Wilson, 1927).
+def wilson(share: float, n: int) -> tuple[float, float]:
+    """Wilson's score interval (low, high) of a share of successes in `n` trials, with a confidence of 95 %.
 
-    `z`: quantile of the standard normal distribution; 1.96 for a confidence of 95 %.
+    Source: E. B. Wilson, 1927.
     """
+    z = 1.96
     middle = (share + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return 0.0 if share == 0.0 else max(0.0, middle - half), 1.0 if share == 1.0 else min(1.0, middle + half)

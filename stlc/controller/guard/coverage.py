@@ -131,12 +131,12 @@ def chance(axes: Sequence[Axis], radius: float, length: int, samples: int | None
     )
 
 
-def chances(task: Task, grid: PrefixGrid, radii: Sequence[float] = RADII) -> list[Chance]:
-    """Compute `chance` for each prefix length of `grid` and each radius in `radii`.
+def chances(task: Task, grid: PrefixGrid) -> list[Chance]:
+    """Compute `chance` for each prefix length of `grid` and each radius in `RADII`.
 
     Each result is a probability that the backup policy finds a satisfying plan. It is assumed that a prefix
     (the first actions of a plan) leads to a satisfying plan if it differs from an unknown prefix by at most
     the radius in each control. The radius is a share of the control's range.
     """
     axes = axes_of(task, grid)
-    return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in radii]
+    return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in RADII]

@@ -42,10 +42,6 @@ class BoxVerdicts:
     high: Floats
     effects: Floats
 
-    def weighed(self, effects: Floats) -> BoxVerdicts:
-        """The same bounds with other effects."""
-        return replace(self, effects=effects)
-
 
 class Judge:
     """Robustness of formulas over affine forms of signals.

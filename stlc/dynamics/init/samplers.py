@@ -357,10 +357,10 @@ class InitialStates:
         found = [mark.expand(len(states)) > 0.5 for mark in marks.values()]
         return torch.stack(found) if found else torch.ones(0, len(states), dtype=torch.bool)
 
-    def require_many(self, n: int = 256, *, seed: int = 0) -> None:
-        """Draw n states; raise SystemFileError (S301) if less than 1 % of proposed states is accepted."""
+    def require_many(self) -> None:
+        """Draw 256 states; raise SystemFileError (S301) if less than 1 % of proposed states is accepted."""
         before = self.drawn, self.accepted
-        self.sample(n, torch.Generator().manual_seed(seed))
+        self.sample(256, torch.Generator().manual_seed(0))
         drawn, accepted = self.drawn - before[0], self.accepted - before[1]
         if accepted < FEW * drawn:
             raise self._rejected(drawn, accepted)

@@ -64,13 +64,13 @@ SOFT = Line("")
 _Entry: TypeAlias = tuple[int, bool, Doc]
 
 
-def render(parts: Sequence[Doc], *, width: int, indent: int = 0) -> list[str]:
+def render(parts: Sequence[Doc], *, width: int) -> list[str]:
     """Return the lines of a sequence of layout elements, of at most `width` characters.
 
-    Only a word may exceed that width; `indent` is the indentation of the first line, in characters.
+    Only a word may exceed that width.
     """
-    page = _Page(indent)
-    stack: list[_Entry] = [(indent, False, part) for part in reversed(parts)]
+    page = _Page()
+    stack: list[_Entry] = [(0, False, part) for part in reversed(parts)]
     while stack:
         level, flat, doc = stack.pop()
         match doc:
@@ -151,10 +151,10 @@ def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
 class _Page:
     """Lines under construction; only the last line can still grow."""
 
-    def __init__(self, indent: int) -> None:
+    def __init__(self) -> None:
         self.lines: list[str] = []
         self.line = ""
-        self.indent = indent
+        self.indent = 0
         self.blank = False
         self.commented = False
 
