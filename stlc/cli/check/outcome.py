@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING
 
 from stlc.cli.framework.documents import CheckedTrace, InvalidTrace
 from stlc.diagnostics import Diagnostic
-from stlc.monitor.explain.report import Cause
-from stlc.monitor.facts.fact import Fact
-from stlc.monitor.judgement import Verdict
 from stlc.source import Source
-from stlc.trace import Trace
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Sample
-    from stlc.monitor.judgement import Status
+    from stlc.monitor.explain.report import Cause
+    from stlc.monitor.facts.fact import Fact
+    from stlc.monitor.judgement import Status, Verdict
     from stlc.monitor.uncertain import Uncertainty
+    from stlc.trace import Trace
 
 WORDS: dict[Status, str] = {
     "satisfied": "satisfied",
