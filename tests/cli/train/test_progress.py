@@ -198,7 +198,7 @@ def test_the_closing_screen_says_all_that_matters():
     assert lines[2] == "verdict         undertrained: it is poor"
     assert lines[-5:-3] == ["what helps      more time", "                luck"]
     assert lines[-1] == "Next:  stlc train --resume 7"
-    assert any("missions of 120 s" in line for line in final_screen({**RESULT, "judged_seconds": 120.0}))
+    assert any("missions of 2 min;" in line for line in final_screen({**RESULT, "judged_seconds": 120.0}))
 
 
 def test_the_closing_screen_can_go_elsewhere():
