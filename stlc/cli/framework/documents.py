@@ -647,11 +647,7 @@ class ControlRange(TypedDict):
     high: Num
 
 
-class InputSignal(TypedDict):
-    name: str
-    unit: str
-    low: Num
-    high: Num
+class InputSignal(ControlRange):
     pieces: int
     interpolate: Literal["hold", "linear", "pchip"]
     seconds: Num
