@@ -1,4 +1,4 @@
-"""Extremes over a window in a comparison, such as `max[-5 s, 0 s](x) - x < 3`, as temporal operators.
+"""Extremes (`max`, `min`) over a window in a comparison, written as temporal operators.
 
 A comparison with the greatest value holds if it holds with every value where the value stands on its smaller
 side, and with some value where it stands on its greater side:
