@@ -7,8 +7,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.files import MAX_BYTES, read_regular
@@ -41,6 +42,17 @@ def require_driving(place: Span | None) -> None:
         raise RunError(Diagnostic("R111", message, place, label="names Python", help=help_))
 
 
+class _TextLoader(SourceFileLoader):
+    """Loader of a Python file that has been read; it reads and writes no compiled copy."""
+
+    def __init__(self, name: str, path: Path, text: bytes) -> None:
+        super().__init__(name, str(path))
+        self.text = text
+
+    def get_code(self, fullname: str) -> CodeType:  # noqa: ARG002
+        return self.source_to_code(self.text, self.path)
+
+
 def module_at(path: Path, name: str, place: Span | None = None) -> ModuleType:
     """Import the Python file at `path` as the module `name`, which runs it, once while its text is the same.
 
@@ -58,13 +70,15 @@ def module_at(path: Path, name: str, place: Span | None = None) -> ModuleType:
     text, known = read_regular(path, MAX_BYTES), sys.modules.get(name)
     if known is not None and getattr(known, _TEXT, None) == (path, text):
         return known
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    if path.suffix != ".py":
         raise ImportError(f"`{path}` is not a Python file")
+    loader = _TextLoader(name, path, text)
+    spec = importlib.util.spec_from_file_location(name, path, loader=loader)
+    assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        exec(compile(text, str(path), "exec"), vars(module))
+        loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
