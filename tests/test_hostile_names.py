@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers.hostile import CANARY, NAMES, sample
+from helpers.hostile import CANARY, NAMES, OF_FILES, REFUSED, sample
 
 from stlc import escape
 from stlc.cli.framework.app import main
@@ -31,8 +31,10 @@ from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta, read_recording, save_trace
 
-REQUIRED = [name for name in NAMES if name not in ("x[0]", "meta", "t")]
-"""Those that a requirement of a recorded trace may have: no component, no array that a file has anyway."""
+RECORDED = [name for name in OF_FILES if name not in ("x[0]", "meta", "t")]
+"""Names of signals of a recorded trace: no component, no array that a file has anyway."""
+REQUIRED = [name for name in RECORDED if name in NAMES]
+"""Those that a requirement of such a trace may have."""
 MARK = "\N{WHITE SQUARE}"
 
 
@@ -164,6 +166,14 @@ def test_hover_shows_names_and_comments_as_text() -> None:
         assert set(re.findall(r"<(\w+)", re.sub(r"&lt;", "", shown))) <= {"pre", "code", "p"}, shown
 
 
+@pytest.mark.parametrize("name", REFUSED, ids=ascii)
+def test_a_name_with_control_characters_is_refused(name: str, folder: Path, said: Said) -> None:
+    (folder / "h.stl").write_text(text_of([name]), encoding="utf-8", newline="")
+    code, text = said("compile", "h.stl", "--show", "ast")
+    assert code == 3
+    assert "error[E001]: unexpected character U+" in text
+
+
 # -------------------------------------------------------------------------- verdicts
 
 
@@ -172,10 +182,12 @@ def test_a_verdict_has_a_line_for_each(judged: list[str], said: Said) -> None:
     assert code == 1
     head, table = text.split("\n\n")[:2]
     assert head == "h.stl on h.npz    2 traces x 20 samples, dt 0.1 s"
-    rows = table.split("\n")[1:]
-    assert len(rows) == len(judged)
+    lines = table.split("\n")[1:]
+    rows, facts = lines[: len(judged)], lines[len(judged) :]
     for name, row in zip(judged, rows, strict=True):
         assert seen(name).rstrip() in row
+    assert len(facts) == len(judged)
+    assert all(fact.endswith(" is 0 m throughout in 2 of 2 traces") for fact in facts)
     assert text.count("replay:") == len(judged) // 2 + len(judged) % 2
 
 
@@ -196,8 +208,10 @@ def test_documents_hold_every_name(judged: list[str], said: Said) -> None:
     assert code == 1
     assert [each["name"] for each in found["result"]["requirements"]] == judged
     suite = ElementTree.parse("j.xml").getroot()[0]
-    assert [case.get("name") for case in suite] == [seen_in_markup(name) for name in judged]
-    assert {child.tag for case in suite for child in case} == {"failure"}
+    *cases, facts = suite
+    assert [case.get("name") for case in cases] == [seen_in_markup(name) for name in judged]
+    assert {child.tag for case in cases for child in case} == {"failure", "system-out"}
+    assert (facts.tag, str(facts.text).count("\n") + 1) == ("system-out", len(judged))
     assert sorted(read_recording(Path("o.npz")).columns) == sorted(judged)
 
 
@@ -207,7 +221,7 @@ def seen_in_markup(name: str) -> str:
 
 def test_a_csv_gives_names_back_or_refuses_them() -> None:
     kept, codes = 0, set()
-    for name in REQUIRED:
+    for name in RECORDED:
         trace = zeros([name], traces=1)
         try:
             save_trace("one.csv", trace)
@@ -218,7 +232,7 @@ def test_a_csv_gives_names_back_or_refuses_them() -> None:
         with Path("one.csv").open(encoding="utf-8", newline="") as file:
             assert len(next(csv.reader(file))) == 2
         assert list(read_recording(Path("one.csv")).groups[0].arrays) == ["t", f"s{name}"]
-    assert kept > len(REQUIRED) // 2
+    assert kept > len(RECORDED) // 2
     assert codes == {"E605"}
 
 
@@ -234,7 +248,7 @@ def test_formulas_of_a_spreadsheet_do_not_run_and_come_back() -> None:
 def test_a_stream_has_the_names_of_a_file(folder: Path, said: Said, monkeypatch: pytest.MonkeyPatch) -> None:
     import io
 
-    names = ["=1+1", "a,b", 'say "x"', "\x1b[2J", "<b>"]
+    names = ["=1+1", "a,b", 'say "x"', "[2J\u200b", "<b>"]
     (folder / "s.stl").write_text(text_of_signals(names), encoding="utf-8")
     row = dict.fromkeys(names, 0.0)
     lines = "".join(json.dumps({"t": 0.1 * k, **row}) + "\n" for k in range(5))
@@ -263,7 +277,7 @@ def test_a_trace_that_carries_half_a_character_is_judged(said: Said) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in sample(20) if "/" not in name and len(name.encode()) < 200]
+    "name", [name for name in sample(20, OF_FILES) if "/" not in name and len(name.encode()) < 200]
 )
 def test_files_of_any_name_are_named_in_one_line(name: str, folder: Path, said: Said) -> None:
     spec, trace = f"{name}.stl", f"{name}.npz"
@@ -338,7 +352,8 @@ def test_kernels_are_the_same_whatever_things_are_called() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in sample(30) if len(name.encode()) < 200 and not name.startswith(("/", "."))]
+    "name",
+    [name for name in sample(30, OF_FILES) if len(name.encode()) < 200 and not name.startswith(("/", "."))],
 )
 def test_a_project_of_any_name_is_one_folder_that_works(name: str, folder: Path, said: Said) -> None:
     code, text = said("init", "--", name)

@@ -12,7 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from helpers.hostile import CANARY, NAMES, sample
+from helpers.hostile import CANARY, NAMES, OF_FILES, sample
 from test_hostile_names import seen_in_markup, steering
 
 from stlc import escape, native
@@ -88,7 +88,7 @@ def task_of(spec: str, system: str) -> Task:
 
 
 def test_names_of_a_system_can_be_seen_or_are_refused(folder: Path) -> None:
-    for name in NAMES[::4]:
+    for name in OF_FILES[::4]:
         path = folder / "s.yaml"
         path.write_text(system_of(name), encoding="utf-8")
         if name in VISIBLE:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import unicodedata
+from collections.abc import Sequence
+
 CANARY = "canary_ran"
 """Mark that a name leaves behind if it runs as code: a file of that name, or this word on its own."""
 
@@ -252,11 +255,24 @@ COMMANDS = (
 _KINDS = (CODE, MARKUP, STEERING, PLACES, COMMANDS)
 
 
-NAMES = list(dict.fromkeys(name for kind in _KINDS for name in kind))
-"""All of them. None holds what no name in backticks may: a backtick, a line feed, a zero."""
+OF_FILES = list(dict.fromkeys(name for kind in _KINDS for name in kind))
+"""All of them, as files and their contents have them. None holds a backtick, a line feed or a zero."""
 
 
-def sample(wanted: int) -> list[str]:
-    """About so many, of each kind as many."""
+def written(name: str) -> bool:
+    """True if a specification may have the name: it has no control character, and none that turns a text."""
+    turning = "\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+    return not any(c != "\t" and (unicodedata.category(c) == "Cc" or c in turning) for c in name)
+
+
+NAMES = list(filter(written, OF_FILES))
+"""Those that specifications and systems may have."""
+REFUSED = [name for name in OF_FILES if not written(name)]
+"""Those that no specification may have (E001)."""
+
+
+def sample(wanted: int, names: Sequence[str] = NAMES) -> list[str]:
+    """About so many of `names`, of each kind as many."""
     each = -(-wanted // len(_KINDS))
-    return [name for kind in _KINDS for name in kind[:: max(len(kind) // each, 1)][:each]]
+    kinds = [[name for name in kind if name in names] for kind in _KINDS]
+    return [name for kind in kinds for name in kind[:: max(len(kind) // each, 1)][:each]]
