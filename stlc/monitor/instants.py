@@ -67,18 +67,25 @@ def rule_bounds(
     are unknown (`ends` is "open"), or the windows are clipped ("truncate"). Where a window begins beyond the
     end of the trace, the bounds hold wherever the trace may end.
     """
-    formula, window = rule.under(record.semantics), window_of(rule, horizon)
-    if window is None:
-        found = bounds(formula, record, starts, ends)
-    else:
-        found = window_bounds(formula, record, starts, window, ends)
+    found = cut_bounds(rule, record, starts, horizon, ends)
     if ends == "open" or not (outside := beyond(rule, starts, record.samples, horizon)).any():
         return found
     if record.cells is not None or record.ops is not NUMPY:
         return widened(outside, found, rule_bounds(rule, record, starts, horizon, "open"))
+    formula = rule.under(record.semantics)
     lower, upper = (prefix_bound(formula, end, cut=True) for end in ("lower", "upper"))
     grown = replace(record, env=with_seen(record.env))
-    return widened(outside, found, growing_bounds(lower, upper, grown, starts, window))
+    return widened(outside, found, growing_bounds(lower, upper, grown, starts, window_of(rule, horizon)))
+
+
+def cut_bounds(
+    rule: CompiledRequirement, record: Record, starts: range, horizon: int | None, ends: Ends
+) -> tuple[Array, Array]:
+    """`rule_bounds` in which a window that begins beyond the end of the trace is empty if `ends` cuts it."""
+    formula, window = rule.under(record.semantics), window_of(rule, horizon)
+    if window is None:
+        return bounds(formula, record, starts, ends)
+    return window_bounds(formula, record, starts, window, ends)
 
 
 def growing_bounds(

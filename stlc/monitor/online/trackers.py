@@ -15,7 +15,7 @@ from stlc.compile.ir.support import history, reach, uses_end
 from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
-from stlc.monitor.instants import growing_bounds, rule_bounds, window_of
+from stlc.monitor.instants import cut_bounds, growing_bounds, window_of
 from stlc.monitor.online.bounds import Ending, RobustnessBounds, Tracker, TrackingOptions
 from stlc.monitor.online.columns import Beyond, ColumnPlans, ColumnReader, Side, shareable
 from stlc.monitor.online.history import Floats
@@ -404,7 +404,7 @@ class RecomputeTracker(_CutTracker):
         return np.asarray(low), np.asarray(high)
 
     def ended(self, starts: range) -> RobustnessBounds:
-        low, high = rule_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
+        low, high = cut_bounds(self.rule, Record.of(self._signals, NUMPY), starts, self.horizon, self.ending)
         return RobustnessBounds(low[:, 0], high[:, 0])
 
     def drop(self, start: int) -> int:  # noqa: ARG002 - all samples are still needed
