@@ -76,7 +76,7 @@ def result_record(result: Checked, end: str) -> documents.CheckedTrace:
             record(documents.ClockRecord, clock, others=list(clock.others)) for clock in result.trace.clocks
         ],
         facts=fact_records(result.facts_on("")),
-        lint=list(result.lint),
+        lint=sorted(set(result.lint)),
     )
 
 

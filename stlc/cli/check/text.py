@@ -247,7 +247,7 @@ def lint_text(result: Checked) -> str:
     count = f"{len(result.lint)} warning{'s' if len(result.lint) > 1 else ''}"
     file = result.source.name
     command = f"; {shell(('stlc', 'lint', operand(file)))}" if Path(file).is_file() else ""
-    return f"lint: {count}: {', '.join(dict.fromkeys(result.lint))}{command}"
+    return f"lint: {count}: {', '.join(sorted(set(result.lint)))}{command}"
 
 
 def _summary(verdict: Verdict) -> str:

@@ -88,7 +88,7 @@ def test_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert (never["code"], never["count"], never["of"], never["unjudged"]) == ("W712", 0, 601, True)
     assert (far["code"], far["unjudged"]) == ("W714", False)
     assert [(fact["code"], fact["signal"]) for fact in result["facts"]] == [("W715", "z")]
-    assert result["lint"] == ["W105"]
+    assert result["lint"] == ["W105", "W311"]
 
 
 def test_junit(capsys: pytest.CaptureFixture[str]) -> None:
@@ -113,7 +113,7 @@ def test_several_files_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
         in text
     )
     assert "  answer" in text
-    assert text.count("lint: 1 warning: W105; stlc lint s.stl") == 1
+    assert text.count("lint: 4 warnings: W105, W311; stlc lint s.stl") == 1
     text = run(capsys, "check", "s.stl", "l.csv", "m.csv", "--require", "soon")[1]
     assert "`z`: a signal that is constant, or stuck for a while, in 2 of 2 files" in text
 
