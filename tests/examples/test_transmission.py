@@ -76,7 +76,7 @@ def agree(file: dict[str, Any], stream: dict[str, Any], *, resampled: bool = Fal
             assert {one["verdict"], other["verdict"]} != {"satisfied", "violated"}
             assert float(other["robustness"]["low"]) <= float(one["robustness"]["high"]) + 1e-9
         else:
-            assert one == other
+            assert {**one, "facts": []} == {**other, "facts": []}  # pieces tell less about a recording
     return {each["name"]: each["verdict"] for each in file["result"]["requirements"]}
 
 
