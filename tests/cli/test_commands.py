@@ -16,8 +16,8 @@ from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[2]
-SPEC = "signal x [m]\nrequire low: G[0 s, 1 s] x < 3 m && x > 0 m\n"
-FORMATTED = "signal x [m]\nrequire low: (always[0 s, 1 s] x < 3 m) and x > 0 m\n"
+SPEC = "signal x [m]\nrequire low: G[0 s, 1 s] x < 3 m && always x > 0 m\n"
+FORMATTED = "signal x [m]\nrequire low: (always[0 s, 1 s] x < 3 m) and always x > 0 m\n"
 
 
 @pytest.fixture(autouse=True)

@@ -52,7 +52,7 @@ def found(formula: str, **options: object) -> list[tuple[str, str]]:
         ("x > 10 -> eventually[0 s, 1 s] y > 5", "x > 10"),
         ("(go and x > 1) -> always[1 s, 2 s] y > 5", "go and x > 1"),
         ("go or always[0 s, 2 s] y > 5", "go"),
-        ("if go then x > 1 else always[0 s, 2 s] x < 1", "x > 1"),
+        ("if go then x > 1 else always[0 s, 2 s] x < 1", "go"),
         ("x > 2 and always y < 3", "x > 2"),
         ("(always y < 3) and (go -> eventually[0 s, 1 s] x > 2)", "go"),
         ("freeze x0 = x in (x0 > 2 -> eventually[0 s, 1 s] x > x0)", "x0 > 2"),
