@@ -17,6 +17,7 @@ from proof.draw import HORIZON, Taste
 from proof.levels import robustness, truth
 from proof.whole import defined
 
+from stlc.monitor.instants import beyond
 from stlc.monitor.verdict import Monitor
 
 ENDS = ("truncate", "lower", "upper")
@@ -88,10 +89,15 @@ def _check_truth(case: Case, monitor: Monitor, at: Any) -> None:
     exact = monitor.check(case.signals, at=at, end="truncate", tolerance=0)["r"]
     judged = slice(exact.start, exact.start + exact.instants)
     wanted = np.array(truth(case.formula, case.record("truncate")))[judged]
-    np.testing.assert_array_equal(exact.holds[:, 0], wanted, err_msg=f"holds\n{case}")
-    np.testing.assert_array_equal(exact.fails[:, 0], ~wanted, err_msg=f"fails\n{case}")
+    starts = range(exact.start, exact.start + exact.instants)
+    whole = ~beyond(exact.rule, starts, case.samples, monitor.compiled.grid.horizon)
+    held, failed = exact.holds[:, 0], exact.fails[:, 0]
+    np.testing.assert_array_equal(held[whole], wanted[whole], err_msg=f"holds\n{case}")
+    np.testing.assert_array_equal(failed[whole], ~wanted[whole], err_msg=f"fails\n{case}")
+    assert wanted[held].all(), f"holds where a window has no sample\n{case}"
+    assert not wanted[failed].any(), f"fails where a window has no sample\n{case}"
     assert wanted[exact.low[:, 0] > 0].all(), f"positive and violated\n{case}"
-    assert not wanted[exact.low[:, 0] < 0].any(), f"negative and satisfied\n{case}"
+    assert not wanted[exact.high[:, 0] < 0].any(), f"negative and satisfied\n{case}"
     still_open = monitor.check(case.signals, at=at, tolerance=0)["r"]
     certain = np.array(truth(case.formula, case.record("lower")))[judged]
     possible = np.array(truth(case.formula, case.record("upper")))[judged]
@@ -105,7 +111,7 @@ def _check_truth(case: Case, monitor: Monitor, at: Any) -> None:
         np.testing.assert_array_equal(fails, ~possible, err_msg=f"certainly not\n{case}")
     lenient = monitor.check(case.signals, at=at, end="truncate")["r"]
     np.testing.assert_array_equal(lenient.holds, lenient.low >= -1e-6, err_msg=f"tolerance\n{case}")
-    np.testing.assert_array_equal(lenient.fails, lenient.low < -1e-6, err_msg=f"tolerance\n{case}")
+    np.testing.assert_array_equal(lenient.fails, lenient.high < -1e-6, err_msg=f"tolerance\n{case}")
 
 
 def check_clock(seed: int) -> None:
