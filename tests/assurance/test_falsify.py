@@ -279,7 +279,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     text = capsys.readouterr().out
     assert "up: violated, robustness -" in text
     assert "does not repeat itself" not in text
-    assert "deep: no violation in 20 simulations" in text
+    assert re.search(r"deep: no violation in \d+ simulations", text), text
     assert re.search(r"failed, error at t = \S+ s: RuntimeError: below the ground", text)
     replay = ["--plant", "fall.yaml", "--replay", "counterexamples/up.json"]
     assert main(["falsify", "fall.stl", *replay]) == 1
