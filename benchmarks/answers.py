@@ -45,7 +45,7 @@ class Remark:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What `stlc check` and `stlc lint` say: the verdict, "error" if there is none, and the remarks."""
+    """Answer of `stlc check` and `stlc lint`: the verdict, "error" if there is none, and the remarks."""
 
     verdict: str
     remarks: frozenset[Remark]

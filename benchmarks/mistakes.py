@@ -36,7 +36,7 @@ class Files:
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """What a literal reading sees: a formula, and signal -> values at steps of `dt` seconds."""
+    """Input of a literal reading: a formula, and signal -> values at steps of `dt` seconds."""
 
     formula: Formula
     data: Mapping[str, Floats]

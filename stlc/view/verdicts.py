@@ -101,7 +101,7 @@ class Demand:
 
 
 def demands_of(formula: ir.Formula) -> list[Demand]:
-    """What a formula demands at all times; empty if it is not `always p`, or several of these at once."""
+    """Formulas that hold at all times if this one holds; empty if it is not `always p`, or several of these at once."""
     match formula:
         case ir.Temporal("always", ir.Window(first, None), body):
             return [Demand(first, body)]

@@ -37,7 +37,7 @@ class Input:
     odd: dict[str, str] = field(default_factory=dict)
     """Links, pipes and sparse files in the folder; see `fuzzing.hostile`."""
     drives: bool | None = None
-    """Whether the command may run Python of a run, if what it reads, writes and runs is watched."""
+    """True if the command may run Python of a run, if what it reads, writes and runs is watched."""
     missing: str = ""
     """Name of a missing package that the input needs, or ""."""
 

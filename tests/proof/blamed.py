@@ -124,7 +124,7 @@ class _Definition(reference.Robustness):
 
 @dataclass(frozen=True)
 class Statement:
-    """What is printed: a text, the truth value that it has at some instants, and its robustness, if told."""
+    """A printed text, the truth value that it has at some instants, and its robustness, if told."""
 
     text: str
     holds: bool

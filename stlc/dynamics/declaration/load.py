@@ -244,7 +244,7 @@ def _declaration(
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What moves the states of a system.
+    """Motion of the states of a system.
 
     Attributes:
         flow: derivatives or next values, without those of columns that are computed at samples.

@@ -1,4 +1,4 @@
-"""What people have: tables, clocks and objects, as `stlc check` reads them and says so."""
+"""Recordings as people have them: tables, clocks and objects, as `stlc check` reads them and says so."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a system file tells to specifications: names that they cannot use, and units that are missing."""
+"""Messages of a system file to specifications: names that they cannot use, and units that are missing."""
 
 from __future__ import annotations
 
