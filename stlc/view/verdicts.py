@@ -101,7 +101,7 @@ class Demand:
 
 
 def demands_of(formula: ir.Formula) -> list[Demand]:
-    """Formulas that hold at all times if this one holds; empty if it is not `always p`, or several of these at once."""
+    """Formulas that `formula` demands at all samples; none unless it is `always p`, or several of these."""
     match formula:
         case ir.Temporal("always", ir.Window(first, None), body):
             return [Demand(first, body)]
