@@ -288,7 +288,7 @@ def _actions(server: Server, params: lsp.CodeActionParams) -> list[lsp.CodeActio
         edits = [lsp.TextEdit(server.range(span), text) for span, text in fix.edits]
         actions.append(
             lsp.CodeAction(
-                title=f"write `{fix.text}`" if fix.text else f"mend {finding.diagnostic.code}",
+                title=fix.text or f"mend {finding.diagnostic.code}",
                 kind=lsp.CodeActionKind.QuickFix,
                 diagnostics=[server.diagnostic(finding)],
                 edit=lsp.WorkspaceEdit(changes={params.text_document.uri: edits}),

@@ -43,6 +43,15 @@ def test_a_project_may_begin_with_an_installed_example(name, spec, capsys):
     assert "did you mean `car`?" in capsys.readouterr().err
 
 
+def test_a_warning_of_a_system_is_said_once(capsys):
+    Path("tank.yaml").write_text(
+        "stlc: 1\nname: tank\ntime: {dt: 1 s, horizon: 9 steps}\nconst: {top: 2 m}\n"
+        "state: {x: {range: [0, top]}}\ncontrol: {u: {range: [0, 1]}}\nflow: {x: u}\ninit: {mixture: [{draw: {x: 1}}]}\n"
+    )
+    assert main(["system", "check", "tank.yaml", "--steps", "2"]) == 0
+    assert capsys.readouterr().err.count("W108") == 1
+
+
 def test_fmt_writes_in_place(capsys):
     assert main(["fmt", "a.stl"]) == 0
     assert Path("a.stl").read_text() == FORMATTED

@@ -156,6 +156,7 @@ def test_a_quick_fix(session, project):
     assert finding["severity"] == 2
     asked = {"textDocument": {"uri": other}, "range": finding["range"], "context": {"diagnostics": []}}
     (action,) = session.request("textDocument/codeAction", asked)
+    assert action["title"] == "write `5 s`"
     assert action["edit"]["changes"][other][0]["newText"] == "5 s"
 
 

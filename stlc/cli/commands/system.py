@@ -58,7 +58,7 @@ def check(
     a URDF are compared with pytorch-kinematics if that is installed.
     """
     decl = _load(system, parse_overrides(set_))
-    warnings = [*decl.warnings, *(_roll_out(decl, steps, seed) if steps else ())]
+    warnings = _roll_out(decl, steps, seed) if steps else decl.warnings
     compared = _kinematics(decl) if steps else []
 
     def tell() -> None:
@@ -110,7 +110,7 @@ def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
 
 
 def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]:
-    """Simulate random initial states under random controls for `steps` steps; return the warnings.
+    """Simulate random initial states under random controls for `steps` steps; return all warnings.
 
     Raises SystemFileError if no initial states can be sampled, if a simulated state is not finite, or if the
     errors of a listed constant cannot be carried (S212) or have no effect (S213).
@@ -129,7 +129,7 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
     share = torch.rand((_DRAWN, steps, len(system.decl.controls)), generator=generator)
     with torch.no_grad():
         system.require_finite(system.rollout(system.sample(_DRAWN, seed=seed), low + share * (high - low)))
-    return tuple(warnings)
+    return warnings
 
 
 def _kinematics(decl: SystemDecl) -> list[Comparison]:

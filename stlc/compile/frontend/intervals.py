@@ -109,7 +109,7 @@ def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> TimeExpr:
     if scope.time_unit in ("step", "steps"):
         return TimeExpr(steps=value, span=expr.span)
     if not scope.time_unit and value != 0:
-        fix = Fix(((expr.span, f"{expr.span.text} s"),), f"{expr.span.text} s")
+        fix = Fix(((expr.span, f"{expr.span.text} s"),), f"write `{expr.span.text} s`")
         help_ = ("say the unit, or set it for the whole file: `time s`",)
         scope.report(
             Diagnostic(
@@ -198,7 +198,7 @@ def _reversed(node: ast.Interval) -> Diagnostic:
     low, high = node.lo.span, node.hi.span
     edits = ((low, high.text), (high, low.text))
     label = f"{low.text} > {high.text}"
-    fix = Fix(edits, f"[{high.text}, {low.text}]")
+    fix = Fix(edits, f"write `[{high.text}, {low.text}]`")
     return Diagnostic("E301", "the interval ends before it starts", low.to(high), label, fix=fix)
 
 

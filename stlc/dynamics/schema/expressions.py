@@ -228,7 +228,7 @@ class Expressions:
                 message = (
                     f"{where} is in [{number.unit}], and no unit is declared that it could be checked with"
                 )
-                self._report((Diagnostic("W108", message, place, help=("declare the `unit` of the state",)),))
+                self._report((Diagnostic("W108", message, place, help=("declare it: `unit: …`",)),))
             if self.amounts and number.unit.offset:
                 self._report((point_for_amount(where, number, place),))
                 return None

@@ -27,6 +27,8 @@ REST, ALWAYS = 4, 0.98
 """Steps without a change that are told of a signal that changes in this share of all others."""
 GAP = 3.0
 """Spans of all other values by which an odd value lies off them."""
+FEW = 10
+"""Samples below which no value is odd, unless recorders write it for a missing one."""
 _NINES = re.compile(r"-?9{2,}|-?32768|32767|65535|2147483647|-2147483648")
 """Numbers that recorders write for a missing value; they are odd from one span on."""
 _SUFFIX = re.compile(r"_([A-Za-z]+)$")
@@ -93,6 +95,8 @@ def odd_values(evidence: Evidence) -> Iterator[Fact]:
             if not math.isfinite(odd):  # a laser that sees nothing
                 continue
             usual = _NINES.fullmatch(f"{odd:.10g}") is not None
+            if not usual and values.size < FEW:
+                continue
             factor = 1.0 if usual else GAP
             some = _beside(odd, values[:: len(values) // _SAMPLED + 1])
             if some.gap < factor * some.span:
