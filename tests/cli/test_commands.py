@@ -46,7 +46,8 @@ def test_a_project_may_begin_with_an_installed_example(name, spec, capsys):
 def test_a_warning_of_a_system_is_said_once(capsys):
     Path("tank.yaml").write_text(
         "stlc: 1\nname: tank\ntime: {dt: 1 s, horizon: 9 steps}\nconst: {top: 2 m}\n"
-        "state: {x: {range: [0, top]}}\ncontrol: {u: {range: [0, 1]}}\nflow: {x: u}\ninit: {mixture: [{draw: {x: 1}}]}\n"
+        "state: {x: {range: [0, top]}}\ncontrol: {u: {range: [0, 1]}}\nflow: {x: u}\n"
+        "init: {mixture: [{draw: {x: 1}}]}\n"
     )
     assert main(["system", "check", "tank.yaml", "--steps", "2"]) == 0
     assert capsys.readouterr().err.count("W108") == 1

@@ -73,7 +73,12 @@ def test_an_ordinary_recording_has_no_facts() -> None:
         ("always x > -1", np.where(np.arange(N) == 7, np.nan, RAMP), "W716", None),
         ("always x > -1", (RAMP > 1.0) * 1.0, "W716", None),
         ("always x < 99", np.array([1.0, 9.0, 1.5]), "W716", None),
-        ("always x < 99", np.array([1.0, -999.0, 1.5]), "W716", "`x` is -999 at 1 of 3 samples, elsewhere 1 to 1.5"),
+        (
+            "always x < 99",
+            np.array([1.0, -999.0, 1.5]),
+            "W716",
+            "`x` is -999 at 1 of 3 samples, elsewhere 1 to 1.5",
+        ),
     ],
 )
 def test_rules(formula: str, x: np.ndarray, code: str, text: str | None) -> None:
