@@ -205,6 +205,23 @@ def test_gradients_are_finite_and_central_differences(name: str) -> None:
     checked(0, 12, name)
 
 
+def test_an_infinite_constant_has_no_gradient_where_it_is_not_taken() -> None:
+    spread = ir.Op("add", (ir.Signal("z"), ir.Signal("y")))
+    wild = ir.Op("mul", (spread, ir.Op("log", (ir.Const(0.0),))))
+    rule = ir.BoolOp("or", (ir.Predicate(wild), ir.Predicate(ir.Signal("x"))))
+    at = np.array([[[1.0, 2.0, 3.0]]])
+    assert gradient(rule, at, Exact()).tolist() == [[[1.0, 0.0, 0.0]]]
+
+
+@pytest.mark.parametrize("name", ["agm", "dgmsr"])
+def test_the_mean_that_is_not_asked_for_may_overflow(name: str) -> None:
+    huge = ir.Op("square", (ir.Op("square", (ir.Signal("y"),)),))
+    inner = ir.BoolOp("or", (ir.Predicate(huge), ir.Predicate(ir.Signal("x"))))
+    rule = ir.BoolOp("and", (inner, ir.Predicate(ir.Signal("x"))))
+    found = gradient(rule, np.array([[[1.0, 1e70, 0.0]]]), semantics_of(name))
+    assert np.isfinite(found).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 41))
 def test_many_gradients_are_finite_and_central_differences(seed: int) -> None:

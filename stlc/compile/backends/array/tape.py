@@ -85,17 +85,22 @@ class GradientTape:
     def guarded(self) -> set[int]:
         """Return the registers whose derivatives by the operands may be infinite or NaN.
 
-        These are the results of partial functions, such as a quotient, and of what is computed from them.
+        These are the results of partial functions, such as a quotient, of operations with a constant that is
+        infinite or NaN, such as `log(0)`, and of what is computed from them.
         """
         unbounded: set[int] = set()
         found: set[int] = set()
-        for register, (kernel, args) in enumerate((each.kernel, each.args) for each in self.code):
+        for register, each in enumerate(self.code):
+            kernel, args = each.kernel, each.args
             operands = {arg for arg in args if isinstance(arg, int)}
             singular = FUNCTIONS[kernel].singular if kernel in FUNCTIONS else ()
-            if any(isinstance(args[i], int) or args[i] == 0.0 for i in singular) or unbounded & operands:
+            partial = any(isinstance(args[i], int) or args[i] == 0.0 for i in singular)
+            wild = not all(math.isfinite(it) for it in (*args, *each.params) if isinstance(it, float))
+            if partial or wild or unbounded & operands:
                 if kernel not in (*_TRUTHS, "indicator"):
                     unbounded.add(register)
-                if kernel not in _FLAT and not (kernel == "mul" and isinstance(args[1], float)):
+                flat = kernel in _FLAT or (kernel == "mul" and isinstance(args[1], float))
+                if wild or not flat:
                     found.add(register)
         return found
 

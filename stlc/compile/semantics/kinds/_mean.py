@@ -87,12 +87,13 @@ class Mean(ABC):
     def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:
         """Return the mean-based minimum or maximum (`pick`) of the operands from their partial result.
 
-        A single operand is returned unchanged, and a minimum of -inf stays -inf.
+        A single operand is returned unchanged, and a minimum of -inf stays -inf. A sum over huge operands is
+        infinite; the mean that is not asked for must not make its gradient NaN.
         """
         least, gains, losses, known = parts
         several = ops.both(ops.gt(known, 1.0), ops.gt(math.inf, ops.abs(least)))
         count = ops.where(several, known, 1.0)
-        good, bad = self.satisfied(gains, count, ops), self.violated(losses, count, ops)
+        good, bad = self.satisfied(gains, count, ops.guarded), self.violated(losses, count, ops.guarded)
         value = ops.where(several, ops.where(ops.gt(least, 0.0), good, bad), least)
         return value if pick == "min" else -value
 
