@@ -82,12 +82,12 @@ class ArrayProgram:
         bound = self._bound.get(key)
         if bound is None:
             bound = self._bound[key] = self._bind(ops, switch, like)
-        shapes = {
-            tuple(env[name].shape) for name, _ in bound.inputs if not isinstance(env[name], (int, float))
-        }
         with ops.quiet():
-            if ops.name in ("numpy", "intervals") and len(shapes) == 1:
-                return bound.run_in_blocks(env, ops, next(iter(shapes)))
+            if ops.name in ("numpy", "intervals"):  # shapes of exported torch programs are symbols
+                arrays = (env[name] for name, _ in bound.inputs)
+                shapes = {tuple(array.shape) for array in arrays if not isinstance(array, (int, float))}
+                if len(shapes) == 1:
+                    return bound.run_in_blocks(env, ops, *shapes)
             return bound.run(env, ops)
 
     def __getstate__(self) -> dict[str, Any]:
