@@ -138,6 +138,10 @@ class RunError(StlcError):
     """Error: a run folder or checkpoint is damaged, or cannot be used for what was requested."""
 
 
+class PluginError(StlcError):
+    """Error: a plugin of an installed package, or of a file that the user named, cannot be loaded."""
+
+
 class UsageError(StlcError):
     """Error: the command line is wrong, or a file named in it does not exist."""
 

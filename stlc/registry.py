@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from importlib import import_module
 from importlib.util import find_spec
@@ -11,7 +11,8 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, Generic, Literal, TypeAlias, TypeVar, get_args
 
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.plugins import Plugin, name_file, plugins
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -126,48 +127,133 @@ class Registry(Generic[T]):
 class PackageRegistry(Registry[T]):
     """A table of plugins whose entries are modules of a package: the plugin `NAME` is the file `NAME.py`.
 
-    Listing the names imports no module. Modules whose names begin with `_` are not entries.
+    Modules whose names begin with `_` are not entries. Entry points of installed packages and files that the
+    user names add further entries (`stlc.plugins`); they cannot replace those of the package. Listing the
+    names imports no module.
 
     Args:
         kind: noun for an entry in messages, such as "method".
-        package: dotted name of the package.
+        package: dotted name of the package; "": all entries come from elsewhere.
         attribute: name of the variable that holds the plugin in its module.
         default: name of the default plugin, which comes first in `names`.
+        group: group of entry points, such as "stlc.methods"; "": nothing is added from elsewhere.
+        accepts: `module:name` of the class of plugins from elsewhere, or of a function that says whether an
+            object is a plugin.
+        moved: name of a former entry -> file that has it now.
     """
 
-    def __init__(self, kind: str, package: str, attribute: str, *, default: str) -> None:
+    def __init__(
+        self,
+        kind: str,
+        package: str,
+        attribute: str,
+        *,
+        default: str = "",
+        group: str = "",
+        accepts: str = "",
+        moved: Mapping[str, str] | None = None,
+    ) -> None:
         super().__init__(kind)
-        self.default = default
-        self._package, self._attribute = package, attribute
+        self.default, self.group = default, group
+        self._packages = (package,) if package else ()
+        self._attribute, self._accepts = attribute, accepts
+        self.moved = moved or {}
+        self._loaded: dict[Plugin, T] = {}
 
     def get(self, name: str) -> T:
         """Return the plugin called `name`, after importing its module.
 
         Raises:
             UsageError: U101, there is none; the message lists all names and the most similar one.
+            PluginError: S206, a plugin from elsewhere cannot be loaded, or is not of the right kind.
         """
-        if name not in self._entries and name in self:
-            self._entries[name] = getattr(import_module(f"{self._package}.{name}"), self._attribute)
+        if name not in self._entries:
+            if module := self._modules().get(name):
+                self._entries[name] = getattr(import_module(module), self._attribute)
+            elif found := self._elsewhere().get(name):
+                return self._of_elsewhere(*found)
         return super().get(name)
+
+    def _of_elsewhere(self, plugin: Plugin, *others: Plugin) -> T:
+        if others:
+            raise plugin.refused(f"{others[0].source} has another of this name")
+        if plugin not in self._loaded:
+            entry = plugin.load()
+            module, _, name = self._accepts.partition(":")
+            accepts = getattr(import_module(module), name)
+            fits = isinstance(entry, accepts) if isinstance(accepts, type) else accepts(entry)
+            if not fits:
+                raise plugin.refused(f"`{plugin.attribute}` of `{plugin.place}` is no {self.kind}")
+            self._loaded[plugin] = entry
+        return self._loaded[plugin]
+
+    def chosen(self, text: str) -> str:
+        """Return the name of the plugin that the user chose by name, or by the path of its file, `FILE.py`.
+
+        The file is imported, and becomes known to this process and to those that it starts. A text that a
+        file contains, such as a system file or the record of a run, must not be given to this method.
+
+        Raises:
+            UsageError: U101, the file is called like a plugin of stlc; U102, there is no such file.
+            PluginError: S206, the file cannot be imported, or holds no such plugin.
+        """
+        if not text.endswith(".py"):
+            return text
+        name = name_file(self.group, Path(text))
+        if name in self.own:
+            raise usage(f"stlc has a {self.kind} `{name}` of its own", f"rename `{text}`")
+        self.get(name)
+        return name
+
+    def suggest(self, name: str) -> str:
+        if name in self.moved:
+            return f"did you mean --method {self.moved[name]}, a file of the repository?"
+        return super().suggest(name)
+
+    def plugin(self, name: str) -> Plugin | None:
+        """The plugin `name` if it comes from elsewhere; else None."""
+        return None if name in self.own else next(iter(self._elsewhere().get(name, ())), None)
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """Names of the plugins in the package: the default one first, then the others alphabetically."""
+        return self._sorted(self._modules())
+
+    @property
+    def installed(self) -> tuple[str, ...]:
+        """Names in the package and of installed packages, without the files that the user names."""
+        names = (name for name, found in self._elsewhere().items() if isinstance(found[0].place, str))
+        return self._sorted((*self.own, *names))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the plugins: the default one first, then the others in alphabetical order."""
-        found = sorted(
-            module.name
-            for module in iter_modules(self._folders())
-            if not (module.ispkg or module.name.startswith("_"))
-        )
-        return tuple(sorted(found, key=lambda name: name != self.default))
+        """Names of all plugins: the default one first, then the others in alphabetical order."""
+        return self._sorted((*self.own, *self._elsewhere()))
 
-    def _folders(self) -> list[str]:
-        """Paths of the package's folders, found without importing the package or its parents."""
-        if self._package in sys.modules:
-            return list(sys.modules[self._package].__path__)
-        root, *inner = self._package.split(".")
-        package = find_spec(root)
-        roots = (package.submodule_search_locations if package is not None else None) or ()
-        return [str(Path(folder, *inner)) for folder in roots]
+    def _sorted(self, names: Iterable[str]) -> tuple[str, ...]:
+        return tuple(sorted(set(names), key=lambda name: (name != self.default, name)))
+
+    def _elsewhere(self) -> dict[str, tuple[Plugin, ...]]:
+        return plugins(self.group, self._attribute) if self.group else {}
+
+    def _modules(self) -> dict[str, str]:
+        """Dotted name of the module of each plugin in the package, found without importing it."""
+        return {
+            module.name: f"{package}.{module.name}"
+            for package in self._packages
+            for module in iter_modules(_folders(package))
+            if not (module.ispkg or module.name.startswith("_"))
+        }
+
+
+def _folders(package: str) -> list[str]:
+    """Paths of a package's folders, found without importing the package or its parents."""
+    if package in sys.modules:
+        return list(sys.modules[package].__path__)
+    root, *inner = package.split(".")
+    spec = find_spec(root)
+    roots = (spec.submodule_search_locations if spec is not None else None) or ()
+    return [str(Path(folder, *inner)) for folder in roots]
 
 
 GuardName: TypeAlias = Literal["none", "paper", "full", "certified"]
@@ -190,12 +276,22 @@ def guard_named(name: str) -> GuardName:
 
 
 METHODS: PackageRegistry[Any] = PackageRegistry(
-    "method", "stlc.controller.methods", "METHOD", default="guided"
+    "method",
+    "stlc.controller.methods",
+    "METHOD",
+    default="guided",
+    group="stlc.methods",
+    accepts="stlc.controller.methods:Method",
 )
 """Training methods (`stlc.controller.methods.Method`) of `--method` and `train: {method: …}`."""
 
 PLANNERS: PackageRegistry[Any] = PackageRegistry(
-    "planner", "stlc.controller.methods.planners", "PLANNER", default="search"
+    "planner",
+    "stlc.controller.methods.planners",
+    "PLANNER",
+    default="search",
+    group="stlc.planners",
+    accepts="stlc.controller.planning.planner:is_planner",
 )
 """Planners, `stlc.controller.planning.planner.Planner` each, named by `stlc plan --method`."""
 

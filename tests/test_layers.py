@@ -19,7 +19,7 @@ ROOMS = (
     {"source", "version", "stopping"},
     {"diagnostics"},
     {"escape"},
-    {"registry", "units", "jsontext"},
+    {"plugins", "registry", "units", "jsontext"},
     {"signature"},
     {"rundir", "files", "foreign", "provenance", "cache", "toolchain", "native", "trace"},
     {"grammar"},

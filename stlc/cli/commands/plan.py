@@ -51,7 +51,10 @@ def plan(
     ] = "random",
     starts: Annotated[int | None, typer.Option(min=1, help="Number of initial states; 1.")] = None,
     method: Annotated[
-        str, typer.Option("--method", "-m", metavar="|".join(PLANNERS), help="The planner.")
+        str,
+        typer.Option(
+            "--method", "-m", metavar="|".join((*PLANNERS.installed, "FILE.py")), help="The planner."
+        ),
     ] = PLANNERS.default,
     option: PlannerOptionsOption = None,
     budget: Annotated[

@@ -99,7 +99,7 @@ def train(
     method: Annotated[
         str | None,
         typer.Option(
-            metavar="|".join(METHODS),
+            metavar="|".join((*METHODS.installed, "FILE.py")),
             help="How to train, see docs/methods.md; guided unless the system file says otherwise.",
         ),
     ] = None,
@@ -224,10 +224,11 @@ def _logger(name: str | None) -> Opener | None:
 
 
 def _method(name: str) -> str:
-    """Check that there is a training method called `name`, and return the name.
+    """Return the name of the training method that `--method` names, or whose file it names.
 
     Raises UsageError (U101) if there is none.
     """
+    name = METHODS.chosen(name)
     if name not in METHODS:
         raise usage(f"there is no method `{name}`", METHODS.suggest(name))
     return name

@@ -105,7 +105,8 @@ PlannerOption = Annotated[
         "--method",
         "-m",
         metavar="PLANNER",
-        help=f"A planner instead of a trained policy, for a specification: {', '.join(PLANNERS)}.",
+        help="A planner instead of a trained policy, for a specification: "
+        f"{', '.join(PLANNERS.installed)}, or FILE.py.",
     ),
 ]
 PlannerOptionsOption = Annotated[
@@ -122,7 +123,7 @@ def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> Plann
     from stlc.controller.training.config import PlannerChoice
 
     options = parse_pairs(pairs, "--option", "NAME=VALUE", "population=500")
-    return PlannerChoice(name, options, parse_seconds(budget))
+    return PlannerChoice(PLANNERS.chosen(name), options, parse_seconds(budget))
 
 
 def require_no_jobs(cluster: str | None, jobs: int) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import Field, dataclass, fields
+from dataclasses import Field, dataclass, fields, is_dataclass
 from time import process_time
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -244,11 +244,16 @@ class Planner(Protocol):
         """
 
 
+def is_planner(found: object) -> bool:
+    """True for a dataclass with the method of `Planner`."""
+    return isinstance(found, type) and is_dataclass(found) and callable(getattr(found, "prepare", None))
+
+
 def planner_named(name: str, **options: Any) -> Planner:
     """Return the planner `name` with the given options.
 
     Args:
-        name: name of a file in `stlc.controller.methods.planners`.
+        name: name in `stlc.registry.PLANNERS`.
         options: fields of the planner; values may be texts, as on a command line.
 
     Raises:
@@ -329,7 +334,7 @@ def plan(
     Args:
         task: specification and system.
         x0: initial states, (B, n) or (n,), in the order of `task.system.names`.
-        method: name of a planner.
+        method: name of a planner, or path of its file.
         budget: limits of the search; by default `SECONDS` of processor time per initial state.
         seed: seed of the planner's random numbers.
         start: initial guesses of plans, (B, T, m).
@@ -350,7 +355,7 @@ def plan(
     names = task.system.names
     if states.dim() != 2 or states.shape[1] != len(names):
         raise usage(f"initial states of {tuple(given.shape)} are not (B, {len(names)})", ", ".join(names))
-    solver = prepared(planner_named(method, **options), task)
+    solver = prepared(planner_named(PLANNERS.chosen(method), **options), task)
     search = PlanSearch(task, states, budget or PlanBudget(), seed=seed, start=start, progress=progress)
     solver(search)
     return search.result

@@ -56,7 +56,7 @@ class TrainConfig:
     """Options of the user; None leaves the choice to the system file, then to the method.
 
     Attributes:
-        method: name of a training method, see `stlc.registry.METHODS`.
+        method: name of a training method, see `stlc.registry.METHODS`, or path of its file.
         budget: training time in seconds, final evaluation included; the number of steps is adapted to it.
         clock: clock that measures the budget: `wall` time or `processor` time.
         steps: number of training steps, or the recorded schedule of an earlier run, which is followed again;
@@ -229,7 +229,8 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     Raises:
         UsageError: U101, there is no such method or option, or a value is invalid.
     """
-    name = config.method or task.system.decl.train.method or METHODS.default
+    given = METHODS.chosen(config.method) if config.method else None
+    name = given or task.system.decl.train.method or METHODS.default
     method = METHODS.get(name)
     found: ResolvedConfig = method.resolve(task, config)
     if config.falsify and not method.falsifies:

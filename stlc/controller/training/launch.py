@@ -11,12 +11,13 @@ from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.methods.plan import planner_of
 from stlc.controller.planning.planner import prepared
-from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
+from stlc.controller.training.config import ENGINE_VERSION, ResolvedConfig, TrainConfig, resolve_config
 from stlc.controller.training.loop import prepare, run
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.diagnostics import usage
 from stlc.dynamics.robots.functions import function_files
-from stlc.provenance import git_state, hardware, versions
+from stlc.provenance import git_state, hardware, sha256, versions
+from stlc.registry import METHODS, PLANNERS
 from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, now, require_name
 from stlc.version import __version__
 
@@ -81,6 +82,7 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "threads": resolved.threads,
             "options": asdict(replace(config, steps=None)) | {"steps": config.steps and str(config.steps)},
             "engine_version": ENGINE_VERSION,
+            "plugins": _plugins(resolved),
             "versions": versions(),
             "git": git_state(),
             "hardware": hardware(),
@@ -98,6 +100,17 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
     hashes = {"spec_hash": spec_hash(folder), "system_hash": system_hash(folder), "learnt": decl.learnt}
     folder.update(hashes)
     return folder
+
+
+def _plugins(config: ResolvedConfig) -> dict[str, dict[str, str]]:
+    """Sources of the method and planner that are not of stlc, by name; with the hash of a file."""
+    chosen = METHODS.plugin(config.method), PLANNERS.plugin(getattr(config, "planner", ""))
+    return {
+        each.name: {"source": each.source}
+        | ({} if isinstance(each.place, str) else {"sha256": sha256(each.place.read_bytes())})
+        for each in chosen
+        if each is not None
+    }
 
 
 def train_here(

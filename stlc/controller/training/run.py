@@ -13,14 +13,15 @@ from stlc.controller.evaluation.held_out import save_states
 from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint, weights
 from stlc.controller.training.config import ResolvedConfig, checked_config
-from stlc.diagnostics import Diagnostic, RunError
+from stlc.diagnostics import Diagnostic, PluginError, RunError
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import scenario_constants, under
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
+from stlc.plugins import variable
 from stlc.provenance import sha256
-from stlc.registry import METHODS
+from stlc.registry import METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import HELD_OUT, RUNS, SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
@@ -271,16 +272,33 @@ def save_config(folder: RunDir, config: ResolvedConfig) -> None:
     folder.write(CONFIG, json.dumps(asdict(config), indent=1) + "\n")
 
 
+def _unknown(folder: RunDir, registry: PackageRegistry[Any], name: str) -> PluginError:
+    """Error S206: a run needs a plugin that is not there."""
+    noted = folder.record().get("plugins")
+    source = noted.get(name) if isinstance(noted, dict) else None
+    path = registry.moved.get(name, "FILE.py")
+    message = f"run `{folder.shown}` needs the {registry.kind} `{name:.40}`, which stlc does not have"
+    note = (f"it came from {source.get('source')}",) if isinstance(source, dict) else ()
+    help_ = f"if you trust its file: {variable(registry.group)}={path} stlc …"
+    return PluginError(Diagnostic("S206", message, note=note, help=(help_,)))
+
+
 def load_config(folder: RunDir) -> ResolvedConfig:
     """Read the resolved options of a run.
 
+    A method or planner from elsewhere is found only if it is installed, or the user names its file: nothing
+    that the run names is imported.
+
     Raises:
         RunError: R101, their file is missing or damaged.
+        PluginError: S206, the run needs a method or planner that is not there, or that cannot be loaded.
     """
     values: dict[str, Any] = folder.read_json(CONFIG, {"method": str, "hidden": [int]})
+    for registry, name in ((METHODS, values["method"]), (PLANNERS, values.get("planner"))):
+        if isinstance(name, str) and name not in registry:
+            raise _unknown(folder, registry, name)
     try:
-        method = values["method"]
-        kind: type[ResolvedConfig] = METHODS.get(method).options if method in METHODS else ResolvedConfig
+        kind: type[ResolvedConfig] = METHODS.get(values["method"]).options
         engine = {field.name: values[field.name] for field in fields(kind) if field.name in values}
         return checked_config(kind(**{**engine, "hidden": tuple(engine["hidden"])}))
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -304,7 +304,7 @@ class TrainDecl:
     lr: float | None = key(number(1e-12), "learning rate")
     batch: int | None = key(integer(), "fresh initial states a step")
     samples: int | None = key(integer(), "size of the training set of `method: gradient`")
-    method: str | None = key(word(METHODS), "training method")
+    method: str | None = key(word(METHODS, METHODS.installed), "training method")
     reward: ir.Num | None = key(
         _absolute, "reward of a step by states after it and controls in it, for `reward: task`"
     )

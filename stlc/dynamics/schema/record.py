@@ -188,13 +188,15 @@ def number(low: float = 0.0) -> Kind:
     )
 
 
-def word(options: Iterable[str]) -> Kind:
+def word(options: Iterable[str], known: Iterable[str] | None = None) -> Kind:
     """Return the `Kind` of a value that must be one of the words in `options`.
 
-    If `options` are the names of a registry, they are looked up anew each time a value is read.
+    If `options` are the names of a registry, they are looked up anew each time a value is read; `known` are
+    those that the JSON Schema lists.
     """
     return Kind(
-        lambda cx, node, label: cx.reader.option(node, label, tuple(options)), {"enum": list(options)}
+        lambda cx, node, label: cx.reader.option(node, label, tuple(options)),
+        {"enum": list(options if known is None else known)},
     )
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
-import stlc.controller.methods as package
 from stlc import Run, System
 from stlc.cli.framework.app import main
 from stlc.controller.guard.candidates import Limits
@@ -104,27 +102,14 @@ METHOD = Climbing()
 '''
 
 
-def added(name: str, text: str, folder: Path) -> Iterator[None]:
-    """A method more, in a file of its own."""
-    (folder / "methods").mkdir()
-    (folder / "methods" / f"{name}.py").write_text(text, encoding="utf-8")
-    package.__path__.append(str(folder / "methods"))
-    yield
-    package.__path__.pop()
-    METHODS._entries.pop(name, None)
-    sys.modules.pop(f"stlc.controller.methods.{name}", None)
-
-
 @pytest.fixture
-def coasting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Methods more, in files of their own."""
     monkeypatch.chdir(tmp_path)
-    yield from added("coasting", COASTING, tmp_path)
-
-
-@pytest.fixture
-def climbing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.chdir(tmp_path)
-    yield from added("climbing", CLIMBING, tmp_path)
+    monkeypatch.setenv("STLC_METHODS", str(tmp_path / "methods"))
+    (tmp_path / "methods").mkdir()
+    for name, text in {"coasting": COASTING, "climbing": CLIMBING}.items():
+        (tmp_path / "methods" / f"{name}.py").write_text(text, encoding="utf-8")
 
 
 def test_the_default_comes_first_and_parts_of_methods_are_none() -> None:
@@ -144,9 +129,9 @@ def test_an_unknown_method_is_a_finding_with_a_way_out(car_task: Task) -> None:
         System.load(CAR, {"train.method": "guide"})
 
 
-@pytest.mark.usefixtures("coasting")
+@pytest.mark.usefixtures("added")
 def test_a_method_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
-    assert METHODS.names[:3] == ("guided", "coasting", "gradient")
+    assert METHODS.names[:4] == ("guided", "climbing", "coasting", "gradient")
     assert System.load(CAR, {"train.method": "coasting"}).decl.train.method == "coasting"
     options = ["--method", "coasting", "--held-out", "40", "--drives", "4", "--set", "test.steps=15"]
     code = main(["train", SPEC, "--system", CAR, *options, "--no-pictures", "--json"])
@@ -167,7 +152,7 @@ def test_a_method_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
 
 
-@pytest.mark.usefixtures("climbing")
+@pytest.mark.usefixtures("added")
 def test_a_method_of_one_action_a_step_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
     """It has its own option, is trained, resumed bit for bit, deployed under guards, and opened again."""
 
