@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.trace.clocks import SPELLINGS, ClockSetting, clocked
-from stlc.trace.formats.registry import SUFFIXES, format_of, suffix_of, unreadable
+from stlc.trace.formats.registry import format_of, suffix_of, unreadable
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.recording import CLOCK, ClockGroup, Recording
 from stlc.trace.time_grid import TOLERANCE, resample_advice
@@ -31,7 +31,7 @@ def size_of(path: Path) -> int:
         StlcError: the file cannot be opened, or is damaged.
     """
     found = format_of(path)
-    size: int = found.function("size")(path) if found.chunked and suffix_of(path) in SUFFIXES else 0
+    size: int = found.function("size")(path) if found.chunked and suffix_of(path) in found.suffixes else 0
     return size
 
 
@@ -43,7 +43,7 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
             format cannot be read in chunks.
     """
     found = format_of(path)
-    if not found.chunked or suffix_of(path) not in SUFFIXES:
+    if not found.chunked or suffix_of(path) not in found.suffixes:
         raise TraceError(Diagnostic("E605", f"`{path}` is of a format that cannot be read in pieces"))
     clock: _Clock | None = None
     only = OneTrace(str(path))

@@ -24,12 +24,12 @@ from stlc.trace.clocks import ClockSetting, clocked
 from stlc.trace.enums import Words, in_numbers, wordless
 from stlc.trace.formats.registry import (
     FORMATS,
-    SUFFIXES,
     WRITTEN,
     format_of,
     needed,
     opened,
     suffix_of,
+    suffixes,
     unreadable,
 )
 from stlc.trace.formats.table import GROUPS
@@ -226,14 +226,15 @@ def read_recording(path: Path, wanted: Wanted = ALL) -> Recording:
         MissingError: R301, the format needs a package that is not installed.
         TraceError: E603, the file cannot be read; E605, its arrays do not fit together.
     """
-    guessed = format_of(path) is FORMATS[0] and suffix_of(path) not in FORMATS[0].suffixes
+    chosen = format_of(path)
+    guessed = chosen is FORMATS[0] and suffix_of(path) not in chosen.suffixes
     if guessed and path.is_file() and not is_zipfile(path):
-        why = f"its suffix is none of {' '.join(SUFFIXES)}"
+        why = f"its suffix is none of {' '.join(suffixes())}"
         raise unreadable(path, why, advice="give it the suffix of its format")
     if not path.is_dir():
         with opened(path):
             require_regular(path)
-    found: Recording = format_of(path).function("read")(path, wanted)
+    found: Recording = chosen.function("read")(path, wanted)
     return found
 
 
@@ -401,9 +402,10 @@ def check_writable(path: Path | str) -> None:
         MissingError: R301, an `.mcap` file needs a package that is not installed.
     """
     suffix, found = Path(path).suffix.lower(), format_of(Path(path))
-    if suffix in WRITTEN and found.packages:
+    writes = found.writes and suffix == found.suffixes[0]
+    if writes and found.packages:
         needed(found.packages[0])
-    if suffix not in WRITTEN and not Path(path).is_char_device():
+    if not writes and not Path(path).is_char_device():
         message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
         raise UsageError(
             Diagnostic("U101", message, help=(f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}",))

@@ -423,8 +423,8 @@ def _file(node: Node, columns: tuple[Column, ...], cx: Context) -> FileDecl | No
     text = cx.reader.text(node, "`from`")
     if text is None:
         return None
-    from stlc.trace.formats.registry import SUFFIXES
+    from stlc.trace.formats.registry import suffixes
 
-    if Path(text).suffix.lower() not in SUFFIXES:
-        cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(SUFFIXES)}")
+    if Path(text).suffix.lower() not in (known := suffixes()):
+        cx.reader.wrong(node, "`from`", "a file of states", f"formats: {', '.join(known)}")
     return FileDecl(named_in(node.span.source, text, copied=True), columns, node.span)

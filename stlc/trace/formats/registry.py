@@ -1,6 +1,7 @@
 """Formats of trace files: the table `FORMATS`, and helper functions that the readers of files share.
 
-A format is a module of this package and an entry of `FORMATS`. The module contains
+A format is a module of this package and an entry of `FORMATS`, or a module of another package with an object
+`FORMAT`, whose entry point is called like the suffix (`ELSEWHERE`). The module contains
 
 - `read(path) -> Recording`;
 - if the format has `writes` set: `write(path, trace)`;
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError, not_installed
+from stlc.registry import PackageRegistry
 
 MAX_BYTES = 4_000_000_000
 MAX_LETTERS = 64
@@ -34,7 +36,7 @@ class Format:
     """A format of trace files.
 
     Attributes:
-        module: name of the module in this package.
+        module: name of the module in this package; of another package, its dotted name.
         suffixes: suffixes of its files, in lower case; files are written with the first one.
         extra: name of the extra of the package `stlc` that installs the libraries of the format.
         packages: modules of these libraries.
@@ -53,7 +55,8 @@ class Format:
 
     def function(self, name: str) -> Any:
         """Import the module of the format, and return its function `name`."""
-        return getattr(import_module(f"{__package__}.{self.module}"), name)
+        module = self.module if "." in self.module else f"{__package__}.{self.module}"
+        return getattr(import_module(module), name)
 
 
 FORMATS = (
@@ -67,7 +70,10 @@ FORMATS = (
     Format("mf4", (".mf4", ".mdf"), "mf4", ("asammdf",)),
     Format("bag", (".bag", ".db3"), "bag", ("rosbags", "lz4", "zstandard"), folder=True),
 )
-SUFFIXES = tuple(suffix for each in FORMATS for suffix in each.suffixes)
+ELSEWHERE: PackageRegistry[Format] = PackageRegistry(
+    "trace format", "", "FORMAT", group="stlc.formats", accepts="stlc.trace.formats.registry:Format"
+)
+"""Formats of other packages (`Format`), by the suffix of their files without its dot."""
 WRITTEN = tuple(each.suffixes[0] for each in FORMATS if each.writes)
 _PACKAGES = {"google": "protobuf"}
 """Names of packages that differ from those of their modules."""
@@ -83,10 +89,21 @@ def format_of(path: Path) -> Format:
     """Return the format that the suffix of `path` indicates.
 
     A folder has a format of its own. For an unknown suffix, the first format of `FORMATS` is returned.
+
+    Raises:
+        PluginError: S206, the format is of another package and cannot be loaded.
     """
     if path.is_dir():
         return next(each for each in FORMATS if each.folder)
-    return next((each for each in FORMATS if suffix_of(path) in each.suffixes), FORMATS[0])
+    suffix = suffix_of(path)
+    own = (each for each in FORMATS if suffix in each.suffixes)
+    return next(own, None) or (ELSEWHERE.get(suffix[1:]) if suffix[1:] in ELSEWHERE else FORMATS[0])
+
+
+def suffixes() -> tuple[str, ...]:
+    """Suffixes of all formats."""
+    own = (suffix for each in FORMATS for suffix in each.suffixes)
+    return *own, *(f".{name}" for name in ELSEWHERE)
 
 
 def needed(module: str) -> Any:
