@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -169,8 +170,16 @@ class PlantKeys:
 
 
 def plant_schema() -> Json:
-    """JSON Schema of plant files, for editors."""
-    return json_schema(PlantKeys)
+    """JSON Schema of plant files, for editors; it has the kinds of plants of installed packages."""
+    return json_schema(_keys_with(KINDS.installed))
+
+
+@cache
+def _keys_with(kinds: tuple[str, ...]) -> type[PlantKeys]:
+    """Return `PlantKeys` with a key for each of the kinds of plants that has none yet."""
+    new = [name for name in kinds if name not in PlantKeys.__dataclass_fields__]
+    keys = [(name, Node | None, key(_plant(name), f"a plant of the kind `{name}`")) for name in new]
+    return make_dataclass("PlantKeys", keys, bases=(PlantKeys,), repr=False, eq=False) if new else PlantKeys
 
 
 # ------------------------------------------------------------------------------- declaration
@@ -353,7 +362,8 @@ class _Reading:
     def __init__(self, reader: Reader, root: MappingNode) -> None:
         self.reader, self.root = reader, root
         self.cx = Context.of(reader, Names())
-        self.keys = read(PlantKeys, self.cx, root, "a plant file")
+        kinds = tuple(entry.key.text for entry in root.entries if entry.key.text in KINDS)
+        self.keys = read(_keys_with(kinds), self.cx, root, "a plant file")
         self.places = dict(_places(root, ""))
         self.kind, self.options = self._chosen()
 
@@ -407,7 +417,7 @@ class _Reading:
 
     def _chosen(self) -> tuple[str, dict[str, Any]]:
         """Return the kind of plant, and the options of that kind."""
-        given = {name: node for name in KINDS if (node := getattr(self.keys, name)) is not None}
+        given = {name: node for name in KINDS if (node := getattr(self.keys, name, None)) is not None}
         if len(given) != 1:
             wanted = ", ".join(f"`{name}`" for name in KINDS)
             place = list(given)[1] if given else ""

@@ -23,7 +23,14 @@ Reason: TypeAlias = Literal[
 """Reason for which a simulation gave no trace."""
 SCRATCH = "stlc-plant-"
 """Prefix of the names of folders for temporary files, one for each process of a plant."""
-KINDS: PackageRegistry[Any] = PackageRegistry("kind of plant", "stlc.plants.kinds", "KIND", default="python")
+KINDS: PackageRegistry[Any] = PackageRegistry(
+    "kind of plant",
+    "stlc.plants.kinds",
+    "KIND",
+    default="python",
+    group="stlc.plants",
+    accepts="stlc.plants.kinds:PlantKind",
+)
 """Kinds of plants (`PlantKind`) by the key of plant files that names a plant of this kind."""
 
 
