@@ -14,6 +14,8 @@ import typer
 from stlc.cli.framework.documents import InstallationFinding, InstallationReport
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import command
+from stlc.diagnostics import StlcError
+from stlc.plugins import GROUPS, plugins
 
 MISSING = 5
 
@@ -23,13 +25,13 @@ _NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
 
 @command("stlc doctor")
 def doctor(
-    quick: Annotated[bool, typer.Option("--quick", help="Do not import torch to look for devices.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Import neither torch nor plugins.")] = False,
 ) -> Answer[InstallationReport]:
-    """Check the installation: versions, devices, packages, completion.
+    """Check the installation: versions, devices, packages, plugins.
 
     Exit code: 0, or 5 if a required package is missing.
     """
-    findings = [*_python(), *_packages(), *_devices(quick=quick), *_tools()]
+    findings = [*_python(), *_packages(), *_devices(quick=quick), *_tools(), *_plugins(quick=quick)]
     missing = [finding["name"] for finding in findings if finding["state"] == "missing"]
 
     def show() -> None:
@@ -115,6 +117,19 @@ def _tools() -> Iterator[InstallationFinding]:
     yield _compiler()
     installed = _completion()
     yield _finding("completion", "ok" if installed else "off", installed or "stlc --install-completion")
+
+
+def _plugins(*, quick: bool) -> Iterator[InstallationFinding]:
+    """Yield a line for each plugin of other packages; it is imported unless `quick`."""
+    for group in GROUPS:
+        for name, found in plugins(group).items():
+            for plugin in found:
+                try:
+                    _ = quick or plugin.load()
+                except StlcError as error:
+                    yield _finding(name, "off", " ".join((plugin.source, *error.diagnostics[0].note)))
+                else:
+                    yield _finding(name, "ok", f"{plugin.source}, {group}")
 
 
 def _cache() -> InstallationFinding:

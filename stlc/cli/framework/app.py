@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from stlc.cli.framework.program import Program, describe
+from stlc.registry import PackageRegistry
 
 PROGRAM = Program(
     name="stlc",
@@ -25,6 +26,9 @@ PROGRAM = Program(
         "parse": "stlc compile FILE --show ast",
         "new": "stlc init --spec NAME, or stlc init --system NAME",
     },
+    elsewhere=PackageRegistry(
+        "command", "", "", group="stlc.commands", accepts="stlc.cli.framework.program:is_command"
+    ),
 )
 
 

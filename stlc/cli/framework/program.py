@@ -26,8 +26,9 @@ from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.errors import report as report_error
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, ColorMode, emit, noticing, silence
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, PluginError, UsageError
 from stlc.foreign import driving
+from stlc.registry import Registry
 from stlc.version import __version__
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -48,10 +49,19 @@ def command(*examples: str, drives: bool = False) -> Callable[[F], F]:
     def mark(function: F) -> F:
         if drives:
             function = driving(True)(function)
-        _MARKED[f"{function.__module__}:{function.__name__}"] = examples
+        _MARKED[_place(function)] = examples
         return function
 
     return mark
+
+
+def is_command(found: object) -> bool:
+    """True for a function that `command` marked, and for a group of commands."""
+    return isinstance(found, typer.Typer) or (inspect.isfunction(found) and _place(found) in _MARKED)
+
+
+def _place(function: Callable[..., Any]) -> str:
+    return f"{function.__module__}:{function.__name__}"
 
 
 def group(sentence: str, *examples: str, default: Callable[..., None] | None = None) -> typer.Typer:
@@ -155,6 +165,7 @@ class Program:
         package: dotted name of the package of commands.
         order: names of commands in the order of the help text; other commands follow in alphabetical order.
         moved: name of a former command -> command line that replaces it.
+        elsewhere: commands of other packages; those of `package` come before them.
         drives: whether all commands run the Python that the files of a run name.
     """
 
@@ -164,18 +175,29 @@ class Program:
     order: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
     drives: bool = False
+    elsewhere: Registry[Any] | None = None
 
     def names(self) -> list[str]:
         """Return the names of all commands, in the order of the help text."""
-        found = [each.name for each in pkgutil.iter_modules(import_module(self.package).__path__)]
-        return [*(name for name in self.order if name in found), *sorted(set(found) - set(self.order))]
+        own, others = self._own(), self.elsewhere or ()
+        ordered = [*(name for name in self.order if name in own), *sorted(own - set(self.order))]
+        return [*ordered, *(name for name in others if name not in own)]
+
+    def _own(self) -> set[str]:
+        return {each.name for each in pkgutil.iter_modules(import_module(self.package).__path__)}
+
+    def _has(self, name: str) -> bool:
+        return name in self._own() or (self.elsewhere is not None and name in self.elsewhere)
 
     def made(self, only: str = "") -> typer.Typer:
         """Return the typer application with the command `only`.
 
-        If no command has this name, the application has all commands.
+        If no command has this name, the application has all commands. A command of another package that
+        cannot be loaded then says so in its help.
+
+        Raises:
+            PluginError: S206, the command `only` of another package cannot be loaded.
         """
-        names = self.names()
         app = typer.Typer(
             name=self.name,
             help=self.help,
@@ -185,13 +207,18 @@ class Program:
             context_settings={"help_option_names": list(HELP_NAMES)},
         )
         app.callback(invoke_without_command=True)(_global_options)
-        for name in [only] if only in names else names:
-            self._add(app, name)
+        for name in [only] if self._has(only) else self.names():
+            try:
+                self._add(app, name)
+            except PluginError as error:
+                if name == only:
+                    raise
+                app.command(name, help=f"{error.diagnostics[0].message}.")(lambda: None)
         return app
 
     def parser(self, only: str = "") -> Any:
         """Return the parser of the command `only`, or of the whole program; it is built once and cached."""
-        key = (self.package, only if only in self.names() else "")
+        key = (self.package, only if self._has(only) else "")
         if key not in _PARSERS:
             _PARSERS[key] = typer.main.get_command(self.made(only))
             spare_adapters(_PARSERS[key])
@@ -199,13 +226,16 @@ class Program:
         return _PARSERS[key]
 
     def _add(self, app: typer.Typer, name: str) -> None:
-        module = import_module(f"{self.package}.{name}")
-        if hasattr(module, "GROUP"):
-            app.add_typer(module.GROUP, name=name)
-            return
-        function = getattr(module, name, None) or getattr(module, f"{name}_")
-        examples = _MARKED[f"{module.__name__}:{function.__name__}"]
-        app.command(name, help=_help(function, examples))(flat(function))
+        if name in self._own():
+            own = vars(import_module(f"{self.package}.{name}"))
+            found = own.get("GROUP") or own.get(name) or own[f"{name}_"]
+        else:
+            assert self.elsewhere is not None
+            found = self.elsewhere.get(name)
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name)
+        else:
+            app.command(name, help=_help(found, _MARKED[_place(found)]))(flat(found))
 
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run a command line and return its exit code.
