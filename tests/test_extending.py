@@ -52,6 +52,7 @@ def failures(tmp_path_factory) -> dict[str, str]:
     for kind, name, body in BLOCKS:
         if kind == "file":
             assert not (tree / name).exists(), f"{name} is there already"
+            (tree / name).parent.mkdir(exist_ok=True)
             (tree / name).write_text(body, encoding="utf-8")
         elif kind == "change":
             change(tree / name, body)
@@ -71,8 +72,8 @@ def failures(tmp_path_factory) -> dict[str, str]:
 
 
 def test_the_page_has_an_example_of_each_extension():
-    assert len(CHECKS) == 14
-    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 12
+    assert len(CHECKS) == 15
+    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 14
     changed = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
     assert len(changed) == 10  # an operator, a trace format, a function, a kind of plant; 6 for a node
 
