@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from stlc import stopping
 from stlc.cli.framework.program import Program, describe
+from stlc.plugins import name_path
 
 PROGRAM = Program(
     name="python -m benchmarks",
@@ -25,12 +27,20 @@ PROGRAM = Program(
     drives=True,
 )
 
+RIVALS = {
+    "stlc.methods": Path(__file__).parent / "methods",
+    "stlc.planners": Path(__file__).parent / "methods/planners",
+}
+"""Folders of the methods and planners that only the tables need, by group of plugins."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit code.
+    """Run a command line, with the methods of the comparison, and return its exit code.
 
     `argv` are the arguments, by default those of the process.
     """
+    for group, folder in RIVALS.items():
+        name_path(group, folder)
     return PROGRAM.run(argv)
 
 

@@ -83,8 +83,8 @@ class Cell:
         axis: hyperparameter that an ablation varies in this run; "" outside of ablations.
         value: value of that hyperparameter.
         overrides: name of a field in the system file -> new value.
-        options: options of the method, as on a command line. `reward` becomes `--reward`, `falsify` becomes
-            `--falsify`, and any other becomes `--option`.
+        options: options of the method, as on a command line. `falsify` becomes `--falsify`, and any other
+            becomes `--option`.
     """
 
     benchmark: str
@@ -385,9 +385,10 @@ def _spent(run: RunDir) -> float:
 def _shorter(cell: Cell, place: Place) -> RunDir | None:
     """Copy of the longest finished run that differs from the cell in its length only; None if there is none.
 
-    Only the runs of methods whose steps do not depend on the length are copied.
+    Only the runs of methods whose steps do not depend on the length are copied: those that are `extendable`.
     """
-    if not METHODS.get(cell.method).extendable or cell.length.seconds is None or place.cluster is not None:
+    extendable = getattr(METHODS.get(cell.method), "extendable", False)
+    if not extendable or cell.length.seconds is None or place.cluster is not None:
         return None
     cells = [Cell.of(result) for result in place.valid()]
     cells = [each for each in cells if each.length.seconds and each.length.seconds < cell.length.seconds]
@@ -407,9 +408,7 @@ def _shorter(cell: Cell, place: Place) -> RunDir | None:
 
 def _option(key: str, value: str) -> tuple[str, ...]:
     """Words of the command line for an option of a cell."""
-    if key == "falsify":
-        return ("--falsify",)
-    return ("--reward", value) if key == "reward" else ("--option", f"{key}={value}")
+    return ("--falsify",) if key == "falsify" else ("--option", f"{key}={value}")
 
 
 def _portable(word: str) -> str:

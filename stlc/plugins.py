@@ -85,13 +85,13 @@ def variable(group: str) -> str:
     return group.upper().replace(".", "_")
 
 
-def name_file(group: str, path: Path) -> str:
-    """Name a file of a group for this process and those that it starts; return the name of its plugin.
+def name_path(group: str, path: Path) -> str:
+    """Name a file or folder for this process and those that it starts; return the name of a file's plugin.
 
     Raises:
         UsageError: U102, there is no such file.
     """
-    if not path.is_file():
+    if not path.exists():
         raise UsageError(Diagnostic("U102", f"there is no file `{path}`"))
     before = [each for each in os.environ.get(variable(group), "").split(os.pathsep) if each]
     os.environ[variable(group)] = os.pathsep.join(dict.fromkeys((*before, str(path.resolve()))))

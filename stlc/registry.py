@@ -12,7 +12,7 @@ from pkgutil import iter_modules
 from typing import Any, Generic, Literal, TypeAlias, TypeVar, get_args
 
 from stlc.diagnostics import Diagnostic, UsageError, usage
-from stlc.plugins import Plugin, name_file, plugins
+from stlc.plugins import Plugin, name_path, plugins
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -199,7 +199,7 @@ class PackageRegistry(Registry[T]):
         """
         if not text.endswith(".py"):
             return text
-        name = name_file(self.group, Path(text))
+        name = name_path(self.group, Path(text))
         if name in self.own:
             raise usage(f"stlc has a {self.kind} `{name}` of its own", f"rename `{text}`")
         self.get(name)
@@ -282,6 +282,7 @@ METHODS: PackageRegistry[Any] = PackageRegistry(
     default="guided",
     group="stlc.methods",
     accepts="stlc.controller.methods:Method",
+    moved={name: f"benchmarks/methods/{name}.py" for name in ("mbpo", "pets", "ppo", "sac")},
 )
 """Training methods (`stlc.controller.methods.Method`) of `--method` and `train: {method: …}`."""
 

@@ -109,8 +109,6 @@ def test_a_spec_that_does_not_fit_the_system_is_refused():
 
 def test_a_refused_training_makes_no_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-    monkeypatch.delitem(sys.modules, "stlc.controller.methods._sb3", raising=False)
     task = stlc.compile(stlc.load(SPEC), stlc.System.load(SYSTEM))
     with pytest.raises(stlc.StlcError):
         stlc.train(task, method="sac", steps=3)

@@ -62,8 +62,8 @@ HOMES = {
     "pydantic": (),
     "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),
-    "gymnasium": ("stlc.gym", "stlc.controller.methods", "stlc.plants.kinds.gym"),
-    "stable_baselines3": ("stlc.gym", "stlc.controller.methods"),
+    "gymnasium": ("stlc.gym", "benchmarks.methods", "stlc.plants.kinds.gym"),
+    "stable_baselines3": ("stlc.gym", "benchmarks.methods"),
     "lsprotocol": ("stlc.editor",),
     "PIL": ("stlc.view",),
     "numpy": (

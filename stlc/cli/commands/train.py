@@ -103,12 +103,6 @@ def train(
             help="How to train, see docs/methods.md; guided unless the system file says otherwise.",
         ),
     ] = None,
-    reward: Annotated[
-        str | None,
-        typer.Option(
-            metavar="task|robustness|accuracy", help="Reward of methods that learn from one; robustness."
-        ),
-    ] = None,
     option: Annotated[
         list[str] | None,
         typer.Option("--option", metavar="NAME=VALUE", help="An option of the method; repeatable."),
@@ -149,7 +143,7 @@ def train(
         **{"--system": system, "--seed": seed, "--seeds": seeds, "--method": method, "--name": name},
         **{"--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch, "--set": set_},
         **{"--held-out": held_out, "--drives": drives, "--cluster": cluster, "--clock": clock},
-        **{"--reward": reward, "--option": option, "--falsify": falsify or None},
+        **{"--option": option, "--falsify": falsify or None},
     }
     _check_together(specs, jobs, {**given, "--budget": budget, "--steps": steps})
     logger = _logger(log)
@@ -176,7 +170,6 @@ def train(
         held_out=held_out or HELD_OUT,
         clock=parse_clock(clock or "wall"),
         drives=DRIVES if drives is None else drives,
-        reward=reward,
         options=parse_pairs(option, "--option", "NAME=VALUE", "environments=256"),
         falsify=falsify,
     )

@@ -101,7 +101,6 @@ class Many:
             "--batch": config.batch,
             "--held-out": config.held_out,
             "--drives": config.drives,
-            "--reward": config.reward,
             "--log": self.log,
             "--runs": launch.root,
         }

@@ -3,7 +3,8 @@
 In a system file, `train: {method: guided}` selects the same method. Every file defines an object `METHOD`,
 an instance of a subclass of `Method`. `stlc.registry.METHODS` finds the files. It lists their names without
 loading torch, for the command line, the schema of system files and tables of options. Code shared by several
-methods lies in files whose names begin with `_`. The folder `planners` holds the planners.
+methods lies in files whose names begin with `_`. The folder `planners` holds the planners. Methods of other
+packages and files are found, too (`stlc.plugins`).
 """
 
 from __future__ import annotations
@@ -49,13 +50,10 @@ class Method(ABC):
         falsifies: whether the method can train on states of failing closed-loop drives (`--falsify`).
         version: number that rises with every change of the policies that the method trains; measurements of
             older versions are repeated.
-        extendable: whether no step depends on the planned number of steps. Then a longer training begins like
-            a shorter one, and can continue it.
     """
 
     falsifies: ClassVar[bool] = False
     version: ClassVar[int] = 0
-    extendable: ClassVar[bool] = False
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
     learns: ClassVar[type[Learner] | None] = None
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import torch
 
 from stlc.controller.options import MOST, Bounds, bounds_of
-from stlc.controller.problem.environments import Reward
 from stlc.controller.training.budget import Clock, StepSchedule, cores
 from stlc.diagnostics import usage
 from stlc.registry import METHODS, PLANNERS, did_you_mean
@@ -71,8 +70,6 @@ class TrainConfig:
         drives: maximum number of closed-loop simulations after the training, for each kind of guard (a guard
             checks plans at run time); 0: none.
         planner: planner of the method `plan`, with its options.
-        reward: name of the reward, for a method that learns from rewards; None leaves the choice to the
-            method.
         options: options that only this method has, name -> text.
         falsify: whether states of failing closed-loop drives are mixed into the training.
     """
@@ -90,7 +87,6 @@ class TrainConfig:
     clock: Clock = "wall"
     drives: int = DRIVES
     planner: PlannerChoice | None = None
-    reward: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
     falsify: bool = False
 
@@ -167,7 +163,7 @@ class ResolvedConfig:
 
 
 _MOST = {
-    **dict.fromkeys(("hidden", "plans", "threads", "ranks", "environments"), 65_536),
+    **dict.fromkeys(("hidden", "plans", "threads", "ranks"), 65_536),
     **dict.fromkeys(("batch", "hard", "pool", "most", "held_out", "samples", "drives"), 10**8),
     **dict.fromkeys(("warmup", "average"), 1.0),
     "hold": 0.999,
@@ -178,7 +174,7 @@ _MOST = {
 MOST_TEXT = 1000
 
 
-_POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks", "environments")
+_POSITIVE = ("hidden", "plans", "batch", "pool", "every", "ranks")
 
 
 def checked_config(config: ResolvedConfig) -> ResolvedConfig:
@@ -191,7 +187,6 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
         "method": METHODS.names,
         "clock": get_args(Clock),
         "planner": PLANNERS.names,
-        "reward": get_args(Reward),
     }
     for option in fields(config):
         value = getattr(config, option.name)
@@ -248,11 +243,8 @@ def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
         UsageError: U101, the method has no such option, or a value is invalid.
     """
     own = {each.name: each.type for each in fields(found)[len(fields(ResolvedConfig)) :]}
-    texts = dict(config.options)
-    if config.reward is not None:
-        texts["reward"] = config.reward
     changed: dict[str, Any] = {}
-    for name, text in texts.items():
+    for name, text in config.options.items():
         if name not in own:
             known = f"options: {', '.join(own)}" if own else "it has no options of its own"
             advice = did_you_mean(name, own, known)

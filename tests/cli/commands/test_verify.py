@@ -75,7 +75,7 @@ def test_boxes_around_random_states(run: str, capsys: pytest.CaptureFixture[str]
 def test_what_cannot_be_verified_is_refused(
     run: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shooting = trained(tmp_path, "traffic", "ppo")
+    shooting = trained(tmp_path, "traffic", "plan")
     capsys.readouterr()
     assert main(["verify", shooting]) == 2
     assert "can be verified" in capsys.readouterr().err

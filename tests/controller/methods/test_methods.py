@@ -115,7 +115,7 @@ def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_default_comes_first_and_parts_of_methods_are_none() -> None:
     assert METHODS.names[0] == "guided"
     assert list(METHODS.names[1:]) == sorted(METHODS.names[1:])
-    assert {"gradient", "plan", "ppo"} < set(METHODS.names)
+    assert {"gradient", "plan"} < set(METHODS.names)
     assert all(METHODS.get(name).resolve is not None for name in METHODS)
 
 

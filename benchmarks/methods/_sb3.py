@@ -21,14 +21,14 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from stlc.controller.methods._actor import (
+from benchmarks.methods._actor import (
     ActorLearner,
     ActorPolicy,
     finite_weights,
     optimizer_tensors,
     restore_optimizer,
 )
-from stlc.controller.methods._sac import SacActor, SacConfig
+from benchmarks.methods._sac import SacActor, SacConfig
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
 from stlc.controller.training.checkpoint import below

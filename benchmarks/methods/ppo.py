@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from stlc.controller.methods import Method
-from stlc.controller.methods._actor import (
+from benchmarks.methods._actor import (
     ActorConfig,
     ActorLearner,
     ActorPolicy,
     optimizer_tensors,
     restore_optimizer,
 )
+from stlc.controller.methods import Method
 from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers
@@ -76,7 +76,7 @@ class PpoConfig(ActorConfig):
             2019). Uncorrelated noise averages out in states that integrate the controls.
     """
 
-    environments: int = ENVIRONMENTS
+    environments: int = bounded(ENVIRONMENTS, 1, 65_536)
     epochs: int = bounded(5, 1, 10**6)
     minibatches: int = bounded(8, 1, 10**6)
     discount: float = bounded(1.0, 0, 1)

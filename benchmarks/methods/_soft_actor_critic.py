@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from stlc.controller.methods._actor import optimizer_tensors, restore_optimizer
-from stlc.controller.methods._ensemble import BatchedMlp
+from benchmarks.methods._actor import optimizer_tensors, restore_optimizer
+from benchmarks.methods._ensemble import BatchedMlp
 from stlc.controller.training.checkpoint import below
 
 if TYPE_CHECKING:

@@ -7,7 +7,9 @@ import math
 import pytest
 import torch
 
-from stlc.controller.methods._ensemble import BatchedMlp, Ensemble, Fit, optimizer_of, train_ensemble
+from benchmarks.methods._ensemble import BatchedMlp, Ensemble, Fit, optimizer_of, train_ensemble
+
+pytestmark = pytest.mark.apart
 
 NOISE = 0.1
 MATRIX = torch.tensor([[0.5, -0.2, 1.0], [0.1, 0.3, -0.7]])

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from benchmarks.methods._actor import ActorPolicy
+from benchmarks.methods._sac import SacActor, SacConfig
 from stlc.controller.methods import Learner, Method
-from stlc.controller.methods._actor import ActorPolicy
-from stlc.controller.methods._sac import SacActor, SacConfig
 from stlc.controller.training.config import base_config
 from stlc.controller.training.run import load_weights
 from stlc.diagnostics import not_installed
@@ -34,7 +34,7 @@ class Sac(Method):
     """Soft actor-critic; one step of the training is one episode in every environment."""
 
     options = SacConfig
-    extendable = True
+    extendable = True  # no step depends on the planned number of steps
 
     def resolve(self, task: Task, config: TrainConfig) -> SacConfig:
         """Determine the options; `--batch` is the number of transitions of a gradient step."""
@@ -52,11 +52,11 @@ class Sac(Method):
                 declares no reward; or several processes are to train together.
         """
         try:
-            from stlc.controller.methods._sb3 import SacLearner
+            from benchmarks.methods._sb3 import SacLearner
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] not in ("stable_baselines3", "gymnasium"):
                 raise
-            raise not_installed("method `sac` needs stable-baselines3", "rl") from None
+            raise not_installed("method `sac` needs stable-baselines3", "bench") from None
         assert isinstance(config, SacConfig)
         return SacLearner(task, config, steps=steps, device=device, ranks=ranks)
 

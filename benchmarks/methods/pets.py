@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor
 
-from stlc.controller.methods import Method
-from stlc.controller.methods._imagined import (
+from benchmarks.methods._imagined import (
     LearntModel,
     ModelConfig,
     ModelLearner,
@@ -28,6 +27,7 @@ from stlc.controller.methods._imagined import (
     final_reward,
     step_rewards,
 )
+from stlc.controller.methods import Method
 from stlc.controller.options import bounded
 from stlc.controller.policies.policy import Policy
 from stlc.controller.training.config import base_config
@@ -66,7 +66,7 @@ class PetsConfig(ModelConfig):
             elites, the networks with the least validation error.
     """
 
-    environments: int = 8
+    environments: int = bounded(8, 1, 65_536)
     first: int = 200
     ahead: int = 0
     piece: int = bounded(5, 1, 10**6)
@@ -253,7 +253,7 @@ class Pets(Method):
 
     options = PetsConfig
     learns = PetsLearner
-    extendable = True
+    extendable = True  # no step depends on the planned number of steps
 
     def resolve(self, task: Task, config: TrainConfig) -> PetsConfig:
         """Determine the options.

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor
 
+from benchmarks.methods._actor import ActorConfig, optimizer_tensors, restore_optimizer
+from benchmarks.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
 from stlc.controller.methods import Learner
-from stlc.controller.methods._actor import ActorConfig, optimizer_tensors, restore_optimizer
-from stlc.controller.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
 from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward, reward_at_end
@@ -61,7 +61,7 @@ class ModelConfig(ActorConfig):
         capacity: number of episodes that are stored; new ones replace the oldest.
     """
 
-    environments: int = 16
+    environments: int = bounded(16, 1, 65_536)
     networks: int = bounded(7, 1, 64)
     elites: int = bounded(5, 1, 64)
     width: int = bounded(200, 1, 8192)

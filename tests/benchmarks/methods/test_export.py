@@ -9,12 +9,12 @@ import pytest
 import torch
 from helpers.exported import CART, MISSION, ROOT, build
 
+from benchmarks.methods._actor import ActorPolicy
+from benchmarks.methods._sac import SacActor
+from benchmarks.methods.mbpo import Acting, MbpoConfig, actor_critic_of
+from benchmarks.methods.ppo import PpoConfig, network_of
 from stlc import native
 from stlc.controller.guard.guard import Guard
-from stlc.controller.methods._actor import ActorPolicy
-from stlc.controller.methods._sac import SacActor
-from stlc.controller.methods.mbpo import Acting, MbpoConfig, actor_critic_of
-from stlc.controller.methods.ppo import PpoConfig, network_of
 from stlc.controller.policies.policy import ActorNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
@@ -27,6 +27,8 @@ from stlc.export.write import export
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.runtime import Controller
+
+pytestmark = pytest.mark.apart
 
 compiled = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
 

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from benchmarks.methods._actor import ActorPolicy, finite_weights
+from benchmarks.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
+from benchmarks.methods._soft_actor_critic import BOUND, SacOptions, SoftActorCritic, TransitionBatch
 from stlc.controller.methods import Method
-from stlc.controller.methods._actor import ActorPolicy, finite_weights
-from stlc.controller.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
-from stlc.controller.methods._soft_actor_critic import BOUND, SacOptions, SoftActorCritic, TransitionBatch
 from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers

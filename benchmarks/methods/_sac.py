@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from stlc.controller.methods._actor import ActorConfig
+from benchmarks.methods._actor import ActorConfig
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers
 
 if TYPE_CHECKING:

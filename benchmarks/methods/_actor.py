@@ -6,14 +6,15 @@ The actor runs in closed loop on the model of the system. The sequence of its co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, get_args
 
 import torch
 from torch import Tensor
 
 from stlc.controller.methods import Learner
+from stlc.controller.options import bounded
 from stlc.controller.policies.policy import ActorNetwork, ClosedLoopActor, Policy
-from stlc.controller.problem.environments import observe
+from stlc.controller.problem.environments import Reward, observe
 from stlc.controller.problem.native import NativeStep
 from stlc.controller.training.config import ResolvedConfig
 
@@ -34,7 +35,12 @@ class ActorConfig(ResolvedConfig):
     """
 
     reward: str = "robustness"
-    environments: int = 64
+    environments: int = bounded(64, 1, 65_536)
+
+    def __post_init__(self) -> None:
+        if self.reward not in get_args(Reward):
+            known = ", ".join(get_args(Reward))
+            raise ValueError(f"`reward` is {self.reward!r:.40}, none of {known}")
 
 
 class ActorPolicy(Policy):

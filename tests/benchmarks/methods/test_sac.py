@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.methods._sac import SacConfig
 from stlc import Run
 from stlc.cli.framework.app import main
-from stlc.controller.methods._sac import SacConfig
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.diagnostics import MissingError, UsageError
 from stlc.registry import METHODS
+
+pytestmark = pytest.mark.apart
 
 ROOT = Path(__file__).parents[3]
 SPEC, CAR = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
@@ -96,7 +98,18 @@ def test_it_goes_on_bit_for_bit(
     """Replay buffer included, which is full by then."""
     pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
-    options = [SPEC, "--system", CAR, "--method", "sac", "--reward", reward, *OPTIONS, "--batch", "32"]
+    options = [
+        SPEC,
+        "--system",
+        CAR,
+        "--method",
+        "sac",
+        "--option",
+        f"reward={reward}",
+        *OPTIONS,
+        "--batch",
+        "32",
+    ]
     options += ["--held-out", "40"]
     whole = Run.open(trained(capsys, *options, "--steps", "4", "--drives", "2")["run"])
     part = trained(capsys, *options, "--steps", "3", "--drives", "0")
@@ -104,7 +117,7 @@ def test_it_goes_on_bit_for_bit(
     x = whole.task.sample(5, seed=0, dtype=torch.float64)
     assert torch.equal(whole.policy(x), resumed.policy(x))
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-    monkeypatch.delitem(sys.modules, "stlc.controller.methods._sb3", raising=False)
+    monkeypatch.delitem(sys.modules, "benchmarks.methods._sb3", raising=False)
     assert torch.equal(Run.open(part["run"]).policy(x), whole.policy(x))
 
 
@@ -131,12 +144,12 @@ def test_a_divergence_is_a_finding(car_task: Task) -> None:
 
 def test_without_the_package(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-    monkeypatch.delitem(sys.modules, "stlc.controller.methods._sb3", raising=False)
+    monkeypatch.delitem(sys.modules, "benchmarks.methods._sb3", raising=False)
     config = resolve_config(car_task, TrainConfig(method="sac"))
     assert isinstance(config, SacConfig)
     with pytest.raises(MissingError) as caught:
         METHODS.get("sac").learner(car_task, config, steps=1, device=CPU, ranks=ALONE)
-    assert caught.value.diagnostics[0].help == ("pip install 'stlc[rl]'",)
+    assert caught.value.diagnostics[0].help == ("pip install 'stlc[bench]'",)
 
 
 def test_it_trains_in_one_process(car_task: Task) -> None:

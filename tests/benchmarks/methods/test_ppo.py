@@ -11,15 +11,17 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.methods._actor import ActorPolicy
+from benchmarks.methods.ppo import Moments, PpoConfig, PpoLearner
 from stlc import Run, native
 from stlc.cli.framework.app import main
-from stlc.controller.methods._actor import ActorPolicy
-from stlc.controller.methods.ppo import Moments, PpoConfig, PpoLearner
 from stlc.controller.parallel.ddp import ALONE
 from stlc.controller.problem.environments import Environments, observe
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.diagnostics import UsageError
+
+pytestmark = pytest.mark.apart
 
 ROOT = Path(__file__).parents[3]
 SPEC, CAR = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
@@ -126,7 +128,18 @@ def test_it_goes_on_bit_for_bit(
     reward: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    options = [SPEC, "--system", CAR, "--method", "ppo", "--reward", reward, *OPTIONS, "--held-out", "40"]
+    options = [
+        SPEC,
+        "--system",
+        CAR,
+        "--method",
+        "ppo",
+        "--option",
+        f"reward={reward}",
+        *OPTIONS,
+        "--held-out",
+        "40",
+    ]
     whole = Run.open(trained(capsys, *options, "--steps", "6", "--drives", "2")["run"])
     part = trained(capsys, *options, "--steps", "6,3@3", "--drives", "0")
     resumed = Run.open(trained(capsys, "--resume", part["run"], "--steps", "6")["run"])
@@ -135,7 +148,9 @@ def test_it_goes_on_bit_for_bit(
 
 
 def test_options_of_the_method(car_task: Task) -> None:
-    config = resolve_config(car_task, TrainConfig(method="ppo", reward="accuracy", options={"epochs": "3"}))
+    config = resolve_config(
+        car_task, TrainConfig(method="ppo", options={"reward": "accuracy", "epochs": "3"})
+    )
     assert isinstance(config, PpoConfig)
     assert (config.reward, config.epochs, config.plans, config.environments) == ("accuracy", 3, 1, 512)
     for options, message in (
@@ -153,7 +168,7 @@ def test_options_of_the_method(car_task: Task) -> None:
             resolve_config(car_task, TrainConfig(method="ppo", options=options))
         assert caught.value.diagnostics[0].message == message
     with pytest.raises(UsageError, match="method `guided` has no option `reward`"):
-        resolve_config(car_task, TrainConfig(method="guided", reward="task"))
+        resolve_config(car_task, TrainConfig(method="guided", options={"reward": "task"}))
 
 
 def test_a_run_is_reported_and_exported(

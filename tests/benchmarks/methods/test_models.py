@@ -10,19 +10,21 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.methods import _imagined as imagined
+from benchmarks.methods._ensemble import Predictor
+from benchmarks.methods._soft_actor_critic import SacOptions, SoftActorCritic, TransitionBatch
+from benchmarks.methods.mbpo import MbpoLearner
+from benchmarks.methods.pets import PetsLearner, PetsPolicy
 from stlc import Run
 from stlc.cli.framework.app import main
-from stlc.controller.methods import _imagined as imagined
-from stlc.controller.methods._ensemble import Predictor
-from stlc.controller.methods._soft_actor_critic import SacOptions, SoftActorCritic, TransitionBatch
-from stlc.controller.methods.mbpo import MbpoLearner
-from stlc.controller.methods.pets import PetsLearner, PetsPolicy
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
 from stlc.diagnostics import UsageError
 from stlc.registry import METHODS
+
+pytestmark = pytest.mark.apart
 
 ROOT = Path(__file__).parents[3]
 SPEC, CAR = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
@@ -131,7 +133,7 @@ def test_the_command_line_trains_and_opens_it(
     monkeypatch.chdir(tmp_path)
     own = [word for key, value in TINY[method].items() for word in ("--option", f"{key}={value}")]
     options = ["--method", method, "--steps", "2", "--held-out", "20", "--drives", "2", "--no-pictures"]
-    code = main(["train", SPEC, "--system", CAR, *options, *own, "--reward", "task", "--json"])
+    code = main(["train", SPEC, "--system", CAR, *options, *own, "--option", "reward=task", "--json"])
     document = json.loads(capsys.readouterr().out)
     assert code == 0, document["diagnostics"]
     assert document["result"]["steps"] == 2
