@@ -293,6 +293,7 @@ PLANNERS: PackageRegistry[Any] = PackageRegistry(
     default="search",
     group="stlc.planners",
     accepts="stlc.controller.planning.planner:is_planner",
+    moved={name: f"benchmarks/methods/planners/{name}.py" for name in ("cem", "cma", "mpc")},
 )
 """Planners, `stlc.controller.planning.planner.Planner` each, named by `stlc plan --method`."""
 

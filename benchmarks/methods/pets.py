@@ -5,7 +5,7 @@ by the cross-entropy method: it samples control sequences and keeps the best. Th
 mean reward of several imagined episodes (particles), each predicted by one of the networks. By default a
 search covers the whole plan, with controls that are constant over a few steps.
 
-Meng and Fan (2023) compare with PETS under these settings: `--reward task`, and `ahead=5 piece=1
+Meng and Fan (2023) compare with PETS under these settings: `reward=task`, and `ahead=5 piece=1
 population=350 rounds=5 particles=20 model_lr=7.5e-4 model_decay=3e-5 model_held=0 model_epochs=25 growth=0
 environments=10`. In closed-loop simulations they use `ahead=3 particles=3`.
 """

@@ -1,7 +1,7 @@
 """Soft actor-critic (Haarnoja et al., ICML 2018) by stable-baselines3.
 
-RL_R, RL_S and RL_A of Meng and Fan (2023) are this method with `--reward task`, `robustness` and `accuracy`.
-Training needs the optional packages of `stlc[rl]`; the trained policy does not.
+RL_R, RL_S and RL_A of Meng and Fan (2023) are this method with `reward=task`, `robustness` and `accuracy`.
+Training needs stable-baselines3, which `stlc[bench]` installs; the trained policy does not.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def test_options_of_a_learner_are_in_name_key_and_command(tmp_path: Path) -> Non
     assert Cell.of({"key": cell.key.values}) == cell
     job: Job = _job(cell, Place(ResultStore("paper", tmp_path)), None)
     words = " ".join(job.arguments)
-    assert "--reward task --option rate=2" in words
+    assert "--option reward=task --option rate=2" in words
 
 
 # ---------------------------------------------------------------------- planner cells

@@ -189,7 +189,7 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
 
 
 def test_a_longer_training_extends_a_shorter_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(type(METHODS.get("gradient")), "extendable", True)
+    monkeypatch.setattr(type(METHODS.get("gradient")), "extendable", True, raising=False)
     place = Place(ResultStore("ablation", tmp_path), tmp_path / "runs")
     short = quick(length=Length(0.3, clock="processor"))
     run = trained(short, place)
@@ -223,7 +223,7 @@ def test_a_copied_run_is_not_taken_for_the_longer_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The process may end between the copy and the training."""
-    monkeypatch.setattr(type(METHODS.get("gradient")), "extendable", True)
+    monkeypatch.setattr(type(METHODS.get("gradient")), "extendable", True, raising=False)
     place = Place(ResultStore("ablation", tmp_path), tmp_path / "runs")
     short = quick(length=Length(0.3, clock="processor"))
     trained(short, place)

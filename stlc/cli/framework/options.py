@@ -122,7 +122,7 @@ def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> Plann
     """
     from stlc.controller.training.config import PlannerChoice
 
-    options = parse_pairs(pairs, "--option", "NAME=VALUE", "population=500")
+    options = parse_pairs(pairs, "--option", "NAME=VALUE", "tries=500")
     return PlannerChoice(PLANNERS.chosen(name), options, parse_seconds(budget))
 
 

@@ -1,1 +1,1 @@
-"""Back ends: translation of the intermediate representation to NumPy, torch, C, ONNX, CasADi and MILP."""
+"""Back ends: translation of the intermediate representation to NumPy, torch, C, ONNX and MILP."""

@@ -229,7 +229,7 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     method = METHODS.get(name)
     found: ResolvedConfig = method.resolve(task, config)
     if config.falsify and not method.falsifies:
-        able = ", ".join(each for each in METHODS if METHODS.get(each).falsifies)
+        able = ", ".join(each for each in METHODS.own if METHODS.get(each).falsifies)
         raise usage(f"method `{name}` cannot train with `--falsify`", f"methods that can: {able}")
     if isinstance(config.steps, StepSchedule) and config.steps.rounds and not config.falsify:
         raise usage("the schedule of `--steps` has rounds of falsification", "repeat it with --falsify")

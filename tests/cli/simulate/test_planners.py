@@ -14,8 +14,7 @@ from stlc.trace import load_trace
 
 ROOT = Path(__file__).parents[3]
 SMALL = ["--seeds", "0", "--agents", "2", "--steps", "3", "--no-pictures"]
-NEEDS = {"milp": "highspy", "mpc": "casadi", "cma": "cma"}
-SPECS = {"mpc": "ship_safe"}
+NEEDS = {"milp": "highspy"}
 
 
 @pytest.fixture(autouse=True)
@@ -25,12 +24,11 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("method", [name for name in PLANNERS.names if name != "policy"])
+@pytest.mark.parametrize("method", [name for name in PLANNERS.own if name != "policy"])
 def test_every_planner_drives(method: str, capsys: pytest.CaptureFixture[str]) -> None:
     if method in NEEDS:
         pytest.importorskip(NEEDS[method])
-    name = SPECS.get(method, "traffic")
-    spec = str(ROOT / f"specs/{name}.stl")
+    spec = str(ROOT / "specs/traffic.stl")
     assert main(["simulate", spec, "--method", method, *SMALL, "--json", "--fail-under", "0"]) == 0
     result = json.loads(capsys.readouterr().out)["result"]
     assert result["steps"] == 3
@@ -43,7 +41,7 @@ def test_every_planner_drives(method: str, capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("name", "method", "said"),
     [
-        ("traffic", "mpc", "cannot plan through jumps"),
+        ("traffic", "mpc", "did you mean --method benchmarks/methods/planners/mpc.py"),
         ("ship_safe", "milp", "cannot encode cos"),
         ("traffic", "policy", "stlc simulate RUN"),
     ],

@@ -1,14 +1,15 @@
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers import planner_laws as laws
+from helpers.planner_laws import line_task, planned
 
 import stlc
-from stlc.controller.options import FINITE, bounds_of
 from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, PlanSearch, plan, planner_named
 from stlc.controller.planning.traces import following, starts_of, trace_of
 from stlc.controller.problem.task import Task
@@ -17,48 +18,26 @@ from stlc.monitor.verdict import Monitor
 from stlc.registry import PLANNERS
 from stlc.trace import load_trace, save_trace
 
-NEEDS = {"cma": "cma", "milp": "highspy", "mpc": "casadi"}
-QUICK = {"cem": {"population": 50, "elites": 10}, "gradient": {"steps": 5, "starts": 2}}
 
-
-@pytest.fixture(params=[name for name in PLANNERS.names if name != "policy"])
+@pytest.fixture(params=[name for name in PLANNERS.own if name != "policy"])
 def planner(request: pytest.FixtureRequest) -> str:
-    name: str = request.param
-    if name in NEEDS:
-        pytest.importorskip(NEEDS[name])
-    return name
-
-
-def planned(task: Task, name: str, x0: torch.Tensor, evaluations: int = 300) -> stlc.PlanResult:
-    return plan(task, x0, name, budget=PlanBudget(5.0, evaluations), **QUICK.get(name, {}))
+    return laws.available(request.param)
 
 
 def test_plans_are_judged_exactly_and_within_bounds(car_task: Task, planner: str) -> None:
-    x0 = car_task.sample(4, seed=3, dtype=torch.float64)
-    if planner == "mpc":  # a planner for smooth systems
-        with pytest.raises(UsageError, match="cannot"):
-            planned(car_task, planner, x0)
-        return
-    found = planned(car_task, planner, x0)
-    done = torch.isfinite(found.rho)
-    assert bool(done.any())
-    rho = car_task.judge(x0[done], found.plans[done]).rho
-    assert torch.equal(rho, found.rho[done])
-    system = car_task.system
-    assert bool((found.plans >= system.control_low).all() & (found.plans <= system.control_high).all())
-    assert bool((found.evaluations > 0).all())
+    laws.judges_exactly_and_within_bounds(car_task, planner)
 
 
 def test_the_same_seed_gives_the_same_plans(car_task: Task) -> None:
     x0 = car_task.sample(3, seed=5, dtype=torch.float64)
-    for name in ("search", "cem", "gradient"):
+    for name in ("search", "halving", "gradient"):
         first, second = planned(car_task, name, x0), planned(car_task, name, x0)
         assert torch.equal(first.plans, second.plans), name
 
 
 def test_evaluations_are_a_limit_and_a_target_ends_the_search(car_task: Task) -> None:
     x0 = car_task.sample(2, seed=1, dtype=torch.float64)
-    most = plan(car_task, x0, "cem", budget=PlanBudget(5.0, 120, torch.inf), population=50, elites=10)
+    most = plan(car_task, x0, "search", budget=PlanBudget(5.0, 120, torch.inf))
     assert most.evaluations.tolist() == [120, 120]
     few = plan(car_task, x0, "search", budget=PlanBudget(5.0))
     assert bool(few.satisfied.all())
@@ -68,38 +47,11 @@ def test_evaluations_are_a_limit_and_a_target_ends_the_search(car_task: Task) ->
 
 
 def test_no_planner_judges_more_plans_than_allowed(car_task: Task, planner: str) -> None:
-    if planner == "mpc":  # a planner for smooth systems
-        return
-    x0 = car_task.sample(3, seed=1, dtype=torch.float64)
-    for most in (1, 70):
-        budget = PlanBudget(20.0, most, torch.inf if planner != "milp" else 0.0)
-        found = plan(car_task, x0, planner, budget=budget, **QUICK.get(planner, {}))
-        assert bool((found.evaluations <= most).all()), found.evaluations
-
-
-LINE = """stlc: 1
-name: line
-time: {dt: 1 s, horizon: HORIZON steps, integrator: euler, substeps: 1}
-state: {x: {range: [-10, 10]}}
-control: {u: {range: [-1, 1]}}
-flow: {x: FLOW}
-init: {mixture: [{draw: {x: "uniform(-1, 1)"}}]}
-"""
-
-
-def line_task(folder: Path, flow: str, horizon: int) -> Task:
-    path = folder / "line.yaml"
-    path.write_text(LINE.replace("FLOW", flow).replace("HORIZON", str(horizon)))
-    return Task.of(
-        stlc.parse("spec line\nstate signal x\nrequire far: eventually[0 s, T] x >= 0.5"),
-        stlc.System.load(path),
-    )
+    laws.judges_no_more_than_allowed(car_task, planner)
 
 
 def test_plans_of_a_single_number(tmp_path: Path, planner: str) -> None:
-    task = line_task(tmp_path, "u / (1 s)", 1)
-    found = plan(task, torch.zeros(2, 1), planner, budget=PlanBudget(5.0, 2_000))
-    assert bool(found.satisfied.all())
+    laws.plans_a_single_number(tmp_path, planner)
 
 
 def test_plans_with_infinite_states_are_none(tmp_path: Path) -> None:
@@ -187,19 +139,13 @@ def test_starts_that_make_no_sense(car_task: Task, text: str, message: str) -> N
         starts_of(car_task, text, None, 0)
 
 
-def test_options_are_checked(car_task: Task, planner: str) -> None:
-    kind = PLANNERS.get(planner)
-    assert all(type(each.default) in (bool, int, float, str) for each in fields(kind))
-    with pytest.raises(UsageError, match="has no option `nonsense`"):
-        planner_named(planner, nonsense="1")
+def test_options_are_checked(car_task: Task) -> None:
     with pytest.raises(UsageError, match="a whole number, not `many`"):
-        planner_named("cem", population="many")
-    assert planner_named("cem", physical="true", population="7") == planner_named(
-        "cem", physical=True, population=7
-    )
-    for wrong in ({"population": 2.5}, {"population": True}, {"physical": 1}, {"over": 3}, {"floor": None}):
-        with pytest.raises(UsageError, match="of planner `cem` is"):
-            planner_named("cem", **wrong)
+        planner_named("gradient", steps="many")
+    assert planner_named("gradient", steps="7", rate="1") == planner_named("gradient", steps=7, rate=1.0)
+    for wrong in ({"steps": 2.5}, {"steps": True}, {"objective": 3}, {"rate": None}):
+        with pytest.raises(UsageError, match="of planner `gradient` is"):
+            planner_named("gradient", **wrong)
     with pytest.raises(UsageError, match="neither `exact` nor `paper`"):
         plan(car_task, car_task.sample(1), "gradient", objective="smooth")
     with pytest.raises(UsageError, match="unknown planner `serach`"):
@@ -207,24 +153,12 @@ def test_options_are_checked(car_task: Task, planner: str) -> None:
 
 
 def test_numbers_out_of_their_bounds_are_refused(planner: str) -> None:
-    kind = PLANNERS.get(planner)
-    numbers = [each for each in fields(kind) if type(each.default) in (int, float)]
-    assert numbers
-    for each in numbers:
-        bounds = bounds_of(each, FINITE)
-        assert each.default in bounds
-        for value in ("nan", str(2 * int(bounds.most)), str(bounds.least - 1)[:-2]):
-            with pytest.raises(UsageError, match=f"option `{each.name}` of planner `{planner}` is a"):
-                planner_named(planner, **{each.name: value})
+    laws.refuses_numbers_out_of_bounds(planner)
 
 
 @pytest.mark.slow
 def test_least_numbers_plan_too(car_task: Task, planner: str) -> None:
-    x0 = car_task.sample(2, seed=3, dtype=torch.float64)
-    for each in fields(PLANNERS.get(planner)):
-        if type(each.default) in (int, float) and planner != "mpc":
-            least = type(each.default)(max(bounds_of(each, FINITE).least, 0))
-            plan(car_task, x0, planner, budget=PlanBudget(0.05), **{each.name: least})
+    laws.plans_with_least_numbers(car_task, planner)
 
 
 def test_a_planner_is_a_policy(car_task: Task) -> None:

@@ -91,7 +91,7 @@ class SchedulePlanner:
         scheduler = GoalScheduler([rule.formula for rule in task.rules], task.system.names, task.horizon)
         if not scheduler.conditions:
             message = "planner `schedule` needs a condition on states, at one sample, in the specification"
-            raise UsageError(Diagnostic("U101", message, help=("search, cem and cma plan for any task",)))
+            raise UsageError(Diagnostic("U101", message, help=("search and gradient plan for any task",)))
         blank = torch.zeros(1, task.horizon + 1, len(task.system.names), dtype=torch.float64)
         for states in (blank, blank[:, :1]):  # so that the programs of the conditions are built
             values_of(task, scheduler.conditions, states)

@@ -1,4 +1,4 @@
-"""`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT, which `stlc[mpc]` installs.
+"""`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT, which `stlc[bench]` installs.
 
 This planner applies to smooth systems. It uses multiple shooting with the smooth robustness of Pant et al.
 (2017), from several initial guesses. `simulate --method mpc` plans anew in every step: model predictive
@@ -24,7 +24,7 @@ from stlc.diagnostics import not_installed, usage
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
-    from stlc.compile.backends.casadi.shooting import Shooting
+    from benchmarks.methods.planners._shooting import Shooting
     from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
 
@@ -73,7 +73,7 @@ class Mpc:
         try:
             import casadi
         except ModuleNotFoundError:
-            raise not_installed("planner `mpc` needs casadi", "mpc") from None
+            raise not_installed("planner `mpc` needs casadi", "bench") from None
         shooting = self._shooting(task)
         options: dict[str, Any] = {
             "print_time": False,
@@ -90,7 +90,7 @@ class Mpc:
         return partial(self._run, shooting=shooting, solve=solver)
 
     def _shooting(self, task: Task) -> Shooting:
-        from stlc.compile.backends.casadi.shooting import (
+        from benchmarks.methods.planners._shooting import (
             NotSmoothError,
             ScaledFormula,
             Shooting,
@@ -110,7 +110,7 @@ class Mpc:
         except NotSmoothError as what:
             raise usage(
                 f"planner `mpc` cannot plan through jumps: {what}",
-                "search, cem, cma and gradient plan for any system, milp for piecewise linear ones",
+                "search and gradient plan for any system, milp for piecewise linear ones",
             ) from None
 
     def _run(self, search: PlanSearch, shooting: Shooting, solve: Callable[..., Any]) -> None:

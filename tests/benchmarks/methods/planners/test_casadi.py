@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+pytestmark = pytest.mark.apart
 casadi = pytest.importorskip("casadi")
 
-from stlc.compile.backends.casadi.ops import CASADI, SymbolicColumn  # noqa: E402
+from benchmarks.methods.planners._casadi import CASADI, SymbolicColumn  # noqa: E402
 
 
 @pytest.mark.parametrize("b", [0.1, -0.3, 2.0])

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.controller.methods.planners.mpc import Mpc
+from benchmarks.methods.planners.mpc import Mpc
 from stlc.controller.planning.planner import PlanBudget, PlanSearch, plan
 from stlc.controller.problem.task import Task
 from stlc.controller.training.local_search import Searcher
@@ -19,6 +19,7 @@ from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 
+pytestmark = pytest.mark.apart
 casadi = pytest.importorskip("casadi")
 
 SYSTEM = """

@@ -1,4 +1,4 @@
-"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by the package that `stlc[plan]` installs."""
+"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by a package of `stlc[bench]`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Cma:
         try:
             import cma
         except ModuleNotFoundError:
-            raise not_installed("planner `cma` needs cma", "plan") from None
+            raise not_installed("planner `cma` needs cma", "bench") from None
         return partial(self._run, strategy=cma.CMAEvolutionStrategy)
 
     def _run(self, search: PlanSearch, strategy: Any) -> None:

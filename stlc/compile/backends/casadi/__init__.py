@@ -1,1 +1,0 @@
-"""CasADi back end: dynamics and robustness as symbolic expressions for optimisers."""
