@@ -229,11 +229,6 @@ env = stlc.gym.make("specs/traffic.stl", "car.yaml")
 env.reset(seed=0)
 env.step(env.action_space.sample())
 """,
-    "rl": """
-from stlc.gym import make_vec
-from stlc.gym.sb3 import SB3VecEnv
-SB3VecEnv(make_vec("specs/traffic.stl", 2, "car.yaml")).reset()
-""",
     "panda": """
 import os
 os.environ["DISPLAY"] = ":0"
@@ -280,7 +275,6 @@ COMMANDS = {
     "log": ([*TRAIN, "--log", "tensorboard"],),
     "onnx": (TRAIN, ["export", "latest", "--to", "onnx"]),
     "plan": (["plan", "specs/traffic.stl", "--method", "milp", "--budget", "5s"],),
-    "mpc": (["plan", "specs/ship_safe.stl", "--method", "mpc", "--budget", "5s"],),
 }
 
 
@@ -297,7 +291,7 @@ def test_an_extra_of_a_training(extra, wheel, bare, folder):
 
 def test_every_extra_is_tried():
     extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
-    assert extras == {*QUICK, *PROGRAMS, *COMMANDS, "lsp", "peers", "cluster", "docs", "all", "dev"}
+    assert extras == {*QUICK, *PROGRAMS, *COMMANDS, "lsp", "peers", "cluster", "docs", "bench", "all", "dev"}
 
 
 @pytest.mark.slow

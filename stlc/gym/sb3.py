@@ -1,6 +1,6 @@
 """Environments of a task for Stable-Baselines3, which has its own class of vector environments.
 
-The module needs the optional packages of `stlc[rl]`.
+The module needs the package stable-baselines3.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from stlc.diagnostics import not_installed, usage
+from stlc.diagnostics import Diagnostic, MissingError, usage
 from stlc.gym.pictures import Picture
 from stlc.gym.spaces import Floats
 from stlc.gym.vector import SpecVectorEnv
@@ -20,7 +20,8 @@ from stlc.gym.vector import SpecVectorEnv
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ModuleNotFoundError:
-    raise not_installed("stlc.gym.sb3 needs stable-baselines3, which is not installed", "rl") from None
+    message = "stlc.gym.sb3 needs stable-baselines3, which is not installed"
+    raise MissingError(Diagnostic("R301", message, help=("pip install stable-baselines3",))) from None
 
 Indices: TypeAlias = Iterable[int] | int | None
 
