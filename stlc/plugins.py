@@ -22,8 +22,8 @@ from typing import Any
 
 from stlc.diagnostics import Diagnostic, PluginError, StlcError, UsageError
 
-GROUPS = ("stlc.methods", "stlc.planners", "stlc.formats", "stlc.plants", "stlc.commands")
-"""Groups of entry points."""
+PREFIX = "stlc."
+"""Beginning of the names of groups of entry points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +73,16 @@ def plugins(group: str, attribute: str = "") -> dict[str, tuple[Plugin, ...]]:
     of one name.
     """
     found: dict[str, tuple[Plugin, ...]] = {}
-    for plugin in (*_installed(tuple(sys.path)), *_named(group, attribute)):
+    for plugin in (*installed(), *_named(group, attribute)):
         if plugin.group == group:
             before = () if isinstance(plugin.place, Path) else found.get(plugin.name, ())
             found[plugin.name] = (*before, plugin)
     return found
+
+
+def installed() -> tuple[Plugin, ...]:
+    """Return the plugins of installed packages, of all groups."""
+    return _installed(tuple(sys.path))
 
 
 def variable(group: str) -> str:
@@ -131,7 +136,7 @@ def _entries(text: str, source: str) -> Iterator[Plugin]:
     for line in map(str.strip, text.splitlines()):
         if line.startswith("["):
             group = line.strip("[] ")
-        elif group in GROUPS and "=" in line and line[0] not in "#;":
+        elif group.startswith(PREFIX) and "=" in line and line[0] not in "#;":
             name, _, value = line.partition("=")
             module, _, attribute = value.partition("[")[0].partition(":")
             yield Plugin(group, name.strip(), module.strip(), attribute.strip(), source.strip())

@@ -173,10 +173,11 @@ def test_a_command_of_a_package(tmp_path: Path) -> None:
 
 
 def test_commands_of_stlc_look_at_no_package() -> None:
-    """With packages installed, `fmt` imports as many modules as without."""
+    """With packages installed, `fmt` imports as many modules as without, and reads no list of theirs."""
     code = (
         "import sys; from stlc.cli.framework.app import main; main(['fmt', '--check', sys.argv[1]]); "
-        "print(len(sys.modules), 'importlib.metadata' in sys.modules, 'toy' in sys.modules)"
+        "from stlc.plugins import _installed; "
+        "print(len(sys.modules), 'toy' in sys.modules, _installed.cache_info().misses)"
     )
     counts = []
     for toys in ([], [str(TOY)]):
@@ -186,7 +187,7 @@ def test_commands_of_stlc_look_at_no_package() -> None:
         )
         counts.append(done.stdout.splitlines()[-1])
     assert counts[0] == counts[1]
-    assert counts[0].endswith("False False")
+    assert counts[0].endswith("False 0")
 
 
 # ------------------------------------------------------------------------ broken ones
@@ -266,6 +267,14 @@ def test_damaged_lists_of_entry_points_are_passed_over(
 
 
 # ------------------------------------------------------------------------ whose name it is
+
+
+def test_former_names_say_where_they_went(capsys: pytest.CaptureFixture[str]) -> None:
+    for registry in (METHODS, PLANNERS):
+        assert not set(registry.moved) & set(registry.own)
+        assert all((ROOT / path).is_file() for path in registry.moved.values())
+    assert main(["train", SPEC, "--system", CAR, "--method", "sac"]) == 2
+    assert "did you mean --method benchmarks/methods/sac.py" in capsys.readouterr().err
 
 
 def test_a_name_of_stlc_cannot_be_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

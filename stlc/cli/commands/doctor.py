@@ -15,7 +15,7 @@ from stlc.cli.framework.documents import InstallationFinding, InstallationReport
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import StlcError
-from stlc.plugins import GROUPS, plugins
+from stlc.plugins import installed
 
 MISSING = 5
 
@@ -121,15 +121,13 @@ def _tools() -> Iterator[InstallationFinding]:
 
 def _plugins(*, quick: bool) -> Iterator[InstallationFinding]:
     """Yield a line for each plugin of other packages; it is imported unless `quick`."""
-    for group in GROUPS:
-        for name, found in plugins(group).items():
-            for plugin in found:
-                try:
-                    _ = quick or plugin.load()
-                except StlcError as error:
-                    yield _finding(name, "off", " ".join((plugin.source, *error.diagnostics[0].note)))
-                else:
-                    yield _finding(name, "ok", f"{plugin.source}, {group}")
+    for plugin in installed():
+        try:
+            _ = quick or plugin.load()
+        except StlcError as error:
+            yield _finding(plugin.name, "off", " ".join((plugin.source, *error.diagnostics[0].note)))
+        else:
+            yield _finding(plugin.name, "ok", f"{plugin.source}, {plugin.group}")
 
 
 def _cache() -> InstallationFinding:

@@ -20,7 +20,6 @@ from stlc.cli.framework.options import (
     JsonOption,
     MarginOption,
     PicturesOption,
-    PlannerOption,
     PlannerOptionsOption,
     RunArgument,
     RunsOption,
@@ -37,7 +36,7 @@ from stlc.cli.framework.options import (
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
-from stlc.registry import GUARDS, guard_named
+from stlc.registry import GUARDS, PLANNERS, guard_named
 from stlc.units import time_text
 
 if TYPE_CHECKING:
@@ -119,7 +118,16 @@ def simulate(
             "--windows", help="Also show results on plans and planning windows, such as plan accuracy."
         ),
     ] = False,
-    method: PlannerOption = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            "--method",
+            "-m",
+            metavar="PLANNER",
+            help="A planner instead of a trained policy, for a specification: "
+            f"{', '.join(PLANNERS.installed)}, or FILE.py.",
+        ),
+    ] = None,
     option: PlannerOptionsOption = None,
     budget: Annotated[
         str | None,

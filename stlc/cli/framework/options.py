@@ -99,16 +99,6 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a constant of the spec or a key of the system."),
 ]
-PlannerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--method",
-        "-m",
-        metavar="PLANNER",
-        help="A planner instead of a trained policy, for a specification: "
-        f"{', '.join(PLANNERS.installed)}, or FILE.py.",
-    ),
-]
 PlannerOptionsOption = Annotated[
     list[str] | None,
     typer.Option("--option", metavar="NAME=VALUE", help="An option of the planner; repeatable."),
