@@ -2,8 +2,7 @@
 
 Each group of entry points, such as `stlc.methods`, belongs to one registry (`stlc.registry`). The
 environment variable of the group, such as `STLC_METHODS`, names files, and folders of files: `sac.py` is the
-plugin `sac`. Looking for plugins imports nothing, and reads only
-files called `entry_points.txt`.
+plugin `sac`. Looking for plugins imports nothing, and reads only files called `entry_points.txt`.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ def name_path(group: str, path: Path) -> str:
     if not path.exists():
         raise UsageError(Diagnostic("U102", f"there is no file `{path}`"))
     before = [each for each in os.environ.get(variable(group), "").split(os.pathsep) if each]
-    os.environ[variable(group)] = os.pathsep.join(dict.fromkeys((*before, str(path.resolve()))))
+    os.environ[variable(group)] = os.pathsep.join(dict.fromkeys((*before, str(path.absolute()))))
     return path.stem
 
 

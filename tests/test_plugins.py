@@ -391,3 +391,9 @@ def test_a_file_of_a_package_imports_its_neighbours(
     monkeypatch.setattr(sys, "path", list(sys.path))
     assert METHODS.chosen(str(tmp_path / "site/pack/own.py")) == "own"
     assert type(METHODS.get("own")).__module__ == "pack._shared"
+
+
+def test_a_link_to_a_file_has_the_name_of_the_link(steady: Path, tmp_path: Path) -> None:
+    (tmp_path / "linked.py").symlink_to(steady)
+    assert METHODS.chosen(str(tmp_path / "linked.py")) == "linked"
+    assert METHODS.get("linked") is not None
