@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from difflib import SequenceMatcher
 from importlib import import_module
 from importlib.util import find_spec
@@ -151,7 +151,7 @@ class PackageRegistry(Registry[T]):
         default: str = "",
         group: str = "",
         accepts: str = "",
-        moved: Mapping[str, str] | None = None,
+        moved: dict[str, str] | None = None,
     ) -> None:
         super().__init__(kind)
         self.default, self.group = default, group

@@ -273,6 +273,10 @@ def test_former_names_say_where_they_went(capsys: pytest.CaptureFixture[str]) ->
     for registry in (METHODS, PLANNERS):
         assert not set(registry.moved) & set(registry.own)
         assert all((ROOT / path).is_file() for path in registry.moved.values())
+    with pytest.raises(SystemFileError) as caught:
+        load_system_decl(Path(CAR), {"train.method": "sac"})
+    advice = "it is a file of the repository now: --method benchmarks/methods/sac.py"
+    assert caught.value.diagnostics[0].help == (advice,)
     assert main(["train", SPEC, "--system", CAR, "--method", "sac"]) == 2
     assert "did you mean --method benchmarks/methods/sac.py" in capsys.readouterr().err
 

@@ -206,13 +206,20 @@ class Reader:
         value = as_bool(node) if isinstance(node, Scalar) else None
         return self._valid(node, where, "`true` or `false`", value)
 
-    def option(self, node: Node | None, where: str, options: Collection[str]) -> str | None:
-        """Read a word, which must be one of `options`. `where` names it in messages."""
+    def option(
+        self, node: Node | None, where: str, options: Collection[str], moved: dict[str, str] | None = None
+    ) -> str | None:
+        """Read a word, which must be one of `options`. `where` names it in messages.
+
+        `moved` maps former options to the files that have them now.
+        """
         word = self.text(node, where)
         if node is None or word is None or word in options:
             return word
         near = closest(word, options)
         guess = f"did you mean `{near}`?" if near else ""
+        if moved and word in moved:
+            guess = f"it is a file of the repository now: --method {moved[word]}"
         self.wrong(node, where, " or ".join(f"`{option}`" for option in options), guess)
         return None
 

@@ -195,7 +195,9 @@ def word(options: Iterable[str], known: Iterable[str] | None = None) -> Kind:
     those that the JSON Schema lists.
     """
     return Kind(
-        lambda cx, node, label: cx.reader.option(node, label, tuple(options)),
+        lambda cx, node, label: cx.reader.option(
+            node, label, tuple(options), getattr(options, "moved", None)
+        ),
         {"enum": list(options if known is None else known)},
     )
 
