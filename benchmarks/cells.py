@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from benchmarks.comparison import HOUR
-from benchmarks.drives import GUARDS, Drive
+from benchmarks.drives import WITH_BACKUP, Drive
 from benchmarks.options import Comparing, Training
 from benchmarks.plannings import PlanCell
 from benchmarks.roster import Contender
@@ -98,5 +98,5 @@ class Selection:
                 self.comparing.drive_steps,
             )
             for each in cells
-            for guard in GUARDS
+            for guard in WITH_BACKUP
         ]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from benchmarks.claims import OURS, Standing, Upset
-from benchmarks.drives import GUARDS, DriveRow, budget_text
+from benchmarks.drives import WITH_BACKUP, DriveRow, budget_text
 from benchmarks.options import Comparing, Training
 from benchmarks.plannings import LONG, SECONDS, PlanRow
 from benchmarks.roster import Contender
@@ -19,6 +19,7 @@ from benchmarks.store import BENCHMARKS
 from benchmarks.table import Columns, bullet, listed
 from benchmarks.training import Length
 from stlc.cli.framework.options import parse_seconds, parse_seeds
+from stlc.registry import GUARDS
 
 HOUR = 3600.0
 SEEDS = parse_seeds(Training().seeds)
@@ -222,7 +223,7 @@ def deployments(
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for each in known.values():
         seconds = None if each.evaluations else parse_seconds(Comparing().decision)
-        for guard in GUARDS:
+        for guard in WITH_BACKUP:
             cells[each.name, _loop_text(guard, seconds if each.plans else math.inf)] = {}
     for row in sorted(drives, key=lambda row: trained.get((row.benchmark, row.label), 0.0)):
         budget = _loop_text(row.guard, math.inf if row.label else row.seconds)
@@ -237,7 +238,7 @@ def deployments(
 
 def _loop_text(guard: str, seconds: float | None) -> str:
     """Text for the guard, and for the time budget of a planner; `seconds` is inf for a trained policy."""
-    backup = "with backup" if guard == "paper" else "no guard"
+    backup = "with backup" if GUARDS.get(guard).intervenes else "no guard"
     return backup if seconds == math.inf else f"{budget_text(seconds)}, {backup}"
 
 
@@ -270,7 +271,7 @@ def standings(
     guarded = {
         (row.benchmark, row.method): row.median_ms
         for row in drives
-        if row.label and row.guard == "paper" and not row.outdated
+        if row.label and GUARDS.get(row.guard).intervenes and not row.outdated
     }
     for each in sorted(learned, key=lambda each: each.seconds):
         if not each.outdated:

@@ -23,17 +23,19 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, 
 from stlc.controller.evaluation.deployment import decided, feasible_states
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, is_progress, measure
-from stlc.controller.guard.candidates import Limits, Mode
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.feasibility import viable
-from stlc.controller.guard.guard import GUARD_VERSION, Guard
-from stlc.controller.guard.margins import MarginRequest, parse_margins
+from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.kind import GuardKind, compared_guards
+from stlc.controller.guard.kinds.full import GUARD as FULL
+from stlc.controller.guard.margins import AUTO, MarginRequest, parse_margins
 from stlc.controller.training.run import Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.scenarios.scenario import DISTURBED
 from stlc.provenance import sha256
-from stlc.registry import guard_named
+from stlc.registry import GUARDS
 from stlc.rundir import SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
@@ -45,7 +47,7 @@ NOMINAL = "as it is"
 AGENTS = 5
 """Maximum number of agents in the deployments whose states are sampled."""
 SCENARIOS = (NOMINAL, *DISTURBED)
-USUAL = ("none", "paper", "full", "full+auto")
+USUAL = (*compared_guards(), f"{FULL.name}+{AUTO}")
 """Default guards. The text after a `+` is the safety margin that the guard requests; see `guard_of`."""
 
 
@@ -136,14 +138,14 @@ def picked(recording: DeploymentRecording, samples: int) -> tuple[NDArray[np.int
     return even, there
 
 
-def guard_of(name: str) -> tuple[Mode, MarginRequest]:
+def guard_of(name: str) -> tuple[GuardKind, MarginRequest]:
     """Parse a name such as `full`, `full+0.2` or `full+auto` into a guard and its requested safety margin.
 
     Raises:
         UsageError: U101, there is no such guard.
     """
     mode, _, margin = name.partition("+")
-    return guard_named(mode), parse_margins([margin] if margin else [])
+    return GUARDS.get(mode), parse_margins([margin] if margin else [])
 
 
 @dataclass(slots=True)
@@ -197,9 +199,9 @@ class Deployments:
     def _deploy(self, run: Run, name: str, setting: Setting) -> Result:
         """Simulate the policy of a run with the guard called `name`, and return its metrics."""
         begin = perf_counter()
-        mode, asked = guard_of(name)
-        margin = asked.of(run.task, run.policy, mode, setting.replan)
-        guard = Guard(run.task, run.policy, mode, limits=Limits(seconds=setting.limit, margin=margin))
+        kind, asked = guard_of(name)
+        margin = asked.of(run.task, run.policy, kind.name, setting.replan)
+        guard = Guard(run.task, run.policy, kind.name, limits=Limits(seconds=setting.limit, margin=margin))
         recording = recorded(guard, setting)
         seconds = perf_counter() - begin
         known = self.viable(run.task, torch.from_numpy(recording.states[:, 0]))
@@ -232,7 +234,8 @@ def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
     """Return the key under which a deployment is stored: its name and all its inputs."""
     folder, decl = run.dir.path, run.task.system.decl
     world, laid = decl.test.world, decl.scenario
-    mode, asked = guard_of(guard)
+    kind, asked = guard_of(guard)
+    limit = setting.limit if kind.intervenes and kind.timed else None
     errors = laid.errors if laid is not None and laid.errors != ErrorsDecl() else None
     spec, system, policy = (
         sha256((folder / name).read_text(encoding="utf-8")) for name in (SPEC, SYSTEM, "ckpt/last.json")
@@ -243,10 +246,10 @@ def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
         {
             **{"spec": name, "spec_sha256": spec, "system_sha256": system, "policy_sha256": policy},
             "world_sha256": None if world is None else sha256(world.path.read_text(encoding="utf-8")),
-            **{"guard": guard, "guard_version": GUARD_VERSION, "margin_share": asked.share},
+            **{"guard": guard, "guard_version": kind.version, "margin_share": asked.share},
             **{"scenario": scenario, "errors": None if errors is None else str(errors)},
             **{"seeds": list(setting.seeds), "agents": setting.agents, "steps": setting.steps},
-            **{"replan": setting.replan, "time_limit": None if mode in ("none", "paper") else setting.limit},
+            **{"replan": setting.replan, "time_limit": limit},
             "ceiling": setting.ceiling,
         },
     )

@@ -25,16 +25,19 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Setting
 from stlc.controller.evaluation.deployment import decided
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, measure
-from stlc.controller.guard.candidates import Limits, Mode
-from stlc.controller.guard.guard import GUARD_VERSION, Guard
+from stlc.controller.guard.candidates import Limits
+from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.planning.planner import PLANNING_VERSION, PlanBudget, PlannerPolicy, planner_named
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.run import Run
 from stlc.diagnostics import UsageError
 from stlc.provenance import sha256
+from stlc.registry import GUARDS
 
-GUARDS: tuple[Mode, ...] = ("none", "paper")
+WITH_BACKUP = (GUARDS.default, PAPER.name)
+"""Guards of the paper: none, and the backup policy."""
 DECISIONS, LEAST_DECISIONS, TIMING = 60, 5, 60.0
 """Number of decisions that are timed, each for one agent; fewer, if they take longer than so many seconds."""
 
@@ -45,14 +48,14 @@ class Drive:
 
     Attributes:
         plan: planner with its time budget, or the run of a trained policy.
-        guard: `none` or `paper`.
+        guard: name of the guard.
         seeds: seeds of the simulations.
         agents: greatest number of agents in a simulation; None for the number in the system file.
         steps: greatest number of steps of a simulation; None for the number in the system file.
     """
 
     plan: PlanCell
-    guard: Mode
+    guard: str
     seeds: tuple[int, ...]
     agents: int | None = None
     steps: int | None = None
@@ -83,7 +86,7 @@ class Drive:
             self.name,
             {
                 **planned,
-                **{"guard": self.guard, "guard_version": GUARD_VERSION},
+                **{"guard": self.guard, "guard_version": GUARDS.get(self.guard).version},
                 **{"seeds": list(setting.seeds), "agents": setting.agents, "steps": setting.steps},
                 **_deployed(task),
             },
@@ -226,8 +229,9 @@ def _half(metric: Mapping[str, Any]) -> float | None:
 
 def is_outdated(result: Result) -> bool:
     """True if the specification, the system, the world or a version has changed since a measurement."""
-    versions = {"planner_version": PLANNING_VERSION, "guard_version": GUARD_VERSION}
-    return has_changed(result, {**versions, **_deployed(load(result["key"]["benchmark"]))})
+    key = result["key"]
+    versions = {"planner_version": PLANNING_VERSION, "guard_version": GUARDS.get(key["guard"]).version}
+    return has_changed(result, {**versions, **_deployed(load(key["benchmark"]))})
 
 
 def driven(

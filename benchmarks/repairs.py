@@ -19,6 +19,8 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import TO_SPARE, Limits
 from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.kinds.full import GUARD as FULL
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.guard.stages.gradient_refine import SEED, GradientAscent
 from stlc.controller.problem.task import Task
@@ -73,7 +75,7 @@ def repairs(run: Run, samples: int, seeds: tuple[int, ...], scenario: str = "") 
     task, states = run.task, _rejected(run, samples, seeds)
     if not states:
         return
-    methods = methods_of(task, StagedSearch(task, run.policy, "full", limits=Limits(seconds=None)))
+    methods = methods_of(task, StagedSearch(task, run.policy, FULL, limits=Limits(seconds=None)))
     tried = {name: _tried(task, method, states) for name, method in methods.items()}
     x = torch.cat([state for state, _, _ in states])
     can, safely = solvable(task, x), viable(task, x)
@@ -113,7 +115,7 @@ def methods_of(task: Task, backup: StagedSearch) -> dict[str, Method]:
 
 def _rejected(run: Run, samples: int, seeds: tuple[int, ...]) -> list[Rejected]:
     """Return states in which the guard intervened, and both the policy's plan and the previous plan fail."""
-    task, guard = run.task, Guard(run.task, run.policy, "paper")
+    task, guard = run.task, Guard(run.task, run.policy, PAPER.name)
     recording, _, acted = sampled_states(guard, seeds, 2 * samples)
     found = []
     for row, step in acted:

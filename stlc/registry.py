@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from difflib import SequenceMatcher
 from importlib import import_module
 from importlib.util import find_spec
+from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, Generic, Literal, TypeAlias, TypeVar, get_args
+from typing import Any, Generic, TypeVar
 
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.plugins import Plugin, name_path, plugins
@@ -129,34 +131,37 @@ class PackageRegistry(Registry[T]):
 
     Modules whose names begin with `_` are not entries. Entry points of installed packages and files that the
     user names add further entries (`stlc.plugins`); they cannot replace those of the package. Listing the
-    names imports no module.
+    names imports no module, unless plugins have an order of their own.
 
     Args:
         kind: noun for an entry in messages, such as "method".
-        package: dotted name of the package; "": all entries come from elsewhere.
+        package: dotted name of the package, or of several: rooms above may add plugins of this kind; "": all
+            entries come from elsewhere.
         attribute: name of the variable that holds the plugin in its module.
         default: name of the default plugin, which comes first in `names`.
         group: group of entry points, such as "stlc.methods"; "": nothing is added from elsewhere.
         accepts: `module:name` of the class of plugins from elsewhere, or of a function that says whether an
             object is a plugin.
         moved: name of a former entry -> file that has it now.
+        order: attribute of the plugins, a number, by which `names` lists them; "" for alphabetical order.
     """
 
     def __init__(
         self,
         kind: str,
-        package: str,
+        package: str | tuple[str, ...],
         attribute: str,
         *,
         default: str = "",
         group: str = "",
         accepts: str = "",
-        moved: dict[str, str] | None = None,
+        moved: Mapping[str, str] | None = None,
+        order: str = "",
     ) -> None:
         super().__init__(kind)
         self.default, self.group = default, group
-        self._packages = (package,) if package else ()
-        self._attribute, self._accepts = attribute, accepts
+        self._packages = tuple(filter(None, (package,))) if isinstance(package, str) else package
+        self._attribute, self._accepts, self._order = attribute, accepts, order
         self.moved = moved or {}
         self._loaded: dict[Plugin, T] = {}
 
@@ -173,6 +178,14 @@ class PackageRegistry(Registry[T]):
             elif found := self._elsewhere().get(name):
                 return self._of_elsewhere(*found)
         return super().get(name)
+
+    def loaded(self) -> dict[str, T]:
+        """All plugins by name, in the order of `names`; one that cannot be loaded is left out."""
+        found = {}
+        for name in self.names:
+            with suppress(Exception):
+                found[name] = self.get(name)
+        return found
 
     def _of_elsewhere(self, plugin: Plugin, *others: Plugin) -> T:
         if others:
@@ -216,7 +229,7 @@ class PackageRegistry(Registry[T]):
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Names of the plugins in the package: the default one first, then the others alphabetically."""
+        """Names of the plugins in the package: the default one first, then the others in their order."""
         return self._sorted(self._modules())
 
     @property
@@ -227,11 +240,20 @@ class PackageRegistry(Registry[T]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all plugins: the default one first, then the others in alphabetical order."""
+        """Names of all plugins: the default one first, then the others in their order."""
         return self._sorted((*self.own, *self._elsewhere()))
 
     def _sorted(self, names: Iterable[str]) -> tuple[str, ...]:
-        return tuple(sorted(set(names), key=lambda name: (name != self.default, name)))
+        return tuple(sorted(set(names), key=self._place))
+
+    def _place(self, name: str) -> tuple[bool, float, str]:
+        """Sort key of a plugin in `names`; one that cannot be loaded is listed last."""
+        number = 0.0
+        if self._order:
+            number = inf
+            with suppress(Exception):
+                number = float(getattr(self.get(name), self._order))
+        return name != self.default, number, name
 
     def _elsewhere(self) -> dict[str, tuple[Plugin, ...]]:
         return plugins(self.group, self._attribute) if self.group else {}
@@ -256,24 +278,17 @@ def _folders(package: str) -> list[str]:
     return [str(Path(folder, *inner)) for folder in roots]
 
 
-GuardName: TypeAlias = Literal["none", "paper", "full", "certified"]
-
-GUARDS: tuple[GuardName, ...] = get_args(GuardName)
-"""Guards (`stlc.controller.guard.guard.Guard`) of `--guard`, by increasing cost of a decision."""
-
-
-def guard_named(name: str) -> GuardName:
-    """Return the guard called `name`.
-
-    Raises:
-        UsageError: U101, there is none; the message lists all names, and the most similar one.
-    """
-    for guard in GUARDS:
-        if guard == name:
-            return guard
-    advice = *did_you_mean(name, GUARDS), f"--guard {', '.join(GUARDS[:-1])} or {GUARDS[-1]}"
-    raise UsageError(Diagnostic("U101", f"there is no guard `{name}`", help=advice))
-
+GUARDS: PackageRegistry[Any] = PackageRegistry(
+    "guard",
+    ("stlc.controller.guard.kinds", "stlc.assurance.guards"),
+    "GUARD",
+    default="none",
+    group="stlc.guards",
+    accepts="stlc.controller.guard.kind:GuardKind",
+    order="cost",
+)
+"""Guards of `--guard`, `stlc.controller.guard.kind.GuardKind` each, by increasing cost of a decision. The
+default one never intervenes; simulations compare the others with it."""
 
 METHODS: PackageRegistry[Any] = PackageRegistry(
     "method",

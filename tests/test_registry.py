@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
 import pytest
 from helpers.effort import effort
 from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.diagnostics import UsageError
-from stlc.registry import Registry, closest
+from stlc.registry import PackageRegistry, Registry, closest
 
 words = st.text("abcdefgh_", min_size=4, max_size=10)
 
@@ -108,3 +113,42 @@ def test_a_name_of_thousands_of_letters_is_a_slip_of_nothing():
     assert closest("xy", ["x" * 100_000, "x"]) == "x"
     assert closest("x" * 100_000, ["x", "x" * 99_999]) is None
     assert effort(lambda: closest("x" * 100_000, ["x", "x" * 99_999])) < 100
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, str]]:
+    """Two packages with plugins, one of them broken."""
+    modules = {
+        "below/zero.py": "ENTRY = Fraction(0)",
+        "below/half.py": "ENTRY = Fraction(1, 2)",
+        "below/_shared.py": "raise AssertionError",
+        "above/ninth.py": "ENTRY = Fraction(1, 9)",
+        "above/broken.py": "import surely_not_installed",
+    }
+    for name, text in modules.items():
+        path = tmp_path / "numbers_of_tests" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"from fractions import Fraction\n{text}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "numbers_of_tests.below", "numbers_of_tests.above"
+    for name in [name for name in sys.modules if name.startswith("numbers_of_tests")]:
+        del sys.modules[name]
+
+
+def test_plugins_are_modules_of_several_packages(packages: tuple[str, str]) -> None:
+    registry: PackageRegistry[Fraction] = PackageRegistry("number", packages, "ENTRY", default="zero")
+    assert registry.names == ("zero", "broken", "half", "ninth")
+    assert not any(name.startswith("numbers_of_tests") for name in sys.modules)
+    assert registry.get("ninth") == Fraction(1, 9)
+    with pytest.raises(UsageError, match="unknown number `nineth`"):
+        registry.get("nineth")
+
+
+def test_a_broken_plugin_is_no_fault_of_the_others(packages: tuple[str, str]) -> None:
+    registry: PackageRegistry[Fraction] = PackageRegistry(
+        "number", packages, "ENTRY", default="zero", order="denominator"
+    )
+    assert registry.names == ("zero", "half", "ninth", "broken")
+    assert registry.loaded() == {"zero": 0, "half": Fraction(1, 2), "ninth": Fraction(1, 9)}
+    with pytest.raises(ModuleNotFoundError, match="surely_not_installed"):
+        registry.get("broken")

@@ -593,8 +593,7 @@ def runs(place: Place) -> Pins:
     for name in GUARDED:
         run = place.run(name).as_posix()
         world = f"simulate {run} --seeds 0..1 --steps 12 --agents 2 --no-pictures --json"
-        for guard in ("none", "paper", "full"):
-            limit = " --time-limit none" if guard == "full" else ""
+        for guard, limit in (("none", ""), ("paper", ""), ("full", " --time-limit none")):
             record = f"--record {name}_{guard}.npz"
             yield f"{name}/simulate-{guard}", place.stlc(f"{world} --guard {guard}{limit} {record}")
             yield f"{name}/trace-{guard}", arrays(place.work / f"{name}_{guard}.npz")

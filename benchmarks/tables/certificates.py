@@ -29,6 +29,7 @@ from stlc.cli.framework.program import command
 from stlc.controller.deployment.simulator import Setting
 from stlc.controller.evaluation.rules import rules_of
 from stlc.controller.training.run import Run
+from stlc.registry import GUARDS
 from stlc.rundir import RunDir
 
 SHARE, CONFIDENCE = 0.99, 0.95
@@ -162,7 +163,7 @@ def _drives_of(folder: RunDir, drives: int, steps: int | None, store: ResultStor
     """Drives of a run, as it is and in the scenario, from the store or simulated."""
     run, test = Run.open(folder.path), Run.open(folder.path).task.system.decl.test
     setting = Setting((), 1, min(steps or test.steps, test.steps), test.replan)
-    key = key_of(run, NOMINAL, "none", setting)
+    key = key_of(run, NOMINAL, GUARDS.default, setting)
     key = Key(run.task.compiled.name, {**key.values, "drives": drives, "first_seed": SEED})
 
     def simulate() -> Result:
@@ -182,5 +183,5 @@ def _drives_of(folder: RunDir, drives: int, steps: int | None, store: ResultStor
 
 
 def _recorded(run: Run, setting: Setting, seeds: Sequence[int]) -> Sample:
-    drives = PolicyDrives(run, rules_of(run), "none", replace(setting, seeds=()))
+    drives = PolicyDrives(run, rules_of(run), GUARDS.default, replace(setting, seeds=()))
     return joined([*drives.observed(seeds)])

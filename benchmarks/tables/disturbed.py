@@ -26,6 +26,8 @@ from benchmarks.options import Output
 from benchmarks.store import Result, ResultStore
 from benchmarks.table import Columns, Table, listed, provenance
 from stlc.cli.framework.program import command
+from stlc.controller.guard.kind import named_guard
+from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.margins import AUTO
 from stlc.registry import GUARDS
 
@@ -46,7 +48,6 @@ MOST = 0.95
 """Share of safe starts below which unsafe drives are attributed to the world if the model is exact."""
 METRICS = {"safe agents": "saved", "safe starts": "saved_starts", "satisfied": "executed_starts"}
 """Columns of the table for each guard: title -> name of the metric."""
-TITLES = {"none": "no guard", "paper": "paper's", "full": "full", "certified": "certified"}
 _OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
 
@@ -69,13 +70,15 @@ def table(rows: Sequence[Row]) -> Table[Row, Row]:
 def _guards(rows: Sequence[Row]) -> list[str]:
     """Return the names of all guards in `rows`, in the order of the columns."""
     found = {guard.partition("+") for row in rows for guard in row.guards}
-    ordered = sorted(found, key=lambda parts: ([*TITLES].index(parts[0]), parts[2]))
+    ordered = sorted(found, key=lambda parts: (named_guard(parts[0]).cost, parts[2]))
     return ["".join(parts) for parts in ordered]
 
 
 def _title(guard: str) -> str:
     mode, _, margin = guard.partition("+")
-    return TITLES[mode] + (" with margin" if margin == AUTO else f" with margin {margin}" if margin else "")
+    kind = named_guard(mode)
+    title = kind.title.removesuffix(" guard") if kind.intervenes else kind.title
+    return title + (" with margin" if margin == AUTO else f" with margin {margin}" if margin else "")
 
 
 def _shown(metric: str, guard: str) -> Callable[[Row], str]:
@@ -92,7 +95,7 @@ def section(results: Sequence[Result]) -> list[str]:
     columns: Columns[Row] = {
         "": "{spec}",
         "scenario": "{scenario}",
-        "share of starts": _shown("quiet", "none"),
+        "share of starts": _shown("quiet", GUARDS.default),
         **{f"safe, {_title(guard)}": _shown("quiet_safe_starts", guard) for guard in _guards(rows)},
     }
     some = [row for row in rows if row.spec in lost]
@@ -108,7 +111,7 @@ def _lost_to_the_world(row: Row) -> bool:
 
     This is so if safety is clearly higher for initial states without such events.
     """
-    every, uneventful = row.metric("full", "saved_starts"), row.metric("full", "quiet_safe_starts")
+    every, uneventful = (row.metric(FULL.name, name) for name in ("saved_starts", "quiet_safe_starts"))
     if every is None or uneventful is None:
         return False
     return float(every["mean"]) < min(float(uneventful["mean"]), MOST)

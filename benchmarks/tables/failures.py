@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.deployments import NOMINAL, key_of
+from benchmarks.drives import WITH_BACKUP
 from benchmarks.measured import measured
 from benchmarks.options import OnlyOption, Output, Training, chosen
 from benchmarks.store import Key, Result, ResultStore
@@ -22,16 +23,15 @@ from stlc.assurance.drive_search import DRIVE_SEARCH_VERSION, search_drives
 from stlc.assurance.drive_simulator import DriveSimulator
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.batched import Setting
-from stlc.controller.guard.candidates import Mode
 from stlc.controller.training.failures import FAILURES_VERSION
 from stlc.controller.training.run import Run
+from stlc.registry import GUARDS
 from stlc.rundir import RunDir
 
 ORDER = ("traffic", "ship_safe", "manipulation", "navigation", "reach_n_avoid", "ship_track")
 """Benchmarks in the order in which they are measured."""
 COUPLED = ("traffic",)
 """Benchmarks whose agents influence each other: their searches keep all agents of a world."""
-GUARDS: tuple[Mode, ...] = ("none", "paper")
 BATCH = 16
 SEARCHED, FRESH = 0, 4_000_000
 """Seeds of the searches, and of the fresh drives, on which nothing is tuned."""
@@ -72,7 +72,7 @@ class Drives:
 
     folder: RunDir
     benchmark: str
-    guard: Mode
+    guard: str
     random: bool
     simulations: int
     agents: int
@@ -281,7 +281,7 @@ def _drives(
     cells: Sequence[Cell], place: Place, simulations: int, fresh: int, steps: int | None
 ) -> Iterator[Drives]:
     """The simulations of a benchmark whose trainings are finished."""
-    for guard in GUARDS:
+    for guard in WITH_BACKUP:
         for cell in cells:
             own = _fresh(cell, place, guard, fresh, steps)
             if own is None:
@@ -296,12 +296,12 @@ def _drives(
 def _drives_of_others(cells: Sequence[Cell], place: Place, fresh: int, steps: int | None) -> Iterator[Drives]:
     """The fresh drives of trainings with further seeds, without guard."""
     for cell in cells:
-        own = _fresh(cell, place, "none", fresh, steps)
+        own = _fresh(cell, place, GUARDS.default, fresh, steps)
         if own is not None:
             yield own
 
 
-def _fresh(cell: Cell, place: Place, guard: Mode, fresh: int, steps: int | None) -> Drives | None:
+def _fresh(cell: Cell, place: Place, guard: str, fresh: int, steps: int | None) -> Drives | None:
     """About `fresh` drives of the policy of a training; None if it is not finished."""
     folder = place.newest_run(cell.key)
     if folder is None or folder.status != "finished":
@@ -326,7 +326,7 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
     """
     rows = []
     for benchmark in ORDER:
-        for guard in GUARDS:
+        for guard in WITH_BACKUP:
             own = [each for each in results if _is_of(each, benchmark, guard) and not _seed_of(each)]
             searches = {_size(each): each for each in own if each["key"]["seed"] != FRESH}
             sizes = [count for count, random in searches if random and (count, False) in searches]
@@ -359,7 +359,11 @@ def seed_rows_of(results: Sequence[Result]) -> list[SeedRow]:
     """
     rows = []
     for benchmark in ORDER:
-        fresh = [each for each in results if _is_of(each, benchmark, "none") and each["key"]["seed"] == FRESH]
+        fresh = [
+            each
+            for each in results
+            if _is_of(each, benchmark, GUARDS.default) and each["key"]["seed"] == FRESH
+        ]
         fresh.sort(key=_drives_of)
         newest = max((str(each["key"]["trained"]) for each in fresh if _falsified(each)), default="")
         shares = [

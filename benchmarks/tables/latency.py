@@ -26,9 +26,10 @@ from stlc.cli.framework.program import command
 from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.training.run import Run
 from stlc.diagnostics import UsageError
-from stlc.registry import GUARDS, GuardName
+from stlc.registry import GUARDS
 
 TEXT = """## A decision
 
@@ -102,7 +103,7 @@ def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
         seeds: seeds of the closed-loop simulations from which the states are taken.
     """
     guards = dict(_guards(run))
-    recording, even, acted = sampled_states(guards["paper"], seeds, samples)
+    recording, even, acted = sampled_states(guards[PAPER.name], seeds, samples)
 
     def plan(index: NDArray[np.int64]) -> float:
         x = torch.from_numpy(recording.states[tuple(index)])[None]
@@ -118,13 +119,13 @@ def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
         yield Row(*names, mode, Times.of([seconds for seconds, _ in every]), Times.of(acting))
 
 
-def _guards(run: Run) -> Iterator[tuple[GuardName, Guard]]:
-    """Yield the guards of a run by name, but not `certified` if there is nothing that it can certify."""
+def _guards(run: Run) -> Iterator[tuple[str, Guard]]:
+    """Yield the guards of a run by name, but not one that needs more than the run has."""
     for mode in GUARDS:
         try:
             yield mode, Guard(run.task, run.policy, mode, limits=Limits())
         except UsageError:
-            if mode != "certified":
+            if not GUARDS.get(mode).needs:
                 raise
 
 

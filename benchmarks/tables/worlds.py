@@ -131,7 +131,7 @@ def worlds(
     A world is the simulated environment of a system. Stored simulations with the same policy, system and
     settings are reused. Scenarios with a world of their own are simulated, too.
     """
-    modes = [mode for mode in GUARDS if mode in chosen(guards, GUARDS, "guard")]
+    modes = [mode for mode in GUARDS if mode in chosen(guards, GUARDS.names, "guard")]
     deployments = Deployments(ResultStore("worlds", options.out), options, ceiling)
     for folder in options.runs(runs):
         declared = Run.open(folder.path).task.system.decl.scenarios

@@ -22,6 +22,7 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Simulation
 from stlc.controller.training.failures import SearchRound
 from stlc.controller.training.run import Run
 from stlc.native import Stop, never
+from stlc.registry import GUARDS
 
 DRIVE_SEARCH_VERSION = 2
 """Version of the search; results of older versions are recomputed."""
@@ -206,7 +207,7 @@ def round_of(
     test = run.task.system.decl.test
     setting = Setting((0,), test.agents, test.steps, test.replan)
     batch = min(max(ROWS // test.agents, 2), ROUND)
-    simulator = DriveSimulator(run, "none", setting, batch=batch)
+    simulator = DriveSimulator(run, GUARDS.default, setting, batch=batch)
     kept, ended = list[NDArray[np.float64]](), list[int]()
 
     def seen(recording: DeploymentRecording, margins: NDArray[np.float64]) -> None:

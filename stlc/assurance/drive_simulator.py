@@ -18,7 +18,6 @@ from stlc.controller.deployment.simulator import simulate as run_worlds
 from stlc.controller.deployment.tape import BELOW
 from stlc.controller.evaluation.archive import trace_of
 from stlc.controller.evaluation.rules import Rules, rules_of, verdict_on_runs
-from stlc.controller.guard.candidates import Limits, Mode
 from stlc.controller.guard.guard import Guard
 from stlc.controller.world import world_type
 
@@ -41,13 +40,13 @@ class DriveSimulator:
 
     Attributes:
         run: the trained policy, with its scenario.
-        guard: kind of guard.
+        guard: name of the guard.
         setting: agents, steps and replanning period, and a first seed.
         batch: number of worlds that are simulated side by side.
     """
 
     run: Run
-    guard: Mode
+    guard: str
     setting: Setting
     batch: int = 16
 
@@ -60,10 +59,7 @@ class DriveSimulator:
 
     @cached_property
     def _guard(self) -> Guard:
-        limits = Limits(
-            seconds=self.setting.limit, margin=self.setting.margin, paper=self.setting.paper_limit
-        )
-        return Guard(self.run.task, self.run.policy, self.guard, limits=limits)
+        return Guard(self.run.task, self.run.policy, self.guard, limits=self.setting.limits)
 
     @cached_property
     def space(self) -> SearchSpace:

@@ -16,14 +16,14 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
-from stlc.controller.guard.candidates import Limits, Mode
-from stlc.controller.guard.guard import GUARD_VERSION, Guard
+from stlc.controller.guard.guard import Guard
 from stlc.controller.training.checkpoint import FOLDER, POINTER
 from stlc.controller.training.run import CONFIG, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.robots.functions import function_files
 from stlc.monitor.judgement import unknown_requirement
 from stlc.provenance import sha256
+from stlc.registry import GUARDS
 from stlc.rundir import MOST_ARRAYS, RunDir
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ class PolicyDrives:
 
     run: Run
     rules: Rules | None
-    guard: Mode
+    guard: str
     setting: Setting
     require: tuple[str, ...] = ()
     overrides: Mapping[str, str] = field(default_factory=dict)
@@ -165,11 +165,10 @@ class PolicyDrives:
             UsageError: U101, there is no such requirement.
         """
         task, limit = self.run.task, self.setting
-        limits = Limits(seconds=limit.limit, margin=limit.margin, paper=limit.paper_limit)
         size = max(1, ROWS // limit.agents)
         for begin in range(0, len(seeds), size):
             setting = replace(limit, seeds=tuple(seeds[begin : begin + size]))
-            guard = Guard(task, self.run.policy, self.guard, limits=limits)
+            guard = Guard(task, self.run.policy, self.guard, limits=limit.limits)
             recorder = Recorder(setting.agents, pictured=False)
             simulate(guard, world_type(task.system.decl), setting, recorder, self.watch)
             recording = recorder.recording()
@@ -184,14 +183,14 @@ class PolicyDrives:
             "run": run.dir.shown,
             "spec": run.task.compiled.name,
             "system": run.task.system.decl.name,
-            "inputs": inputs_of(run.dir, run.task.system.decl, self.rules),
+            "inputs": inputs_of(run.dir, run.task.system.decl, self.rules, self.guard),
             "conditions": {
                 "guard": self.guard,
                 "scenario": None if scenario is None else scenario.name,
                 "overrides": dict(self.overrides),
                 "require": list(self.require),
                 "margin": dict(setting.margin),
-                "time_limit": setting.paper_limit if self.guard == "paper" else setting.limit,
+                "time_limit": setting.limit if GUARDS.get(self.guard).timed else setting.paper_limit,
                 "agents": setting.agents,
                 "steps": setting.steps,
                 "replan": setting.replan,
@@ -206,14 +205,19 @@ class PolicyDrives:
 # ---------------------------------------------------------------------- verification
 
 
-def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None) -> dict[str, str | int | None]:
+def inputs_of(
+    folder: RunDir, decl: SystemDecl, rules: Rules | None, guard: str
+) -> dict[str, str | int | None]:
     """Hashes and versions of everything that the drives of a run depend on, beside their conditions.
 
     `spec`, `system`: files in the folder of the run, with imports and the changes of the training.
     `functions`: files that the system file names. `rules`: the specification of drives with its imports and
     changes, None if there is none. `world`: the file of the world, None for the model. `policy`: the
-    checkpoint and the options of the method. `guard_version`: raised with every change of a guard's
+    checkpoint and the options of the method. `guard_version`: raised with every change of the guard's
     decisions.
+
+    Raises:
+        UsageError: U101, there is no guard called `guard`.
     """
     files = sorted(function_files(decl).items())
     judge = "" if rules is None else spec_sha256(rules.spec.source.text, rules.spec.library or {})
@@ -225,7 +229,7 @@ def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None) -> dict[str
         "rules": None if rules is None else sha256(f"{judge} {changes}"),
         "world": None if decl.test.world is None else sha256(decl.test.world.path.read_bytes()),
         "policy": _policy(folder),
-        "guard_version": GUARD_VERSION,
+        "guard_version": GUARDS.get(guard).version,
     }
 
 
@@ -236,13 +240,14 @@ def verify(document: Mapping[str, Any], folder: RunDir) -> CertificateVerificati
 
     Raises:
         KeyError, TypeError, ValueError: the document is no certificate.
+        UsageError: U101, there is no such guard.
         SpecError, SystemFileError, RunError: the folder is damaged.
     """
     conditions = document["conditions"]
     changed = {str(name): str(text) for name, text in conditions["overrides"].items()}
     scenario = conditions["scenario"]
     decl = declaration_of_run(folder, changed, None if scenario is None else str(scenario))
-    present = inputs_of(folder, decl, rules_for(folder, decl))
+    present = inputs_of(folder, decl, rules_for(folder, decl), str(conditions["guard"]))
     return compared(document, present)
 
 

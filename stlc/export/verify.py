@@ -13,11 +13,13 @@ from torch import Tensor
 
 from stlc import toolchain
 from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import rank
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import without_deprecations
+from stlc.registry import GUARDS
 from stlc.runtime.backup import search
 from stlc.runtime.graphs import joined
 
@@ -192,7 +194,7 @@ def backup_agreement(
     task = policy.task
     x = task.sample(states, seed=seed, dtype=torch.float64)
     with torch.no_grad():
-        wanted, told = StagedSearch(task, policy, "paper").search(x, policy.plan(x)), decide(x)
+        wanted, told = StagedSearch(task, policy, PAPER).search(x, policy.plan(x)), decide(x)
     assert told.source is not None
     assert told.t0 is not None
     alike = torch.equal(told.source, wanted.source) and torch.equal(told.t0, wanted.prefix_length)
@@ -248,7 +250,7 @@ def previous_plan_agreement(
     Raises:
         RunError: R105, they disagree.
     """
-    guard, task = Guard(policy.task, policy, "none"), policy.task
+    guard, task = Guard(policy.task, policy, GUARDS.default), policy.task
     x = task.sample(states, seed=seed, dtype=torch.float64)
     first = guard.decide(x)
     x, left = task.system.step(x, first.action), first.later()

@@ -6,9 +6,9 @@ controller = Controller.load("controller", guard="paper")
 decision = controller.decide(state)
 """
 
-from stlc.runtime.controller import ControlDecision, Controller, Guard
+from stlc.runtime.controller import ControlDecision, Controller
 
 Decision = ControlDecision
 """The former name of `ControlDecision`."""
 
-__all__ = ["ControlDecision", "Controller", "Decision", "Guard"]
+__all__ = ["ControlDecision", "Controller", "Decision"]

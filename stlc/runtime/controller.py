@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.diagnostics import Diagnostic, RunError, UsageError
+from stlc.diagnostics import Diagnostic, RunError, usage
+from stlc.registry import GUARDS
 from stlc.runtime.backup import POLICY, Found, search
 from stlc.runtime.facts import Facts, read_facts
 from stlc.runtime.graphs import Graphs, JudgedPlans, Numbers
 
-Guard: TypeAlias = Literal["none", "paper"]
 RULES = ("policy", "backup", "safest")
 KEPT = "kept"
 
@@ -74,24 +73,25 @@ class Controller:
 
     Attributes:
         facts: description of the controller: names, units, ranges, hashes.
-        guard: "paper" searches for another plan if the policy's plan violates the specification; "none"
-            always returns the policy's plan.
+        guard: name of the guard; "paper" searches for another plan if the policy's plan violates the
+            specification, "none" always returns the policy's plan.
     """
 
     def __init__(
         self,
         facts: Facts,
-        guard: Guard = "none",
+        guard: str = GUARDS.default,
         *,
         parameters: Mapping[str, float] | None = None,
         threads: int = 1,
     ) -> None:
-        if guard not in get_args(Guard):
-            raise UsageError(Diagnostic("U101", f"there is no guard `{guard}`", help=("none or paper",)))
-        self.facts = facts
-        self.guard = guard
+        kind = GUARDS.get(guard)
+        if not kind.exported:
+            names = [name for name, each in GUARDS.loaded().items() if each.exported]
+            raise usage(f"exported controllers do not contain the guard `{guard}`", " or ".join(names))
+        self.facts, self.guard, self._guarded = facts, guard, bool(kind.intervenes)
         self._graphs = Graphs(facts, threads=threads)
-        if guard == "paper":
+        if self._guarded:
             self._graphs.prepare()
         self._parameters = dict(parameters or {})
         self._previous: _ChosenPlans | None = None
@@ -101,7 +101,7 @@ class Controller:
     def load(
         cls,
         where: Path | str,
-        guard: Guard = "none",
+        guard: str = GUARDS.default,
         *,
         parameters: Mapping[str, float] | None = None,
         threads: int = 1,
@@ -110,12 +110,13 @@ class Controller:
 
         Args:
             where: folder that `stlc export RUN --to onnx` wrote.
-            guard: "paper" or "none".
+            guard: name of a guard that exported controllers contain: "none" or "paper".
             parameters: values of the specification's parameters, if the states are given without them.
             threads: number of threads for one decision.
 
         Raises:
-            UsageError: U102, the folder does not exist; U101, there is no such guard.
+            UsageError: U102, the folder does not exist; U101, there is no such guard, or exported controllers
+                do not contain it.
             RunError: R106, a file is missing, damaged, or of another export.
             MissingError: R301, `onnxruntime` is not installed.
         """
@@ -162,7 +163,7 @@ class Controller:
         followed, outputs = self._followed(x, elapsed)
         fresh = outputs.get("policy_plan", outputs["plan"])
         policy_rho = outputs.get("policy_rho", outputs["rho"]).copy()
-        if self.guard == "paper":
+        if self._guarded:
             rest = None if previous is None else _continued(previous.judged.plan, elapsed)
             for row in np.flatnonzero(~(followed.judged.rho >= -TOLERANCE)):
                 left = None if rest is None else rest[row]

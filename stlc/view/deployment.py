@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from stlc.controller.evaluation.metrics import HOLDS, METRICS, is_progress
+from stlc.controller.guard.kind import named_guard
 from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table
-from stlc.view.words import cause_words, count, drives_of, guard_words, seconds, share, spread
+from stlc.view.words import cause_words, count, drives_of, seconds, share, spread
 
 Record = Mapping[str, Any]
 
@@ -22,7 +23,7 @@ SOURCES = ("policy", "polished", "backup", "safest", "")
 def deployment_tiles(contents: RunContents) -> list[tuple[str, str]]:
     """Key figures of the closed-loop runs for the head of the report: (name, value) pairs."""
     return [
-        (f"{drives['obeyed']:,} of {drives['count']:,}", f"drives satisfied {guard_words(each).beside}")
+        (f"{drives['obeyed']:,} of {drives['count']:,}", f"drives satisfied {named_guard(each).beside}")
         for each, drives in reversed(drives_of(contents.simulation).items())
     ]
 
@@ -56,7 +57,7 @@ def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, 
     """Table `rows` with one column per guard, below the heading `title`; None if there are no rows."""
     if not rows:
         return None
-    header = ["", *(guard_words(name).title for name in guards)]
+    header = ["", *(named_guard(name).title for name in guards)]
     compared = table(header, rows, numeric=range(1, len(header)), kind="compare")
     return join(el("h3", title), compared) if title else compared
 
@@ -144,7 +145,7 @@ def _broken(simulation: Record | None) -> Html | None:
         rows.append((f"seed {drive['seed']}, agent {drive['agent']}", rules, cause_words(drive)))
     more = len(broken) - MOST_BROKEN
     note = el("p", f"{more} more are in eval/simulate.json.") if more > 0 else None
-    title = f"Drives that violate a requirement, {guard_words(guard).beside}"
+    title = f"Drives that violate a requirement, {named_guard(guard).beside}"
     return join(el("h3", title), table(("drive", "violated", "why"), rows), note)
 
 

@@ -13,14 +13,17 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from stlc.controller.guard.kind import named_guard
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.escape import operand, shell
+from stlc.registry import GUARDS
 from stlc.rundir import SYSTEM, RunDir
 from stlc.signature import Signature
 from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_text
-from stlc.view.words import GUARDS, guard_words, share
 from stlc.view.words import seconds as duration
+from stlc.view.words import share
 
 Level: TypeAlias = Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
 
@@ -103,26 +106,27 @@ class Commands:
     report: str
 
     @classmethod
-    def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = "paper") -> Commands:
+    def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = PAPER.name) -> Commands:
         """Return the commands for the run named `run`.
 
         Args:
             run: name of the run.
             newest: whether it is the newest run. The command `simulate` then omits its name.
             start: program that the training command begins with.
-            guard: the recommended guard, such as `paper`.
+            guard: name of the recommended guard.
         """
         run = shell((operand(run),))
-        simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, GUARDS[guard].option)))
+        option = named_guard(guard).option
+        simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, option)))
         return cls(f"{start} train --resume {run}", simulate, f"stlc report {run}")
 
 
 def recommended(record: Mapping[str, Any]) -> str:
-    """The guard that `run.json` recommends; `paper` if there are no closed-loop results."""
+    """Name of the guard that `run.json` recommends; of the paper's if there are no closed-loop results."""
     result = record.get("result")
     driven = result.get("closed_loop") if isinstance(result, Mapping) else None
     guard = driven.get("recommended") if isinstance(driven, Mapping) else None
-    return str(guard) if guard in GUARDS else "paper"
+    return str(guard) if guard in GUARDS else PAPER.name
 
 
 def driven_lines(result: Mapping[str, Any]) -> list[str]:
@@ -143,18 +147,20 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
         best = found.get("recommended")
         first = sorted(guards, key=lambda each: each.get("guard") != best)
         lines = [_driven_line(each) for each in first]
-        left_out = [guard_words(name).noun for name in found.get("left_out") or ()]
+        left_out = [named_guard(name).noun for name in found.get("left_out") or ()]
         if left_out:
             lines.append(f"too few drives in the time to compare {' and '.join(left_out)}")
         if len({each["drives"] for each in guards}) > 1:
             return lines  # a record of an older version, which counted different starts
-        if any(each["guard"] == "none" for each in guards):
-            lines += [_changed_line(each) for each in first if each["guard"] != "none"]
+        acting = [each for each in first if named_guard(each["guard"]).intervenes]
+        if len(acting) < len(guards):
+            lines += map(_changed_line, acting)
         if best in GUARDS:
-            option = " ".join(filter(None, ("stlc simulate", GUARDS[str(best)].option)))
+            guard = named_guard(best)
+            command = f"stlc simulate {guard.option}".rstrip()
             better = max(each["share"] for each in guards) > first[0]["share"]
             why = ", the cheapest within 2 % of the best" if better else ""
-            lines.append(f"recommended after these drives: {GUARDS[str(best)].noun} (`{option}`){why}")
+            lines.append(f"recommended after these drives: {guard.noun} (`{command}`){why}")
         return lines
     except (KeyError, TypeError, ValueError):  # a damaged or foreign record
         return []
@@ -168,13 +174,13 @@ def _driven_line(each: Mapping[str, Any]) -> str:
     low, high = each["interval"]
     safe = "" if each.get("safe") is None else f", {share(each['safe'])} safe"
     part = f"{share(each['share'])}, 95 % interval {100 * low:.1f} to {share(high)}"
-    guard = guard_words(each["guard"]).beside
+    guard = named_guard(each["guard"]).beside
     return f"{each['satisfied']:,} of {each['drives']:,} drives satisfied ({part}) {guard}{safe}"
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
     """Line on the verdicts that a guard changes: drives that are satisfied only with it, or only without."""
-    changed, noun = each["gained"] + each["lost"], guard_words(each["guard"]).noun
+    changed, noun = each["gained"] + each["lost"], named_guard(each["guard"]).noun
     if not changed:
         return f"{noun} changes no verdict"
     return (

@@ -13,6 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from stlc.controller.guard.kind import named_guard
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.escape import operand, shell
 from stlc.files import write_atomic
 from stlc.rundir import RunDir
@@ -42,7 +44,6 @@ from stlc.view.player import player_section, script
 from stlc.view.recorded import map_section, recorded_section
 from stlc.view.words import (
     count,
-    guard_words,
     interval,
     number,
     satisfied_sentence,
@@ -295,7 +296,7 @@ def _hashed(record: Mapping[str, Any], what: str) -> Child:
 
 
 USUAL_LIMIT = 0.1
-"""Default time limit of a decision of the full guard, in seconds."""
+"""Default time limit of a decision of timed guards, in seconds."""
 _TITLES = {
     "spec.stl": "The specification",
     "system.yaml": "The system",
@@ -368,11 +369,11 @@ def _set(record: Mapping[str, Any]) -> list[str]:
 def _simulate(contents: RunContents) -> list[str]:
     """Return the command that repeats the latest closed-loop simulation, as a list of words.
 
-    If there was none, the command simulates the run with the guard "paper".
+    If there was none, the command simulates the run with the paper's guard.
     """
     done = contents.simulation or {}
-    guard = list(done.get("guards") or {"paper": {}})[-1]
-    words = ["stlc", "simulate", contents.run.shown, *guard_words(guard).option.split()]
+    guard = list(done.get("guards") or (PAPER.name,))[-1]
+    words = ["stlc", "simulate", contents.run.shown, *named_guard(guard).option.split()]
     if done.get("scenario"):
         words += ["--scenario", str(done["scenario"])]
     seeds = list(done.get("seeds") or range(10))

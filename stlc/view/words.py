@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
+
+from stlc.controller.guard.kind import named_guard
+from stlc.registry import GUARDS
 
 
 def share(value: float | None, digits: int = 1) -> str:
@@ -62,42 +64,6 @@ def listing(names: Sequence[str]) -> str:
     return ", ".join(names[:12]) + (f" and {more:,} more" if more > 0 else "")
 
 
-@dataclass(frozen=True, slots=True)
-class GuardWords:
-    """Words that name a guard in texts.
-
-    Attributes:
-        title: heading of the guard's column in a table.
-        option: option of `stlc simulate` that selects the guard; "" for no guard.
-    """
-
-    title: str
-    option: str
-
-    @property
-    def noun(self) -> str:
-        """Name of the guard with its article: `the full guard`, `no guard`."""
-        return f"the {self.title}" if self.option else self.title
-
-    @property
-    def beside(self) -> str:
-        """Name of the guard with its preposition: `with the full guard`, `without a guard`."""
-        return f"with {self.noun}" if self.option else "without a guard"
-
-
-GUARDS = {
-    "none": GuardWords("no guard", ""),
-    "paper": GuardWords("paper's guard", "--backup"),
-    "full": GuardWords("full guard", "--guard full"),
-    "certified": GuardWords("certified guard", "--guard certified"),
-}
-
-
-def guard_words(name: object) -> GuardWords:
-    """Names of the guard `name`; for an unknown guard, names derived from `name`."""
-    return GUARDS.get(str(name)) or GuardWords(f"guard {name}", f"--guard {name}")
-
-
 def labelled(name: str, unit: str) -> str:
     """Format a name with its unit, `v [m/s]`, for axes; only the name if there is no unit."""
     return f"{name} [{unit}]" if unit not in ("", "1") else name
@@ -137,8 +103,8 @@ def satisfied_sentence(simulation: Mapping[str, Any]) -> str:
         words = f"In scenario {scenario}, {words}"
     if drives["undecided"]:
         words += f", {drives['undecided']:,} ended too early to say"
-    if name != "none" and "none" in each:
-        words += f"; without the guard {each['none']['obeyed']:,}"
+    if named_guard(name).intervenes and GUARDS.default in each:
+        words += f"; without the guard {each[GUARDS.default]['obeyed']:,}"
     return words
 
 

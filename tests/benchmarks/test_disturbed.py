@@ -28,6 +28,7 @@ from benchmarks.tables.schema import document_schema
 from benchmarks.tables.worlds import section as worlds_section
 from benchmarks.tables.worlds import wholly_viable
 from stlc.cli.framework.app import main
+from stlc.controller.guard import kind
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[2]
@@ -104,7 +105,7 @@ def test_what_was_driven_is_kept(
     assert results(tmp_path) == first
 
     with monkeypatch.context() as patch:
-        patch.setattr(deployments, "GUARD_VERSION", deployments.GUARD_VERSION + 1)
+        patch.setattr(kind, "GUARD_VERSION", kind.GUARD_VERSION + 1)
         assert bench(run, tmp_path, "--scenarios", "noise", "--guards", "none") == 0
     assert capsys.readouterr().err.count("deploying") == 1  # by another guard
     assert bench(run, tmp_path, "--scenarios", "noise", "--guards", "none", "--steps", "6") == 0

@@ -146,7 +146,7 @@ def test_a_drive_that_violates_an_assumption_violates_no_requirement():
     [
         (["falsify", "cart.stl"], "has controls (`u`)"),
         (["falsify", "latest", "--require", "nea"], "did you mean `near`?"),
-        (["falsify", "latest", "--guard", "some"], "there is no guard `some`"),
+        (["falsify", "latest", "--guard", "some"], "unknown guard `some`"),
         (["falsify", "latest", "--system", "cart.yaml"], "`--system` is for a specification"),
         (["falsify", "cart.stl", "--agents", "2"], "`--agents` is for a run"),
         (["falsify", "latest", "--replay", "none.json"], "there is no file `none.json`"),

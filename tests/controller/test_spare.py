@@ -10,7 +10,7 @@ from torch import Tensor
 
 from stlc.compile.ir.nodes import Const, Predicate, Signal
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
-from stlc.controller.guard.candidates import Limits, Mode
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.margins import tightened, with_margins
 from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_until
@@ -56,7 +56,7 @@ class Onward(Policy):
         return plan
 
 
-def driven(mode: Mode, margin: float, scenario: str = "") -> DeploymentRecording:
+def driven(mode: str, margin: float, scenario: str = "") -> DeploymentRecording:
     task = task_of(scenario)
     guard = Guard(task, Onward(task), mode, limits=Limits(margin={"clear": margin}, seconds=None))
     recorder = Recorder(8)
@@ -91,7 +91,7 @@ def test_time_tests_stay_and_negated_predicates_are_tightened_too() -> None:
 
 
 @pytest.mark.parametrize("mode", ["paper", "full"])
-def test_a_guard_keeps_away_and_tells_the_plain_verdict(mode: Mode) -> None:
+def test_a_guard_keeps_away_and_tells_the_plain_verdict(mode: str) -> None:
     task, x = task_of(), torch.tensor([[1.0, 0.0]], dtype=torch.float64)
     policy = Onward(task)
     plain = Guard(task, policy, mode, limits=Limits(seconds=None)).decide(x)

@@ -9,6 +9,7 @@ import torch
 from helpers.exported import run_of
 
 from stlc.controller.guard.candidates import grid_of
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.export import programs
 from stlc.export.programs import Guarding
@@ -22,7 +23,7 @@ def test_every_rule_of_the_backup(at_once: int, tmp_path: Path, monkeypatch: pyt
     x = run.task.sample(60, seed=5, dtype=torch.float64)
     plan = run.policy.plan(x)
     plan[7] = torch.nan
-    wanted = StagedSearch(run.task, run.policy, "paper").search(x, plan)
+    wanted = StagedSearch(run.task, run.policy, PAPER).search(x, plan)
     assert {1, 2} <= set(wanted.source.tolist())
     assert {1, 2, 3} <= set(wanted.prefix_length.tolist())
     with torch.no_grad():
@@ -40,7 +41,7 @@ def test_a_grid_without_lengths_hands_the_plan_back(tmp_path: Path) -> None:
     x = run.task.sample(3, seed=5, dtype=torch.float64)
     plan = run.policy.plan(x)
     grid = PrefixGrid(grid_of(run.task).values, (), 10)
-    wanted = StagedSearch(run.task, run.policy, "paper", grid=grid).search(x, plan)
+    wanted = StagedSearch(run.task, run.policy, PAPER, grid=grid).search(x, plan)
     with torch.no_grad():
         mine, rho, *_, source, t0 = Guarding(run.task, run.network, grid)(x, plan)
     assert torch.equal(mine, wanted.plans)

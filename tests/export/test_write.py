@@ -18,6 +18,7 @@ from stlc import native
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
@@ -153,7 +154,7 @@ def test_the_torch_program_needs_nothing_of_stlc(tmp_path: Path) -> None:
         torch.testing.assert_close(mine, plan, rtol=0.0, atol=1e-5)
         torch.testing.assert_close(rho, judged.rho, rtol=0.0, atol=1e-5)
         torch.testing.assert_close(each, judged.requirements, rtol=0.0, atol=1e-5)
-        wanted = StagedSearch(run.task, run.policy, "paper").search(x, plan)
+        wanted = StagedSearch(run.task, run.policy, PAPER).search(x, plan)
         mine, *_, source, t0 = backup(x, plan)
         torch.testing.assert_close(mine, wanted.plans, rtol=0.0, atol=1e-5)
         assert (source.tolist(), t0.tolist()) == (wanted.source.tolist(), wanted.prefix_length.tolist())

@@ -39,7 +39,7 @@ from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.escape import file_part, operand, shell, visible
 from stlc.files import find_spec, of_run, read_source, write_atomic
 from stlc.foreign import driving
-from stlc.registry import guard_named
+from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
     from stlc.assurance.campaign import Campaign, CertificateVerification, Progress, Subject
@@ -56,7 +56,7 @@ MOST_SHOWN = 5
 class Driving:
     """Options on how the policy is deployed."""
 
-    guard: GuardOption = "none"
+    guard: GuardOption = GUARDS.default
     time_limit: TimeLimitOption = None
     margin: MarginOption = None
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="A scenario of the system.")] = None
@@ -237,7 +237,7 @@ class _Chosen:
         from stlc.controller.training.run import Run
 
         how = self.how
-        mode = guard_named(how.guard)
+        mode = GUARDS.get(how.guard).name
         opened = Run.open(
             self.name or "latest", root=self.runs, overrides=self.overrides, scenario=how.scenario
         )
@@ -325,7 +325,7 @@ def _lines(result: Certificate | DrawnCertificate, path: str) -> Iterator[str]:
 
 
 def _title(result: Certificate | DrawnCertificate) -> str:
-    from stlc.view.words import guard_words
+    from stlc.controller.guard.kind import named_guard
 
     overall = result["overall"]
     if "kind" in result:
@@ -337,7 +337,7 @@ def _title(result: Certificate | DrawnCertificate) -> str:
     size = f"{overall['drives'] // per_seed} worlds x {agents} agent{'s' * (agents > 1)} x {steps} steps"
     if result["unit"] == "drive":
         size = f"{overall['drives']} drives x {steps} steps"
-    title = guard_words(conditions["guard"]).title
+    title = named_guard(conditions["guard"]).title
     return " · ".join((result["spec"], f"run {Path(result['run']).name}", title, *scenario, size))
 
 

@@ -37,7 +37,7 @@ from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, MissingError, SpecError, usage
 from stlc.files import read_source
-from stlc.registry import closest, guard_named
+from stlc.registry import GUARDS, closest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -95,7 +95,7 @@ def falsify(
     random: Annotated[
         bool, typer.Option("--random", help="Draw from the declared distributions only, as a baseline.")
     ] = False,
-    guard: GuardOption = "none",
+    guard: GuardOption = GUARDS.default,
     agents: Annotated[int | None, typer.Option(min=1, help="Agents in each world of a run.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each drive of a run.")] = None,
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="Scenario of a run.")] = None,
@@ -220,7 +220,7 @@ class _Target:
         test = run.task.system.decl.test
         size = self.agents or test.agents, self.steps or test.steps
         setting = Setting((self.seed,), *size, test.replan, limit=None)  # a limit of time cannot be replayed
-        return DriveSimulator(run, guard_named(self.guard), setting)
+        return DriveSimulator(run, GUARDS.get(self.guard).name, setting)
 
     def _black_box(self, plant: Path, overrides: Mapping[str, str], jobs: int) -> PlantSimulator:
         from stlc.assurance.plant_simulator import PlantSimulator
@@ -413,7 +413,7 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
     stored = _stored(path)
     given = stored["settings"]
     again = _Target(
-        *(target.name, target.system, target.plant, str(given.get("guard", "none"))),
+        *(target.name, target.system, target.plant, str(given.get("guard", GUARDS.default))),
         *(_optional(given.get("agents")), _optional(given.get("steps"))),
         None if given.get("scenario") is None else str(given["scenario"]),
         _optional(given.get("seed")) or 0,

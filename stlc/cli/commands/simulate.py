@@ -35,8 +35,9 @@ from stlc.cli.framework.options import (
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.diagnostics import Diagnostic, RunError, usage
-from stlc.registry import GUARDS, PLANNERS, guard_named
+from stlc.registry import GUARDS, PLANNERS
 from stlc.units import time_text
 
 if TYPE_CHECKING:
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import Setting
     from stlc.controller.evaluation.deployment import Deployment
     from stlc.controller.evaluation.rules import Rules
-    from stlc.controller.guard.candidates import Mode
     from stlc.controller.guard.margins import MarginRequest
     from stlc.controller.training.config import PlannerChoice
     from stlc.controller.training.run import Run
@@ -56,6 +56,8 @@ ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"
 LONG = 10.0
 """Seconds of drawing from which on a remark says how to do without."""
+EACH = ", ".join(f"`{name}` {guard.help}" for name, guard in GUARDS.loaded().items() if guard.help)
+"""Help of the guards that have one, such as "`full` also repairs plans"."""
 
 
 @command(
@@ -78,7 +80,7 @@ def simulate(
         str | None,
         typer.Option(
             metavar="|".join(GUARDS),
-            help="Guard, by default none; `full` also repairs plans, `certified` also bounds errors.",
+            help=f"Guard, by default {GUARDS.default}; {EACH}.",
         ),
     ] = None,
     time_limit: TimeLimitOption = None,
@@ -192,7 +194,7 @@ def simulate(
     overrides = parse_overrides(set_)
     run = _run_of(run, _planner(method, option, budget, system), system, overrides, runs)
     opened = Run.open(run, root=runs, overrides=overrides)
-    if chosen != "none":
+    if GUARDS.get(chosen).intervenes:
         require_controls(opened.task, "a guard")
     decl = opened.task.system.decl
     test = decl.test
@@ -303,7 +305,7 @@ class _Order:
     """Options of a simulation, as parsed from the command line."""
 
     run: Run
-    guard: Mode
+    guard: str
     setting: Setting
     record: Path | None
     live: bool
@@ -323,8 +325,8 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
     """
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
+    from stlc.controller.guard.kind import named_guard
     from stlc.controller.training.run import Run
-    from stlc.view.words import guard_words
 
     run, found = order.run, {}
     if name is not None:
@@ -332,8 +334,8 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
     rules = rules_of(run)
     margin = order.requested.of(run.task, run.policy, order.guard, order.setting.replan)
     order = replace(order, setting=replace(order.setting, margin=margin))
-    for mode in dict.fromkeys(("none", order.guard)):
-        title = " · ".join((run.task.compiled.name, guard_words(mode).title, *([name] if name else [])))
+    for mode in dict.fromkeys((GUARDS.default, order.guard)):
+        title = " · ".join((run.task.compiled.name, named_guard(mode).title, *([name] if name else [])))
         guarded = mode == order.guard
         watching = Watching(title, order.live, order.margins if writes and guarded else None)
         try:
@@ -379,26 +381,26 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
     return {name: find_scenario(decl, name) for name in DISTURBED} if scenario == USUAL else {}
 
 
-def _satisfied(document: Simulation, guard: Mode) -> float:
+def _satisfied(document: Simulation, guard: str) -> float:
     """Least share, over all scenarios, of the drives with the guard `guard` that obey every requirement."""
     guards = [document["guards"], *(each["guards"] for each in document.get("scenarios", {}).values())]
     runs = [each[guard]["drives"] for each in guards]
     return min(float(each["obeyed"] / each["count"]) for each in runs)
 
 
-def _bounds(document: Simulation, guard: Mode) -> dict[str, Assurance]:
+def _bounds(document: Simulation, guard: str) -> dict[str, Assurance]:
     """Bounds on the drives with a guard: scenario -> bounds; empty without `--certify`."""
     each = {"": document["guards"], **{k: v["guards"] for k, v in document.get("scenarios", {}).items()}}
     return {name: guards[guard]["assurance"] for name, guards in each.items() if "assurance" in guards[guard]}
 
 
-def _bounds_shown(document: Simulation, guard: Mode) -> Iterator[str]:
+def _bounds_shown(document: Simulation, guard: str) -> Iterator[str]:
     for name, record in _bounds(document, guard).items():
         yield f"\n  {name}" if name else ""
         yield from bounds_lines(record)
 
 
-def _certified(document: Simulation, guard: Mode) -> int:
+def _certified(document: Simulation, guard: str) -> int:
     """Exit code of `--certify`: 0 if the share is certified in all scenarios, 1 if refuted in one, else 4."""
     answers = [record["answer"] for record in _bounds(document, guard).values()]
     every = len(answers) == 1 + len(document.get("scenarios", {}))
@@ -426,15 +428,17 @@ def _all(order: _Order, scenarios: Mapping[str, ScenarioDecl]) -> Simulation:
     return document
 
 
-def _guard(backup: bool | None, guard: str | None) -> Mode:
-    named = None if guard is None else guard_named(guard)
-    if backup is not None and guard is not None and backup != (guard == "paper"):
+def _guard(backup: bool | None, guard: str | None) -> str:
+    if guard is None:
+        return PAPER.name if backup else GUARDS.default
+    chosen = GUARDS.get(guard)
+    if backup is not None and backup != (chosen is PAPER):
         option = "--backup" if backup else "--no-backup"
         raise usage(f"`{option}` and `--guard {guard}` contradict each other")
-    return named or ("paper" if backup else "none")
+    return guard
 
 
-def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rules | None) -> Deployment:
+def _deploy(run: Run, order: _Order, mode: str, watching: Watching, rules: Rules | None) -> Deployment:
     """Simulate the policy of `run` with the guard `mode`, and return the results.
 
     `order` contains the options of the simulation, and `watching` those of the progress display. The
@@ -454,7 +458,7 @@ def _deploy(run: Run, order: _Order, mode: Mode, watching: Watching, rules: Rule
         raise (error.__cause__ or error) from None
 
 
-def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rules | None) -> Simulation:
+def _save(run: Run, order: _Order, found: Mapping[str, Deployment], rules: Rules | None) -> Simulation:
     """Write the traces, the scene (data of the animation) and the record of a simulation; return the record.
 
     `found` maps each kind of guard to its results. The trace of the last kind is saved as the main trace.
@@ -467,7 +471,8 @@ def _save(run: Run, order: _Order, found: Mapping[Mode, Deployment], rules: Rule
     last = list(found.values())[-1]
     save_trace_of(run, last.recording, order.setting, order.record, rules=rules)
     save_scene(run.dir.place(SCENE), last.recording.scene)
-    beside = found["none"].recording if "none" in found and len(found) > 1 else None
+    alone = found.get(GUARDS.default)
+    beside = alone.recording if alone is not None and len(found) > 1 else None
     save_unguarded(run, beside, order.setting, rules)
     decl = run.task.system.decl
     world, scenario = decl.test.world, decl.scenario

@@ -2,10 +2,13 @@
 
 from typing import Annotated, Any, Literal, TypeAlias, TypedDict, final
 
-from stlc.registry import GuardName
+from stlc.controller.guard.kind import compared_guards
+from stlc.registry import GUARDS
 
 Num: TypeAlias = float | str
 Count = Annotated[int, 0]
+GuardName = Annotated[str, GUARDS]
+ComparedGuard = Annotated[str, compared_guards()]
 
 
 class ShareStatement(TypedDict):
@@ -310,7 +313,7 @@ class Verified(TypedDict):
 class GuardResult(TypedDict):
     """Drives under one guard after a training; see `stlc.controller.evaluation.closed_loop.Share`."""
 
-    guard: Literal["none", "paper", "full"]
+    guard: ComparedGuard
     drives: int
     satisfied: int
     share: Num
@@ -324,11 +327,11 @@ class GuardResult(TypedDict):
 class ClosedLoopRecord(TypedDict):
     """Closed-loop results of a training; see `stlc.controller.evaluation.closed_loop.ClosedLoop`."""
 
-    recommended: Literal["none", "paper", "full", None]
+    recommended: Annotated[str | None, (*compared_guards(), None)]
     share: Num | None
     interval: list[Num] | None
     guards: list[GuardResult]
-    left_out: list[Literal["none", "paper", "full"]]
+    left_out: list[ComparedGuard]
     seed: int
     steps: int
     judge: str | None

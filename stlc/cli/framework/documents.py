@@ -760,7 +760,8 @@ def schema_of(kind: Any) -> dict[str, Any]:
     if is_typeddict(kind):
         return _object(kind)
     if origin is Annotated:
-        return {**schema_of(args[0]), "minimum": args[1]}
+        what = args[1]
+        return {**schema_of(args[0]), "minimum": what} if isinstance(what, int) else {"enum": list(what)}
     if origin is Literal:
         return {"enum": list(args)}
     if origin is dict:

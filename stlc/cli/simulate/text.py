@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from stlc.controller.guard.kind import named_guard
 from stlc.escape import operand, shell, visible
-from stlc.view.words import guard_words, listing
+from stlc.view.words import listing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -46,11 +47,11 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
         yield f"  the guard asks for a margin: {spared}"
     yield ""
     yield from _drives(document)
-    header = ("", *(guard_words(name).title for name in guards))
+    header = ("", *(named_guard(name).title for name in guards))
     shares = _shares(guards, safe=bool(document.get("safety", True))) if windows else ()
     yield table([*_counts(guards), *_progress(guards), *_times(guards), *shares], header=header)
     for name, guard in guards.items():
-        if name != "none":
+        if named_guard(name).intervenes:
             yield f"  guard acted in {_acted(guard['decisions'])}"
     name, last = list(guards.items())[-1]
     yield from _broken(name, last["drives"], judged="" if document["judge"] else "judged from ")
@@ -109,7 +110,7 @@ def _broken(guard: str, drives: Record, judged: str) -> Iterator[str]:
     """
     from stlc.view.words import cause_words
 
-    violated = f"  violated {guard_words(guard).beside}"
+    violated = f"  violated {named_guard(guard).beside}"
     for each in sorted(drives["broken"], key=lambda each: each["lost"])[:MOST_BROKEN]:
         rules = ", ".join(
             name if time is None else f"{name} ({judged}{time:.3g} s)" for name, time in each["rules"].items()
@@ -149,7 +150,7 @@ def compared(document: Record, *, windows: bool = False) -> Iterator[str]:
 
     guards = list(document["guards"])
     labels = ["satisfied", *(["plan accuracy"] if windows else [])]
-    header = ("scenario", *(f"{guard_words(name).title}: {label}" for name in guards for label in labels))
+    header = ("scenario", *(f"{named_guard(name).title}: {label}" for name in guards for label in labels))
     rows = []
     for name, each in {"none": document, **document["scenarios"]}.items():
         cells: list[str] = []

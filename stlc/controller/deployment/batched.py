@@ -18,7 +18,7 @@ from torch import Tensor
 from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.deployment.tape import Tape
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
-from stlc.controller.guard.candidates import RobustnessMargins
+from stlc.controller.guard.candidates import Limits, RobustnessMargins
 from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.world import Charting, Choosing, Redrawing
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
@@ -41,22 +41,20 @@ class Setting:
     """Options of a deployment.
 
     An agent replans every `replan` steps. It also replans immediately when an exogenous signal (role `env` in
-    the system file) has changed. A guard judges plans at run time and replaces bad ones; "paper", "full"
-    and "certified" are guards.
+    the system file) has changed. A guard judges plans at run time and replaces bad ones.
 
     Attributes:
         seeds: random seeds; each has a world of its own.
         agents: number of agents per seed.
         steps: number of steps.
         replan: replanning period in steps.
-        limit: time limit of a decision of the guards "full" and "certified", in seconds per agent; None: no
-            limit.
+        limit: time limit of a decision of timed guards, in seconds per agent; None: no limit.
         ceiling: number of visited states, over all seeds, for which feasibility is checked. A state counts as
             feasible if the followed plan satisfies the specification, or if a search finds another plan that
             satisfies it.
         margin: name of a safety requirement -> robustness margin by which a plan must satisfy it to be
             accepted by a guard.
-        paper_limit: time limit of a decision of the guard "paper", in seconds per agent; None: no limit.
+        paper_limit: time limit of a decision of the other guards; None: no limit.
         draws: for each seed, a point of the unit cube from which its first random numbers are read instead of
             drawn, (dim,); None: all are drawn.
     """
@@ -70,6 +68,11 @@ class Setting:
     margin: RobustnessMargins = field(default_factory=dict)
     paper_limit: float | None = None
     draws: tuple[NDArray[np.float64], ...] | None = None
+
+    @property
+    def limits(self) -> Limits:
+        """Limits and margins of the guard's decisions."""
+        return Limits(seconds=self.limit, margin=self.margin, paper=self.paper_limit)
 
 
 class Worlds:

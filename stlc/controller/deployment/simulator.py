@@ -198,8 +198,8 @@ class _Pilot:
         All rows replan every `replan` steps. At other steps a row replans for one of two reasons:
 
         - An exogenous signal has changed in its true state `x`.
-        - The rest of its plan is predicted to violate a safety requirement. Only the guards "full" and
-          "certified" predict this, from the measured state `seen`.
+        - The rest of its plan is predicted to violate a safety requirement. Guards that monitor plans predict
+          this, from the measured state `seen`.
 
         If a plan ends before the next regular replanning, the prediction repeats the plan's last action. The
         last sample of a plan is not checked, because a `sweep` predicate judges the motion between two

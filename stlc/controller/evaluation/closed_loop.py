@@ -33,8 +33,9 @@ from stlc.controller.evaluation.rules import (
     rules_of,
     verdict_on_runs,
 )
-from stlc.controller.guard.candidates import Limits, Mode
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
+from stlc.controller.guard.kind import compared_guards
 from stlc.controller.training.config import DRIVES
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
@@ -47,8 +48,8 @@ if TYPE_CHECKING:
 
 SEED = 1 << 40
 """Seed of the first closed-loop runs; those of `simulate` begin at 0."""
-COMPARED: tuple[Mode, ...] = GUARDS[: GUARDS.index("full") + 1]
-"""Guards by increasing cost. The guard "certified" needs a scenario, and training has none."""
+COMPARED = compared_guards()
+"""Guards by increasing cost. One that needs a scenario is none of them: training has none."""
 NARROW = 0.005
 """A guard is simulated no more once the confidence interval of its share has at most this half-width."""
 NEAR = 0.02
@@ -73,7 +74,7 @@ class Share:
         lost: number of runs that violate the mission, and without a guard do not.
     """
 
-    guard: Mode
+    guard: str
     runs: int
     satisfied: int
     safe: int | None
@@ -100,7 +101,7 @@ class Share:
             "share": self.share,
             "interval": list(self.interval),
             "safe": safe,
-            "compared": 0 if self.guard == "none" else self.runs,
+            "compared": self.runs if GUARDS.get(self.guard).intervenes else 0,
             "gained": self.gained,
             "lost": self.lost,
         }
@@ -125,7 +126,7 @@ class ClosedLoop:
     steps: int
     judge: str | None = None
     why: str = ""
-    left_out: tuple[Mode, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def recommended(self) -> Share | None:
@@ -212,7 +213,7 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES) -> Clos
     return ClosedLoop(shares, test.steps, judge, left_out=trial.left_out(shares))
 
 
-def fresh_share(run: Run, guard: Mode, runs: int) -> Share:
+def fresh_share(run: Run, guard: str, runs: int) -> Share:
     """Simulate at least `runs` runs under one guard, without time limit, from the seeds of `stlc simulate`.
 
     Raises:
@@ -236,14 +237,14 @@ class _Trial:
         self.most, self.seed = most, seed
         self.make = world_type(self.task.system.decl)
         self.test = self.task.system.decl.test
-        self.known: Mapping[Mode, _Known] = {mode: _Known(self.test.agents) for mode in COMPARED}
+        self.known: Mapping[str, _Known] = {mode: _Known(self.test.agents) for mode in COMPARED}
 
     def simulate(self) -> None:
         """Simulate seeds until the time is used up, or until it is clear enough which guard is best."""
         while self.left() > 0.0 and (further := self._next()) is not None:
             self._more(*further)
 
-    def _next(self) -> tuple[Mode, int] | None:
+    def _next(self) -> tuple[str, int] | None:
         """Guard to simulate next and number of seeds; None if no further runs are needed or possible.
 
         At first, guards are simulated once each, from the cheapest one up to the first guard under which all
@@ -282,7 +283,7 @@ class _Trial:
         cost = sum(known.cost for known in guards)
         return int(0.6 * self.left() / cost) if cost else 1
 
-    def _more(self, mode: Mode, count: int) -> None:
+    def _more(self, mode: str, count: int) -> None:
         """Simulate `count` further seeds under the guard `mode` and store their results.
 
         If the first seed takes too long, the number of agents is reduced, also that of further seeds under
@@ -306,7 +307,7 @@ class _Trial:
         known.cost = (whole - self.left()) / count
         known.seeds += count
 
-    def _simulated(self, mode: Mode, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
+    def _simulated(self, mode: str, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:
         """Simulate `seeds` with `agents` agents each under the guard `mode` and return the recording.
 
         Raises:
@@ -350,13 +351,13 @@ class _Trial:
 
         A guard with fewer than `LEAST` runs from the initial states of the cheaper ones is left out.
         """
-        compared: dict[Mode, _Known] = {}
+        compared: dict[str, _Known] = {}
         starts: set[tuple[int, int]] = set()
         for mode, known in self.known.items():
             common = starts & known.found.keys() if compared else set(known.found)
             if common and (not compared or len(common) >= LEAST):
                 compared[mode], starts = known, common
-        free = compared["none"].found if "none" in compared else {}
+        free = compared[GUARDS.default].found if GUARDS.default in compared else {}
         shares = []
         for mode, known in compared.items():
             safe = [known.found[start][1] for start in starts]
@@ -373,7 +374,7 @@ class _Trial:
             )
         return tuple(shares)
 
-    def left_out(self, shares: Sequence[Share]) -> tuple[Mode, ...]:
+    def left_out(self, shares: Sequence[Share]) -> tuple[str, ...]:
         """Guards that are not among `shares` although they are cheaper than a guard without a failure."""
         perfect = next((share.guard for share in shares if share.share == 1.0), None)
         wanted = COMPARED if perfect is None else COMPARED[: COMPARED.index(perfect)]

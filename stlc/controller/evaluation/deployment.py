@@ -18,7 +18,7 @@ from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.metrics import measure
 from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, judge_runs_by_plans, runs_json
 from stlc.controller.evaluation.stats import MeanInterval
-from stlc.controller.guard.candidates import SOURCES, Limits, Mode
+from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import Guard
 from stlc.controller.world import world_type
@@ -73,7 +73,7 @@ class Deployment:
         runs: verdicts on the closed-loop runs.
     """
 
-    guard: Mode
+    guard: str
     recording: DeploymentRecording
     metrics: Mapping[str, MeanInterval]
     decisions: Mapping[str, float]
@@ -97,7 +97,7 @@ def deploy(
     task: Task,
     policy: Policy,
     setting: Setting,
-    guard: Mode,
+    guard: str,
     *,
     watch: Watch | None = None,
     rules: Rules | None = None,
@@ -113,8 +113,7 @@ def deploy(
         SystemFileError: S206, the world cannot be loaded.
     """
     make = world_type(task.system.decl)
-    limits = Limits(seconds=setting.limit, margin=setting.margin, paper=setting.paper_limit)
-    guarded = Guard(task, policy, guard, limits=limits)
+    guarded = Guard(task, policy, guard, limits=setting.limits)
     recorder = Recorder(setting.agents)
     try:
         simulate(guarded, make, setting, recorder, watch)
@@ -146,7 +145,7 @@ def judged(
         else judge_runs(rules, guard.task, recording, executed.viable)
     )
     return Deployment(
-        guard.mode,
+        guard.kind.name,
         recording,
         measure(recording, executed, feasible_states(guard.task, recording, ceiling)),
         decided(recording),
@@ -218,7 +217,7 @@ def latency(guard: Guard, recording: DeploymentRecording) -> DecisionLatency:
 
 
 def as_json(
-    deployments: Mapping[Mode, Deployment], setting: Setting, facts: Mapping[str, Any]
+    deployments: Mapping[str, Deployment], setting: Setting, facts: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Content of `eval/simulate.json`; `facts`: further entries at its top level."""
     return {

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.registry import GuardName
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 
     from stlc.controller.problem.task import Task
 
-Mode: TypeAlias = GuardName
 RobustnessMargins: TypeAlias = Mapping[str, float]
 """Safety requirement -> required robustness margin, in its unit; 0 for requirements left out."""
 
@@ -207,28 +205,26 @@ class Deadline:
 class Limits:
     """Computational limits of a decision.
 
-    The guard "paper" searches for plans as Meng and Fan (2023) do. The guard "full" uses more search methods,
-    and so does the guard "certified", which has the limits of the guard "full". Each method is called a
-    stage. A prefix is a sequence of first actions that a stage tries; the policy plans the rest.
+    A guard searches by stages. A prefix is a sequence of first actions that a stage tries; the policy plans
+    the rest.
 
     Attributes:
-        seconds: time limit of the guard "full" per agent, after which the best plan found is taken. None: no
+        seconds: time limit of timed guards per agent, after which the best plan found is taken. None: no
             limit.
-        tries: number of plans that a local search in the guard "full" judges per starting plan.
-        prefixes: maximum number of prefixes of one length in the stage "prefix shooting" of the guard "full";
-            lengths with more prefixes are skipped. The stage runs only if no stage before it found a safe
-            plan.
+        tries: number of plans that the stage "local search" judges per starting plan.
+        prefixes: maximum number of prefixes of one length in the stage "prefix shooting" where other stages
+            run before it; lengths with more prefixes are skipped.
         drawn: maximum number of prefixes of one length in the stage "sampled shooting"; if there are more, a
             random sample is used.
         places: number of plans of the stage "sampled shooting", the best ones, from which local searches
             start.
         again: number of plans that each of these local searches judges.
-        rescue: whether the guard "full" also searches for a safe plan without the policy. It does so only if
-            no earlier stage found a safe plan; the search ignores all requirements that are not tagged
+        rescue: whether the stage "restarts" also searches for a safe plan without the policy. It does so only
+            if no earlier stage found a safe plan; the search ignores all requirements that are not tagged
             `@safety`.
         margin: name of a safety requirement -> robustness margin in the unit of the requirement. Guards
             accept a plan only if it satisfies the requirement by this margin.
-        paper: time limit of the guard "paper" in seconds per agent; None: no limit.
+        paper: time limit of the other guards, in seconds per agent; None: no limit.
     """
 
     seconds: float | None = 0.1

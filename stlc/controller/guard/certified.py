@@ -1,4 +1,4 @@
-"""Search of the guard "certified": plans that are safe for all errors within the bounds of the scenario.
+"""Search for certified plans: those that are safe for all errors within the bounds of the scenario.
 
 A plan is certified if all states that it can lead to under errors within the bounds are safe, over the whole
 plan (`stlc.controller.verification.tubes`). Then the rest of the plan is certified at the next decision, too,
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, Limits, best, finite, rank
+from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, best, finite, rank
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
 from stlc.controller.streams import seeded
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from stlc.controller.guard.candidates import RobustnessMargins
+    from stlc.controller.guard.kind import GuardInputs, GuardKind
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.controller.verification.tubes import Tube
-    from stlc.runtime.prefixes import PrefixGrid
 
 STARTS = 500
 """States from which the margins of a search are measured."""
@@ -117,41 +117,44 @@ def _growth(tube: Tube, names: Iterable[str]) -> float:
 
 
 class CertifiedSearch(GuardSearch):
-    """Search of the guard "certified": other proposals of the policy, then the stages of the guard "full".
+    """Search of a guard for certified plans: other proposals of the policy, then the stages of the guard.
 
     If no certified plan is found, a plan is taken that is certified until the next decision, else one that is
     safe on the model; of several, the one with the greatest robustness that is guaranteed in this weaker
-    sense. Without such a plan, the one of the guard "full" is taken.
+    sense. Without such a plan, the one that the stages find is taken.
+
+    The stages search on a task with margins for which plans on the model are likely to be certified.
 
     Args:
-        task: specification that accepted plans satisfy on the model, and system.
-        sought: the task with margins, for which the stages search.
-        policy: policy that proposes and completes plans.
-        certifier: check of plans.
-        grid: control values and lengths of prefixes; by default those of the system file.
-        limits: computational limits of a decision.
+        given: task with the scenario, policy and limits.
+        guard: guard whose stages run.
+
+    Raises:
+        UsageError: U101, there is nothing to certify, or the scenario has no bounds; see `Certifier`.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        sought: Task,
-        policy: Policy,
-        certifier: Certifier,
-        *,
-        grid: PrefixGrid | None = None,
-        limits: Limits | None = None,
-    ) -> None:
-        self.task, self.limits = task, limits or Limits()
-        self._policy, self._certifier = policy, certifier
+    def __init__(self, given: GuardInputs, guard: GuardKind) -> None:
+        self._certifier = Certifier(given.task)
+        sought = self._certifier.sought(given.policy, given.limits.margin)
+        self.task, self.policy, self.limits = given.strict, given.policy.for_task(sought), given.limits
         self._stages: GuardSearch
-        if sought is task:
-            self._stages = StagedSearch(task, policy, "full", grid=grid, limits=self.limits)
+        if sought is self.task:
+            self._stages = StagedSearch(sought, self.policy, guard, grid=given.grid, limits=self.limits)
         else:
-            self._stages = RelaxedSearch(task, sought, policy, grid=grid, limits=self.limits)
+            self._stages = RelaxedSearch(
+                self.task, sought, self.policy, guard, grid=given.grid, limits=self.limits
+            )
+
+    def passes(self, x: Tensor, found: Candidates) -> Tensor:
+        """Mask of the agents whose plan in `found` satisfies the specification and is certified."""
+        passes = found.satisfies
+        rows = passes.nonzero()[:, 0]
+        if len(rows):
+            passes[rows] = self._certifier.guaranteed(x[rows], found.plans[rows]) >= -TOLERANCE
+        return passes
 
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
-        others = finite(self._policy.candidates(x).to(x.dtype).flatten(0, 1), self.task)
+        others = finite(self.policy.candidates(x).to(x.dtype).flatten(0, 1), self.task)
         others = others.view(len(x), -1, *plan.shape[1:])
         pool = [plan[:, None], others] if previous is None else [plan[:, None], others, previous[:, None]]
         found, tier = self._chosen(x, torch.cat(pool, 1))

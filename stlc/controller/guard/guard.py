@@ -9,20 +9,18 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.guard.candidates import Candidates, Limits, Mode, finite
-from stlc.controller.guard.certified import CertifiedSearch, Certifier
+from stlc.controller.guard.candidates import Candidates, Limits, finite
+from stlc.controller.guard.kind import GuardInputs
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
-from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
 from stlc.controller.problem.task import rank
+from stlc.registry import GUARDS
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import PlanVerdicts, Task
-
-GUARD_VERSION = 1
-"""Version of the guard's decisions; benchmarks rerun results of older versions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,45 +82,30 @@ class Guard:
     Args:
         task: specification and system.
         policy: proposes plans.
-        mode: method that replaces a rejected plan. "paper": the backup policy of Meng and Fan (2023), which
-            tries sampled first actions and lets the policy plan the rest. "full": the stages of
-            `stlc.controller.guard.stages`. "certified": these stages, and the check in
-            `stlc.controller.guard.certified`, which a plan passes only if it is safe for all errors within
-            the bounds of the task's scenario. "none": plans are judged but not replaced.
+        guard: name of the guard, one of `stlc.registry.GUARDS`; by default the backup policy of Meng and Fan
+            (2023).
         grid: control values of the backup policy; by default those of the system file.
         limits: computational limits and robustness margins of a decision. A margin changes which plans are
             accepted; reported robustness and verdicts are those of the task without margin.
 
     Raises:
-        UsageError: U101, the mode is "certified", and there is nothing to certify or the scenario has no
-            bounds; see `Certifier`.
+        UsageError: U101, there is no such guard, or the task lacks what the guard needs.
     """
 
     def __init__(
         self,
         task: Task,
         policy: Policy,
-        mode: Mode = "paper",
+        guard: str = PAPER.name,
         *,
         grid: PrefixGrid | None = None,
         limits: Limits | None = None,
     ) -> None:
-        self.task, self.mode = task, mode
-        margin = {} if mode == "none" or limits is None else limits.margin
-        self.strict = sought = with_margins(task, margin)
-        self.certifier: Certifier | None = None
-        self.backup: GuardSearch | None = None
-        if mode == "certified":
-            self.certifier = Certifier(task)
-            sought = self.certifier.sought(policy, margin)
-        self.policy = policy.for_task(sought)  # it selects among its plans with the margin
-        if self.certifier is not None:
-            given = self.strict, sought, self.policy, self.certifier
-            self.backup = CertifiedSearch(*given, grid=grid, limits=limits)
-        elif mode == "full" and self.strict is not task and limits is not None:
-            self.backup = RelaxedSearch(task, self.strict, self.policy, grid=grid, limits=limits)
-        elif mode != "none":
-            self.backup = StagedSearch(self.strict, self.policy, mode, grid=grid, limits=limits)
+        self.task, self.kind, limits = task, GUARDS.get(guard), limits or Limits()
+        self.strict = with_margins(task, limits.margin if self.kind.intervenes else {})
+        given = GuardInputs(task, self.strict, policy, grid, limits)
+        self.backup = self.kind.search(given) if self.kind.intervenes else None
+        self.policy = policy.for_task(task) if self.backup is None else self.backup.policy
 
     @torch.no_grad()
     def decide(self, x: Tensor, previous: GuardDecision | None = None) -> GuardDecision:
@@ -138,18 +121,19 @@ class Guard:
             previous: remainder of the previous decision (see `GuardDecision.later`); None at first.
 
         Returns:
-            The decision. With mode "none", even a plan that is not finite is followed; its robustness is
-            -inf.
+            The decision. If the guard does not intervene, even a plan that is not finite is followed; its
+            robustness is -inf.
         """
         x = x.to(torch.float64)
         fresh, judged = self.policy.plan_judged(x)
         if self.policy.task is not self.strict:
             judged = self.strict.judge(x, fresh)
         found = self._with_previous(x, previous, fresh, judged)
-        failing = torch.nonzero(~self._passes(x, found)).squeeze(1)
-        if self.backup is not None and len(failing):
-            rest_plans = None if previous is None else previous.plan[failing]
-            found.put(failing, self.backup.search(x[failing], fresh[failing], rest_plans))
+        if self.backup is not None:
+            failing = torch.nonzero(~self.backup.passes(x, found)).squeeze(1)
+            if len(failing):
+                rest_plans = None if previous is None else previous.plan[failing]
+                found.put(failing, self.backup.search(x[failing], fresh[failing], rest_plans))
         decision = GuardDecision(
             found.plans[:, 0],
             found.plans,
@@ -161,14 +145,6 @@ class Guard:
             fresh,
         )
         return decision if self.strict is self.task else self._plainly(decision, x, fresh)
-
-    def _passes(self, x: Tensor, found: Candidates) -> Tensor:
-        """Mask of the agents whose plan in `found` is followed without a search, (agents,)."""
-        passes = found.satisfies
-        rows = passes.nonzero()[:, 0]
-        if self.certifier is not None and len(rows):
-            passes[rows] = self.certifier.guaranteed(x[rows], found.plans[rows]) >= -TOLERANCE
-        return passes
 
     def _plainly(self, decision: GuardDecision, x: Tensor, fresh: Tensor) -> GuardDecision:
         """Return `decision` with its robustness and verdicts recomputed without robustness margins.
@@ -189,11 +165,10 @@ class Guard:
             steps: number of steps to check, one number or (agents,).
 
         Returns:
-            (agents,) booleans. Only the guards "full" and "certified" check previous plans; all are False
-            under other guards.
+            (agents,) booleans; all are False if the guard does not monitor plans.
         """
         formulas = [rule.formula for rule in self.strict.compiled.safety]
-        if self.mode in ("none", "paper") or not formulas:
+        if not (self.kind.monitors and formulas):
             return torch.zeros(len(x), dtype=torch.bool)
         columns = self.strict.system.rollout_columns(x.to(torch.float64), previous.plan.to(torch.float64))
         return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)

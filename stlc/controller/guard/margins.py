@@ -27,11 +27,11 @@ from stlc.controller.problem.task import Task
 from stlc.controller.streams import seeded
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.model.algebra import add, multiply
-from stlc.registry import closest
+from stlc.registry import GUARDS, closest
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.guard.candidates import Mode, RobustnessMargins
+    from stlc.controller.guard.candidates import RobustnessMargins
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
 
@@ -100,7 +100,8 @@ def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float 
     Args:
         task: specification and system. The errors, disturbances and noise of the scenario cause the loss.
         policy: policy that makes the plans.
-        steps: number of steps between two judgements of the guard; the full guard judges at every step.
+        steps: number of steps between two judgements of the guard; one that monitors plans judges at every
+            step.
         share: share of the plans whose loss is at most the margin; the margin is this quantile of the loss.
 
     Returns:
@@ -158,7 +159,7 @@ class MarginRequest:
     named: Mapping[str, float] = field(default_factory=dict)
     share: float | None = None
 
-    def of(self, task: Task, policy: Policy, mode: Mode, replan: int = 1) -> RobustnessMargins:
+    def of(self, task: Task, policy: Policy, guard: str, replan: int = 1) -> RobustnessMargins:
         """Return the requested margin of each safety requirement, without margins of 0.
 
         The margin of a requirement is its entry in the attribute `named`. If it has none, its calibrated
@@ -168,7 +169,7 @@ class MarginRequest:
         Args:
             task: specification and system.
             policy: policy that makes the plans.
-            mode: name of the guard; with "none" no margin is calibrated.
+            guard: name of the guard; no margin is calibrated for one that does not intervene.
             replan: number of steps between two decisions of the guard.
 
         Raises:
@@ -184,9 +185,9 @@ class MarginRequest:
                     Diagnostic("U101", f"`{name}` is no safety requirement", help=(*help_, listed))
                 )
         found = dict.fromkeys(names, self.every)
-        if self.share is not None and mode != "none":
-            steps = replan if mode == "paper" else 1
-            found |= calibrated_margins(task, policy, steps, self.share)
+        kind = GUARDS.get(guard)
+        if self.share is not None and kind.intervenes:
+            found |= calibrated_margins(task, policy, 1 if kind.monitors else replan, self.share)
         found |= self.named
         return {name: margin for name, margin in found.items() if margin}
 

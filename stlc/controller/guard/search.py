@@ -13,11 +13,12 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import REPAIRED, SAFEST, Candidates, Deadline, Limits, finite, grid_of
 from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.guard.safe_prefix import robustness_until
-from stlc.controller.guard.stages import Rejected, Setup, stages_of
+from stlc.controller.guard.stages import STAGES, Rejected, Setup
 from stlc.controller.guard.stages.gradient_refine import SEED
 from stlc.controller.training.local_search import Searcher
 
 if TYPE_CHECKING:
+    from stlc.controller.guard.kind import GuardKind
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.runtime.prefixes import PrefixGrid
@@ -28,11 +29,20 @@ class GuardSearch(ABC):
 
     Attributes:
         task: specification and system by which plans are judged.
+        policy: policy that proposes plans, and completes those that the search begins.
         limits: computational limits of a decision.
     """
 
     task: Task
+    policy: Policy
     limits: Limits
+
+    def passes(self, x: Tensor, found: Candidates) -> Tensor:  # noqa: ARG002
+        """Mask of the agents whose plan in `found` is followed without a search, (agents,).
+
+        `x`: states, (agents, n) float64.
+        """
+        return found.satisfies
 
     @torch.no_grad()
     def search(self, x: Tensor, plan: Tensor, previous: Tensor | None = None) -> Candidates:
@@ -60,7 +70,7 @@ class StagedSearch(GuardSearch):
     Args:
         task: specification and system.
         policy: policy that completes plans: it plans from the state after a prefix (sampled first actions).
-        guard: name of the guard: "paper" or "full".
+        guard: guard whose stages run.
         grid: control values and lengths of prefixes; by default those of the system file.
         limits: computational limits of a decision; the defaults of `Limits` if None.
     """
@@ -69,16 +79,17 @@ class StagedSearch(GuardSearch):
         self,
         task: Task,
         policy: Policy,
-        guard: str,
+        guard: GuardKind,
         *,
         grid: PrefixGrid | None = None,
         limits: Limits | None = None,
     ) -> None:
-        self.task, self.limits = task, limits or Limits()
-        self.seconds = self.limits.paper if guard == "paper" else self.limits.seconds
+        self.task, self.policy, self.limits = task, policy, limits or Limits()
+        self.seconds = self.limits.seconds if guard.timed else self.limits.paper
         generator = torch.Generator().manual_seed(SEED)
-        setup = Setup(task, policy, grid or grid_of(task), self.limits, guard, generator)
-        self.stages = [stage(setup) for stage in stages_of(guard)]
+        stages = tuple(map(STAGES.get, guard.stages))
+        setup = Setup(task, policy, grid or grid_of(task), self.limits, stages, generator)
+        self.stages = [stage(setup) for stage in stages]
 
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
         deadline = Deadline(self.seconds, len(x))
@@ -97,7 +108,7 @@ class StagedSearch(GuardSearch):
 
 
 class RelaxedSearch(GuardSearch):
-    """Search of the guard "full" with robustness margins of safety requirements.
+    """Search by the stages of a guard, with robustness margins of safety requirements.
 
     If no plan keeps the required margins, the safe plan with the largest margin is taken. Example: a rover is
     already closer to a wall than the margin allows. It may continue at this distance. A plan that keeps the
@@ -111,18 +122,26 @@ class RelaxedSearch(GuardSearch):
         task: specification without margins, and system.
         strict: the task with margins.
         policy: policy that completes plans: it plans from the state after a prefix (sampled first actions).
+        guard: guard whose stages run.
         grid: control values and lengths of prefixes; by default those of the system file.
         limits: computational limits of a decision.
     """
 
     def __init__(
-        self, task: Task, strict: Task, policy: Policy, *, grid: PrefixGrid | None = None, limits: Limits
+        self,
+        task: Task,
+        strict: Task,
+        policy: Policy,
+        guard: GuardKind,
+        *,
+        grid: PrefixGrid | None = None,
+        limits: Limits,
     ) -> None:
         seconds = None if limits.seconds is None else limits.seconds / 2
         half = replace(limits, seconds=seconds)
-        self.task, self.limits = strict, half
-        self._strict = StagedSearch(strict, policy, "full", grid=grid, limits=half)
-        self._plain = StagedSearch(task, policy, "full", grid=grid, limits=half)
+        self.task, self.policy, self.limits = strict, policy, half
+        self._strict = StagedSearch(strict, policy, guard, grid=grid, limits=half)
+        self._plain = StagedSearch(task, policy, guard, grid=grid, limits=half)
         generator = torch.Generator().manual_seed(SEED)
         self._searcher = Searcher(safety_task(strict), generator, enough=0.0)
         self._formulas = [rule.formula for rule in strict.compiled.safety]

@@ -1,12 +1,17 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.documents import misfits
+from helpers.other_guard import PACKAGES, write_guard
 
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
@@ -262,7 +267,7 @@ def test_fail_under_is_the_share_of_drives_that_satisfy_everything(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--guard", "fuller"], "no guard `fuller`"),
+        (["--guard", "fuller"], "unknown guard `fuller`"),
         (["--guard", "full", "--time-limit", "soon"], "not a duration"),
         (["--backup", "--guard", "none"], "contradict"),
         (["--no-backup", "--guard", "paper"], "contradict"),
@@ -399,3 +404,56 @@ def test_a_window_is_refused_before_anything_is_driven(
 ) -> None:
     assert main(["simulate", there.name, *SMALL, "--window"]) == 2
     assert "`--window` shows robots, and `car` has none" in capsys.readouterr().err
+
+
+OTHER = """
+import sys
+from importlib import import_module
+
+for package, folder in zip(sys.argv[1::2], sys.argv[2::2]):
+    import_module(package).__path__.append(folder)
+
+import stlc.controller.evaluation.deployment as deployment
+from stlc.cli.framework.app import main
+from stlc.diagnostics import UsageError
+from stlc.runtime import Controller
+
+deployment.LATENCY_SECONDS = 0.2
+small = "--guard braking --seeds 0 --agents 4 --steps 6 --no-pictures"
+for words in ("simulate --help", f"simulate {small}", "report", "schema certify", "simulate --guard brakng"):
+    print(f"## {words}", flush=True)
+    main(words.split())
+print("## export", flush=True)
+try:
+    Controller(None, "braking")
+except UsageError as error:
+    print(error)
+from benchmarks.tables.disturbed import _title
+print("## table", _title("braking+auto"))
+"""
+
+
+@pytest.mark.apart
+def test_a_guard_of_two_files_is_known_everywhere(there: RunDir, tmp_path: Path) -> None:
+    write_guard(tmp_path)
+    added = [word for folder, package in PACKAGES.items() for word in (package, str(tmp_path / folder))]
+    done = subprocess.run(
+        [sys.executable, "-c", OTHER, *added],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", "NO_COLOR": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    parts = re.split("^## ", done.stdout, flags=re.MULTILINE)[1:]
+    names = ("help", "simulation", "report", "schema", "slip", "export", "table")
+    told = dict(zip(names, parts, strict=True))
+    assert "none|paper|braking|full|certified" in told["help"]
+    assert "`braking` brakes first, `full` also repairs plans" in " ".join(told["help"].split())
+    assert re.search(r"^ +no guard +braking guard$", told["simulation"], re.MULTILINE)
+    report = (there.path / "report.html").read_text()
+    assert "with the braking guard" in report
+    assert "--guard braking" in report
+    assert '"braking"' in told["schema"]
+    assert "did you mean `braking`?" in done.stderr
+    assert "exported controllers do not contain the guard `braking`" in told["export"]
+    assert told["table"].strip() == "table braking with margin"

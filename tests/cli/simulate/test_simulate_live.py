@@ -14,7 +14,6 @@ from torch import Tensor
 from stlc.cli.simulate.live import LiveView, _fitting, _shown, _signed
 from stlc.controller.deployment.live import LiveMonitor
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
-from stlc.controller.guard.candidates import Mode
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
@@ -53,7 +52,7 @@ class Away(Policy):
 def shown(
     *,
     terminal: bool,
-    guard: Mode = "none",
+    guard: str = "none",
     seeds: int = 1,
     steps: int = 20,
     size: tuple[int, int] = (110, 30),

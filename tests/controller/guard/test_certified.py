@@ -20,7 +20,6 @@ from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.scenario import under
 from stlc.grammar.parse.parser import parse
-from stlc.registry import GUARDS, guard_named
 from stlc.source import Source
 
 SYSTEM = """\
@@ -138,11 +137,3 @@ def test_a_specification_without_safety_requirements_is_refused() -> None:
     task = task_of("gusts", SPEC.replace("@safety\n", ""))
     with pytest.raises(UsageError, match="needs a requirement tagged `@safety`"):
         Guard(task, Constant(task, 0.0), "certified")
-
-
-def test_guards_are_listed_once() -> None:
-    assert GUARDS == ("none", "paper", "full", "certified")
-    assert guard_named("certified") == "certified"
-    with pytest.raises(UsageError, match="there is no guard `certifed`") as caught:
-        guard_named("certifed")
-    assert "did you mean `certified`?" in caught.value.diagnostics[0].help

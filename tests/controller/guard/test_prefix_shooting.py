@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from stlc.controller.guard.candidates import Limits, best, finite, grid_of
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
@@ -36,7 +37,7 @@ class Constant(Policy):
 
 def paper_search(task: Task, policy: Policy, grid: PrefixGrid, seconds: float | None = None) -> StagedSearch:
     """The stages of the paper's guard."""
-    return StagedSearch(task, policy, "paper", grid=grid, limits=Limits(paper=seconds))
+    return StagedSearch(task, policy, PAPER, grid=grid, limits=Limits(paper=seconds))
 
 
 def grid(**changed: object) -> PrefixGrid:
@@ -107,7 +108,7 @@ def test_a_decision_without_time_takes_the_best_of_what_it_has(car_task: Task) -
     x, plan = failing(car_task, 10.0, n=60)
     whole = paper_search(car_task, Constant(car_task, 10.0), grid(batch=3)).search(x, plan)
     backup = StagedSearch(
-        car_task, Constant(car_task, 10.0), "paper", grid=grid(batch=3), limits=Limits(paper=0.0)
+        car_task, Constant(car_task, 10.0), PAPER, grid=grid(batch=3), limits=Limits(paper=0.0)
     )
     hurried = backup.search(x, plan)
     assert len(hurried.plans) == len(x)
@@ -117,7 +118,7 @@ def test_a_decision_without_time_takes_the_best_of_what_it_has(car_task: Task) -
     assert bool((whole.is_safe & ~hurried.is_safe).any())
     assert bool((hurried.prefix_length == 1).all())
     calm = StagedSearch(
-        car_task, Constant(car_task, 10.0), "paper", grid=grid(batch=3), limits=Limits(paper=1e9)
+        car_task, Constant(car_task, 10.0), PAPER, grid=grid(batch=3), limits=Limits(paper=1e9)
     ).search(x, plan)
     assert torch.equal(calm.plans, whole.plans)
 

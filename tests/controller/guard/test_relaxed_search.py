@@ -9,6 +9,7 @@ from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Limits
 from stlc.controller.guard.guard import Guard, GuardDecision
+from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
 from stlc.controller.policies.policy import Policy
@@ -67,7 +68,7 @@ def test_what_is_beside_the_wall_stays_as_far_from_it_as_it_is() -> None:
 def test_whom_the_plain_guard_can_save_is_saved_with_a_margin_too() -> None:
     task = cart()
     x = task.sample(60, seed=1, dtype=torch.float64)
-    plain = StagedSearch(task, Onward(task), "full", limits=Limits(seconds=None)).search(
+    plain = StagedSearch(task, Onward(task), FULL, limits=Limits(seconds=None)).search(
         x, Onward(task).plan(x)
     )
     found = decided(task, x)
@@ -84,9 +85,9 @@ def test_it_spares_more_than_a_guard_that_asks_for_nothing() -> None:
     task = cart()
     x = task.sample(60, seed=2, dtype=torch.float64)
     strict = with_margins(task, LIMITS.margin)
-    guard = RelaxedSearch(task, strict, Onward(task), limits=LIMITS)
+    guard = RelaxedSearch(task, strict, Onward(task), FULL, limits=LIMITS)
     found = guard.search(x, Onward(task).plan(x))
-    plain = StagedSearch(task, Onward(task), "full", limits=Limits(seconds=None)).search(
+    plain = StagedSearch(task, Onward(task), FULL, limits=Limits(seconds=None)).search(
         x, Onward(task).plan(x)
     )
     short = plain.is_safe & ~found.is_safe

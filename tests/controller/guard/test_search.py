@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
@@ -36,7 +37,7 @@ def test_plans_are_judged_although_there_is_no_prefix(tmp_path: Path) -> None:
     task = Task.of(spec, System.load(tmp_path / "a.yaml"))
     x = task.sample(20, seed=3, dtype=torch.float64)
     plan = torch.zeros(20, 1, 1, dtype=torch.float64)
-    found = StagedSearch(task, Still(task), "paper").search(x, plan)
+    found = StagedSearch(task, Still(task), PAPER).search(x, plan)
     judged = task.judge(x, found.plans)
     assert torch.equal(found.safe, judged.safe)
     assert torch.equal(found.rho, judged.rho)

@@ -1,17 +1,16 @@
 """Stages of guards: methods to find a better plan, one method per file.
 
-A guard runs its stages in order. Each stage declares the guards to which it belongs, and its position in the
-order. Each stage proposes plans for the agents whose plan it may still improve. Of all plans of an agent, the
-highest-ranked one is kept (`stlc.controller.guard.candidates.rank`). A file holds a class `STAGE`; files
-whose names begin with `_` hold shared code.
+A guard names its stages (`stlc.controller.guard.kind.GuardKind`) and runs them in order. Each stage proposes
+plans for the agents whose plan it may still improve. Of all plans of an agent, the highest-ranked one is kept
+(`stlc.controller.guard.candidates.rank`). A file holds a class `STAGE`; files whose names begin with `_` hold
+shared code.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from stlc.controller.guard.candidates import TO_SPARE, Candidates, Deadline, Limits
 from stlc.registry import PackageRegistry
@@ -38,7 +37,7 @@ class Setup:
         policy: policy that completes plans: it plans from the state after a prefix (sampled first actions).
         grid: values of the controls in prefixes, and lengths of prefixes.
         limits: computational limits of a decision.
-        guard: name of the guard.
+        stages: classes of the guard's stages in order.
         generator: source of the random numbers for the searches of all stages.
     """
 
@@ -46,7 +45,7 @@ class Setup:
     policy: Policy
     grid: PrefixGrid
     limits: Limits
-    guard: str
+    stages: tuple[type[GuardStage], ...]
     generator: torch.Generator
 
     @property
@@ -92,13 +91,7 @@ class Tried:
 
 
 class GuardStage(ABC):
-    """Stage of a guard: one method to find a better plan.
-
-    Attributes:
-        turns: name of a guard -> position of the stage among the guard's stages.
-    """
-
-    turns: ClassVar[Mapping[str, int]]
+    """Stage of a guard: one method to find a better plan."""
 
     @abstractmethod
     def __init__(self, setup: Setup) -> None:
@@ -114,9 +107,3 @@ class GuardStage(ABC):
 
         The stage may store the plans that it judged in `rejected.tried` for the next stage.
         """
-
-
-def stages_of(guard: str) -> tuple[type[GuardStage], ...]:
-    """The classes of a guard's stages in order."""
-    found = [stage for stage in map(STAGES.get, STAGES) if guard in stage.turns]
-    return tuple(sorted(found, key=lambda stage: stage.turns[guard]))

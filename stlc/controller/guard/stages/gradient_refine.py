@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from time import perf_counter
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import torch
@@ -31,8 +31,6 @@ from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.native import ObjectiveSlopes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from stlc.controller.problem.native import NativeGradient
     from stlc.controller.problem.task import Task
 
@@ -273,8 +271,6 @@ class GradientAscent:
 
 class GradientRefine(GuardStage):
     """Guard stage: gradient ascent from the policy's and the previous plan, in half of the time left."""
-
-    turns: ClassVar[Mapping[str, int]] = {"full": 10}
 
     def __init__(self, setup: Setup) -> None:
         self.task = setup.task

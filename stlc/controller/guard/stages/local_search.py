@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,8 +13,6 @@ from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.training.local_search import Searcher
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from stlc.controller.problem.task import Task
 
 
@@ -24,8 +22,6 @@ class LocalSearch(GuardStage):
     If the result is unsafe, a second search starts from it, with the requirements tagged `@safety` as its
     only specification.
     """
-
-    turns: ClassVar[Mapping[str, int]] = {"full": 20}
 
     def __init__(self, setup: Setup) -> None:
         task, generator = setup.task, setup.generator

@@ -6,7 +6,7 @@ Of all plans, the one is chosen that stays safe for the longest time.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.controller.guard.stages.prefix_shooting import PrefixShooting
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
 
 class LongestSafePrefix(GuardStage):
@@ -31,8 +31,6 @@ class LongestSafePrefix(GuardStage):
     taken. If plans are still equal, the one with the smaller violation of the safety requirements, averaged
     over time, is taken; then the one with the smaller performance cost.
     """
-
-    turns: ClassVar[Mapping[str, int]] = {"paper": 20, "full": 60}
 
     def __init__(self, setup: Setup) -> None:
         self.task, self.batch = setup.task, setup.grid.batch
@@ -67,7 +65,7 @@ class LongestSafePrefix(GuardStage):
         todo, lengths = torch.nonzero(missing)[:, 0], self._shooting.grid.lengths
         if len(todo) and lengths:
             every = torch.arange(len(todo), device=rows.device)
-            again = Deadline() if self._shooting.patient else deadline
+            again = Deadline() if self._shooting.last_resort else deadline
             for group, candidates in self._shooting.candidates(rejected, todo, every, lengths[-1], again):
                 yield Tried(todo[group], candidates)
 

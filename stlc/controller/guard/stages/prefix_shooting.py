@@ -13,7 +13,7 @@ action. This is not in the paper (decision record 37 in `docs/decisions`).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, best,
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
 HANDED_ON = 65_536
 """Maximum number of trajectories stored for the next stage, which recomputes the others."""
@@ -38,12 +38,10 @@ class PrefixShooting(GuardStage):
     have the same robustness.
     """
 
-    turns: ClassVar[Mapping[str, int]] = {"paper": 10, "full": 50}
-
     def __init__(self, setup: Setup) -> None:
         self.task, self.policy, self.grid = setup.task, setup.policy, setup.grid
-        self.patient = setup.guard != "paper"
-        if self.patient:  # last resort of another guard: few prefixes, no deadline
+        self.last_resort = setup.stages[0] is not PrefixShooting
+        if self.last_resort:  # after other stages: few prefixes, no deadline
             grid = setup.grid
             few = tuple(length for length in grid.lengths if grid.count(length) <= setup.limits.prefixes)
             self.grid = replace(grid, lengths=few or grid.lengths[:1])
@@ -58,7 +56,7 @@ class PrefixShooting(GuardStage):
         Prefixes (first actions of plans) of length T0 = 1, 2, … are tried in turn, until a plan satisfies the
         specification or is at least safe. An agent without a safe plan at any length gets an unjudged plan.
         """
-        deadline = Deadline() if self.patient else deadline
+        deadline = Deadline() if self.last_resort else deadline
         found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
         todo = torch.arange(len(rows), device=rows.device)
         for length in self.grid.lengths:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.feasibility import safety_task, solve
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from torch import Tensor
 
 
 class Restarts(GuardStage):
     """Guard stage: search for a safe plan by `feasibility.solve` until the deadline."""
-
-    turns: ClassVar[Mapping[str, int]] = {"full": 30}
 
     def __init__(self, setup: Setup) -> None:
         self.task, self.rescue = setup.task, setup.limits.rescue

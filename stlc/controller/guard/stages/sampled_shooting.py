@@ -8,7 +8,7 @@ plans.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -19,8 +19,6 @@ from stlc.controller.guard.stages.local_search import climbed_from
 from stlc.controller.training.local_search import Searcher
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.runtime.prefixes import PrefixGrid
@@ -79,8 +77,6 @@ class SampledShooting(GuardStage):
 
     A prefix is a sequence of the first actions of a plan; the policy plans the rest.
     """
-
-    turns: ClassVar[Mapping[str, int]] = {"full": 40}
 
     def __init__(self, setup: Setup) -> None:
         self.task, self.limits = setup.task, setup.limits

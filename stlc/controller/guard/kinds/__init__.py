@@ -1,0 +1,1 @@
+"""Guards, one per file."""
