@@ -20,11 +20,11 @@ from stlc.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from stlc.assurance.verification.tubes import tube
     from stlc.controller.planning.planner import PlanResult, plan
     from stlc.controller.problem.task import Task
     from stlc.controller.training.launch import train_here as train
     from stlc.controller.training.run import Run
-    from stlc.controller.verification.tubes import tube
     from stlc.diagnostics import SpecError, StlcError
     from stlc.dynamics.model.system import System
     from stlc.grammar import ast
@@ -69,7 +69,7 @@ _HOMES = {
     "Trace": "stlc.trace:Trace",
     "plan": "stlc.controller.planning.planner:plan",
     "train": "stlc.controller.training.launch:train_here",
-    "tube": "stlc.controller.verification.tubes:tube",
+    "tube": "stlc.assurance.verification.tubes:tube",
 }
 
 

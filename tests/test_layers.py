@@ -82,7 +82,7 @@ HOMES = {
         "stlc.cli",
         "benchmarks",
     ),
-    "onnx": ("stlc.export", "stlc.controller.verification.onnx_layers"),
+    "onnx": ("stlc.export", "stlc.assurance.verification.onnx_layers"),
     "onnxruntime": ("stlc.runtime", "stlc.plants.controller"),
     "fmpy": ("stlc.plants.kinds.fmu",),
     "pyarrow": ("stlc.trace.formats.parquet", "stlc.trace.formats.cells"),

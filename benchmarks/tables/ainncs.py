@@ -25,16 +25,16 @@ from benchmarks.options import OnlyOption, Output, ResultsOption
 from benchmarks.store import Key, Result, ResultStore, inputs_of
 from benchmarks.table import WIDTH, Columns, listed, provenance, publish
 from benchmarks.timing import one_thread
+from stlc.assurance.verification.loop import NetworkLoop
+from stlc.assurance.verification.network import NetworkLayer
+from stlc.assurance.verification.onnx_layers import read_onnx
+from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.problem.load import load_task
 from stlc.controller.training.budget import clock_of
-from stlc.controller.verification.loop import NetworkLoop
-from stlc.controller.verification.network import NetworkLayer
-from stlc.controller.verification.onnx_layers import read_onnx
-from stlc.controller.verification.verify import Verifier
 from stlc.diagnostics import usage
 from stlc.files import SYSTEMS
 from stlc.provenance import sha256

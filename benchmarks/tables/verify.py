@@ -15,6 +15,11 @@ from benchmarks.store import Key, Result, ResultStore, inputs_of
 from benchmarks.table import Columns, listed, provenance, publish
 from benchmarks.timing import one_thread
 from stlc.assurance.bounds import clopper_pearson_lower
+from stlc.assurance.verification.boxes import Box, Mode
+from stlc.assurance.verification.examine import SharedExaminer
+from stlc.assurance.verification.plans import PolicySource, ProposedPlans
+from stlc.assurance.verification.subject import VerificationSubject
+from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
@@ -22,11 +27,6 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.controller.training.budget import clock_of
 from stlc.controller.training.run import Run
-from stlc.controller.verification.boxes import Box, Mode
-from stlc.controller.verification.examine import SharedExaminer
-from stlc.controller.verification.plans import PolicySource, ProposedPlans
-from stlc.controller.verification.subject import VerificationSubject
-from stlc.controller.verification.verify import Verifier
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 

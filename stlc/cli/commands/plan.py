@@ -29,10 +29,10 @@ from stlc.registry import PLANNERS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from stlc.assurance.verification.tubes import TubeModel
     from stlc.controller.planning.planner import PlanResult
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import PlannerChoice
-    from stlc.controller.verification.tubes import TubeModel
 
 
 @command(
@@ -91,10 +91,10 @@ def plan(
     plan then counts as satisfying only if the lower bound does. Without --fail-under, the exit code is 1 if a
     plan does not satisfy the specification.
     """
+    from stlc.assurance.verification.tubes import TubeModel
     from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.controller.planning.traces import following, starts_of, trace_of
     from stlc.controller.problem.load import load_task
-    from stlc.controller.verification.tubes import TubeModel
     from stlc.stopping import leaving
     from stlc.trace import check_writable, save_trace
 
@@ -177,8 +177,8 @@ def _bounded(model: TubeModel, result: PlanResult, scenario: str | None, start: 
 
     `start`: names of the columns that follow from the others at the start.
     """
+    from stlc.assurance.verification.tubes import DEVIATIONS
     from stlc.controller.problem.task import satisfied
-    from stlc.controller.verification.tubes import DEVIATIONS
 
     found, loose = model.tube(result.states, result.plans, start=start), model.uncertain
     low, high = (model.task.graph.overall(each) for each in (found.low, found.high))

@@ -29,10 +29,10 @@ from stlc.escape import visible
 from stlc.foreign import driving
 
 if TYPE_CHECKING:
-    from stlc.controller.verification.around import Around
-    from stlc.controller.verification.loop import NetworkLoop
-    from stlc.controller.verification.plans import PolicySource
-    from stlc.controller.verification.verify import ModeResult, Verification
+    from stlc.assurance.verification.around import Around
+    from stlc.assurance.verification.loop import NetworkLoop
+    from stlc.assurance.verification.plans import PolicySource
+    from stlc.assurance.verification.verify import ModeResult, Verification
 
 _MOST = 3
 """Counterexamples that the text shows."""
@@ -95,11 +95,11 @@ def verify(
     """
     import torch
 
+    from stlc.assurance.verification.examine import SharedExaminer
+    from stlc.assurance.verification.plans import PolicySource
+    from stlc.assurance.verification.verify import Verifier
     from stlc.controller.parallel.workers import LocalProcesses
     from stlc.controller.training.budget import clock_of
-    from stlc.controller.verification.examine import SharedExaminer
-    from stlc.controller.verification.plans import PolicySource
-    from stlc.controller.verification.verify import Verifier
     from stlc.rundir import RunDir
 
     torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
@@ -160,9 +160,9 @@ class _LoopSource:
 
     def load(self) -> NetworkLoop:
         """Load the closed loop."""
+        from stlc.assurance.verification.loop import NetworkLoop
+        from stlc.assurance.verification.onnx_layers import read_onnx
         from stlc.controller.problem.load import load_task
-        from stlc.controller.verification.loop import NetworkLoop
-        from stlc.controller.verification.onnx_layers import read_onnx
 
         task = load_task(self.spec, self.system)
         dt = float(task.system.decl.dt)

@@ -1,1 +1,1 @@
-"""Guards, one per file."""
+"""Guards, one per file; the room that proves adds its own (`stlc.assurance.guards`)."""

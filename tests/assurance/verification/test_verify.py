@@ -11,15 +11,15 @@ import pytest
 import torch
 from helpers.small_policies import half_seen_task, policy, task_of
 
+from stlc.assurance.verification.boxes import Box, Unsupported, modes_of
+from stlc.assurance.verification.forms import Forms
+from stlc.assurance.verification.network import PlanBounds
+from stlc.assurance.verification.plans import ProposedPlans
+from stlc.assurance.verification.verify import Verification, Verifier
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.controller.policies.policy import BestOfKPolicy, ModelRollout, PlanNetwork
 from stlc.controller.problem.task import Task
-from stlc.controller.verification.boxes import Box, Unsupported, modes_of
-from stlc.controller.verification.forms import Forms
-from stlc.controller.verification.network import PlanBounds
-from stlc.controller.verification.plans import ProposedPlans
-from stlc.controller.verification.verify import Verification, Verifier
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.init import GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from stlc.assurance.verification.tubes import DEVIATIONS, TubeModel, tube
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.deployment.disturbance import Disturbance, ErrorSizes
 from stlc.controller.problem.task import Task
-from stlc.controller.verification.tubes import DEVIATIONS, TubeModel, tube
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.init.samplers import Drawing

@@ -23,12 +23,12 @@ from typing import TypeAlias
 import numpy as np
 import torch
 
-from stlc.controller.verification.around import Around, StateProver
-from stlc.controller.verification.boxes import Box, Mode, whole
-from stlc.controller.verification.examine import BatchExaminer, BatchResult, BoxBatch, Examiner, Witness
-from stlc.controller.verification.forms import Floats
-from stlc.controller.verification.judged import BoxVerdicts
-from stlc.controller.verification.subject import VerificationSubject
+from stlc.assurance.verification.around import Around, StateProver
+from stlc.assurance.verification.boxes import Box, Mode, whole
+from stlc.assurance.verification.examine import BatchExaminer, BatchResult, BoxBatch, Examiner, Witness
+from stlc.assurance.verification.forms import Floats
+from stlc.assurance.verification.judged import BoxVerdicts
+from stlc.assurance.verification.subject import VerificationSubject
 
 Clock: TypeAlias = Callable[[], float]
 

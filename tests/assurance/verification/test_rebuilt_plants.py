@@ -11,16 +11,16 @@ import torch
 from helpers.uncertain_plants import CARRIED, REFUSED, uncertain_plant
 from torch import Tensor
 
+from stlc.assurance.certified_search import Certifier
+from stlc.assurance.verification.boxes import Box
+from stlc.assurance.verification.plans import ProposedPlans
+from stlc.assurance.verification.tubes import Tube, TubeModel
+from stlc.assurance.verification.verify import Verifier
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.controller.guard.certified import Certifier
 from stlc.controller.guard.guard import Guard
 from stlc.controller.planning.traces import RANDOM, following
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
 from stlc.controller.problem.task import Task
-from stlc.controller.verification.boxes import Box
-from stlc.controller.verification.plans import ProposedPlans
-from stlc.controller.verification.tubes import Tube, TubeModel
-from stlc.controller.verification.verify import Verifier
 from stlc.controller.world import ModelWorld
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.load import parse_system

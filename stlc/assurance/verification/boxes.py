@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from stlc.assurance.verification.forms import FORMS, Bools, Floats, Forms, spread
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import nodes
-from stlc.controller.verification.forms import FORMS, Bools, Floats, Forms, spread
 from stlc.dynamics.declaration.init import InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.model.algebra import map_parts, substitute

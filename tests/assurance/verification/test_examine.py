@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from helpers.small_policies import policy
 
+from stlc.assurance.verification.boxes import Box, whole
+from stlc.assurance.verification.examine import BatchResult, BoxBatch, Examiner, SharedExaminer
+from stlc.assurance.verification.judged import BoxVerdicts
+from stlc.assurance.verification.plans import ProposedPlans
+from stlc.assurance.verification.verify import HOPELESS, Verification, Verifier, _Front
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, LostCall
-from stlc.controller.verification.boxes import Box, whole
-from stlc.controller.verification.examine import BatchResult, BoxBatch, Examiner, SharedExaminer
-from stlc.controller.verification.judged import BoxVerdicts
-from stlc.controller.verification.plans import ProposedPlans
-from stlc.controller.verification.verify import HOPELESS, Verification, Verifier, _Front
 
 
 @dataclass(frozen=True)

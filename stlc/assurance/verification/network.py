@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from stlc.assurance.verification.forms import FORMS, SLACK, Floats, Forms, arctan, picked, tanh
 from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import Task
-from stlc.controller.verification.forms import FORMS, SLACK, Floats, Forms, arctan, picked, tanh
 from stlc.dynamics.model.controls import EPS, raw_width
 
 UNIT = 2.0**-24

@@ -3,7 +3,7 @@
 The network reads what the system file lists under `policy: observe`, and its outputs, limited to the ranges
 of the controls, are held for a period. The motion is that of the system file, with its integrator and
 substeps, or the solution of its differential equations, with a bound on the error of every substep
-(`stlc.controller.verification.flow`). Proofs concern the samples. Counterexamples are simulated in the model.
+(`stlc.assurance.verification.flow`). Proofs concern the samples. Counterexamples are simulated in the model.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import torch
 
-from stlc.controller.verification.flow import Flow
-from stlc.controller.verification.forms import FORMS, Floats, Forms, in_use
-from stlc.controller.verification.network import (
+from stlc.assurance.verification.flow import Flow
+from stlc.assurance.verification.forms import FORMS, Floats, Forms, in_use
+from stlc.assurance.verification.network import (
     NetworkBounds,
     NetworkLayer,
     columns,
@@ -24,7 +24,7 @@ from stlc.controller.verification.network import (
     own_symbols,
     reduced,
 )
-from stlc.controller.verification.subject import History, Indices, VerificationSubject
+from stlc.assurance.verification.subject import History, Indices, VerificationSubject
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Protocol, Self
 import numpy as np
 import torch
 
+from stlc.assurance.verification.around import narrowed
+from stlc.assurance.verification.judged import PROVED
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import CallWorkers, LostCall, results
-from stlc.controller.verification.around import narrowed
-from stlc.controller.verification.judged import PROVED
 
 if TYPE_CHECKING:
-    from stlc.controller.verification.boxes import Box, Mode
-    from stlc.controller.verification.forms import Bools, Floats
-    from stlc.controller.verification.subject import Indices, VerificationSubject
+    from stlc.assurance.verification.boxes import Box, Mode
+    from stlc.assurance.verification.forms import Bools, Floats
+    from stlc.assurance.verification.subject import Indices, VerificationSubject
 
 POINTS = 8
 """States that are sampled in each box: its centre and others at random."""

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from stlc.assurance.certified_search import Certifier
 from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.guard.candidates import POLICY, Limits
-from stlc.controller.guard.certified import Certifier
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stlc.assurance.verification.boxes import Box, Mode
+from stlc.assurance.verification.forms import Floats
+from stlc.assurance.verification.judged import PROVED
+from stlc.assurance.verification.subject import VerificationSubject
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.verification.boxes import Box, Mode
-from stlc.controller.verification.forms import Floats
-from stlc.controller.verification.judged import PROVED
-from stlc.controller.verification.subject import VerificationSubject
 
 FIRST = 8
 """Boxes along each coordinate that the search around a state begins with."""

@@ -13,14 +13,14 @@ import pytest
 from helpers.small_policies import half_seen_task
 from helpers.small_systems import moved_by_steps
 
+from stlc.assurance.verification.boxes import Box
+from stlc.assurance.verification.forms import Forms
+from stlc.assurance.verification.loop import NetworkLoop
+from stlc.assurance.verification.network import NetworkBounds, NetworkLayer
+from stlc.assurance.verification.onnx_layers import read_onnx
+from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.app import main
 from stlc.controller.problem.load import load_task
-from stlc.controller.verification.boxes import Box
-from stlc.controller.verification.forms import Forms
-from stlc.controller.verification.loop import NetworkLoop
-from stlc.controller.verification.network import NetworkBounds, NetworkLayer
-from stlc.controller.verification.onnx_layers import read_onnx
-from stlc.controller.verification.verify import Verifier
 from stlc.diagnostics import UsageError
 
 ROOT = Path(__file__).parents[3]

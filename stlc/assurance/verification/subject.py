@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stlc.assurance.verification.boxes import Box, Mode, Unsupported, corners, modes_of
+from stlc.assurance.verification.forms import FORMS, Bools, Floats, Forms, spread
+from stlc.assurance.verification.judged import BoxVerdicts, Judge
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.controller.verification.boxes import Box, Mode, Unsupported, corners, modes_of
-from stlc.controller.verification.forms import FORMS, Bools, Floats, Forms, spread
-from stlc.controller.verification.judged import BoxVerdicts, Judge
 from stlc.diagnostics import usage
 from stlc.dynamics.model.schedule import blocks
 from stlc.dynamics.model.step import build_step

@@ -11,12 +11,12 @@ from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stlc.assurance.verification.forms import FORMS, Forms, ranges, tanh
+from stlc.assurance.verification.judged import Judge
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.controller.verification.forms import FORMS, Forms, ranges, tanh
-from stlc.controller.verification.judged import Judge
 
 BATCH, SYMBOLS = 5, 3
 

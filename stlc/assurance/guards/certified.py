@@ -16,7 +16,7 @@ class CertifiedGuard(GuardKind):
 
     def search(self, given: GuardInputs) -> GuardSearch:
         """Build the search for plans whose tubes are safe; see `CertifiedSearch`."""
-        from stlc.controller.guard.certified import CertifiedSearch
+        from stlc.assurance.certified_search import CertifiedSearch
 
         return CertifiedSearch(given, self)
 

@@ -1,7 +1,7 @@
 """Search for certified plans: those that are safe for all errors within the bounds of the scenario.
 
 A plan is certified if all states that it can lead to under errors within the bounds are safe, over the whole
-plan (`stlc.controller.verification.tubes`). Then the rest of the plan is certified at the next decision, too,
+plan (`stlc.assurance.verification.tubes`). Then the rest of the plan is certified at the next decision, too,
 whatever the errors were: the guard keeps a certified plan until its end, unless an exogenous event occurs.
 
 Where no certified plan is found, a weaker condition counts: errors act until the next decision only, and the
@@ -18,23 +18,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stlc.assurance.verification.tubes import TubeModel
 from stlc.compile.ir.support import columns
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, best, finite, rank
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
 from stlc.controller.streams import seeded
-from stlc.controller.verification.tubes import TubeModel
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from stlc.assurance.verification.tubes import Tube
     from stlc.controller.guard.candidates import RobustnessMargins
     from stlc.controller.guard.kind import GuardInputs, GuardKind
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
-    from stlc.controller.verification.tubes import Tube
 
 STARTS = 500
 """States from which the margins of a search are measured."""

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from stlc.controller.verification.forms import Floats
-from stlc.controller.verification.network import NetworkLayer
+from stlc.assurance.verification.forms import Floats
+from stlc.assurance.verification.network import NetworkLayer
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, usage
 
 WIDEST = 100_000

@@ -2,7 +2,7 @@
 
 The errors are those of the scenario of the task: factors of the numbers in the dynamics, actuators with a
 wrong gain or with noise, measurement errors of the present state, and additive disturbances. Each error is a
-symbol of an affine form (`stlc.controller.verification.forms`): a constant error keeps one symbol over all
+symbol of an affine form (`stlc.assurance.verification.forms`): a constant error keeps one symbol over all
 steps, noise has a new one at every step. The forms are propagated through the dynamics that a deployment
 simulates, and the robustness of each requirement is bounded by affine forms and by intervals, whichever is
 tighter.
@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stlc.assurance.verification.forms import FORMS, Floats, Forms, ranges
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval import Intervals
@@ -29,7 +30,6 @@ from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.controller.deployment.disturbance import ErrorSizes
-from stlc.controller.verification.forms import FORMS, Floats, Forms, ranges
 from stlc.diagnostics import usage
 from stlc.dynamics.init.samplers import Drawing
 from stlc.dynamics.model.schedule import blocks

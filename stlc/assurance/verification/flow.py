@@ -13,10 +13,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from stlc.assurance.verification.forms import FORMS, SLACK, Bools, Floats, Forms, spread
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.controller.verification.forms import FORMS, SLACK, Bools, Floats, Forms, spread
 from stlc.dynamics.declaration.decl import SystemDecl
 
 _ROUNDS = 2

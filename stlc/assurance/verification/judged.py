@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stlc.assurance.verification.forms import FORMS, Floats, Forms, ranges, spread
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval import Intervals
@@ -20,7 +21,6 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import frozen_in, leaves, map_children
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.controller.verification.forms import FORMS, Floats, Forms, ranges, spread
 
 PROVED = 0.5 * TOLERANCE
 """A lower bound on robustness of at least -`PROVED` is a proof: the monitor takes -1e-6 as satisfied."""

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from stlc.assurance.verification.forms import FORMS, Bools, Floats, Forms, in_use, picked, spread, together
+from stlc.assurance.verification.network import UNIT, PlanBounds
+from stlc.assurance.verification.subject import History, Indices, VerificationSubject
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import children
 from stlc.controller.policies.policy import BestOfKPolicy
-from stlc.controller.verification.forms import FORMS, Bools, Floats, Forms, in_use, picked, spread, together
-from stlc.controller.verification.network import UNIT, PlanBounds
-from stlc.controller.verification.subject import History, Indices, VerificationSubject
 from stlc.diagnostics import usage
 from stlc.dynamics.model.step import build_step
 

@@ -1,0 +1,1 @@
+"""Guards whose decisions rest on proofs, one per file."""
