@@ -10,11 +10,13 @@ import typer
 
 from stlc.diagnostics import usage
 from stlc.escape import visible
+from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment
     from stlc.cli.framework.assured import Assurance
 
+GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS), help="Guard of the policy.")]
 CertifyOption = Annotated[
     float | None,
     typer.Option(

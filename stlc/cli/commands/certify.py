@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.certify.text import bounds_lines, checked_share, floored, raised
+from stlc.cli.certify.text import GuardOption, bounds_lines, checked_share, floored, raised
 from stlc.cli.framework.assured import (
     Certificate,
     CertificateCheck,
@@ -23,7 +23,6 @@ from stlc.cli.framework.assured import (
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
     DriveStepsOption,
-    GuardOption,
     MarginOption,
     RequireOption,
     RunsOption,

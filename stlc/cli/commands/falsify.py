@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
+from stlc.cli.certify.text import GuardOption
 from stlc.cli.check.outcome import INCONCLUSIVE
 from stlc.cli.falsify import findings
 from stlc.cli.framework.assured import (
@@ -24,7 +25,6 @@ from stlc.cli.framework.assured import (
 from stlc.cli.framework.options import (
     MOST_SEED,
     ClusterOption,
-    GuardOption,
     RequireOption,
     RunsOption,
     SetOption,

@@ -8,7 +8,7 @@ from stlc.registry import GUARDS
 Num: TypeAlias = float | str
 Count = Annotated[int, 0]
 GuardName = Annotated[str, GUARDS]
-ComparedGuard = Annotated[str, compared_guards()]
+ComparedGuard = Annotated[str, compared_guards]
 
 
 class ShareStatement(TypedDict):
@@ -327,7 +327,7 @@ class GuardResult(TypedDict):
 class ClosedLoopRecord(TypedDict):
     """Closed-loop results of a training; see `stlc.controller.evaluation.closed_loop.ClosedLoop`."""
 
-    recommended: Annotated[str | None, (*compared_guards(), None)]
+    recommended: Annotated[str | None, lambda: (*compared_guards(), None)]
     share: Num | None
     interval: list[Num] | None
     guards: list[GuardResult]

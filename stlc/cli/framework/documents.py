@@ -760,7 +760,7 @@ def schema_of(kind: Any) -> dict[str, Any]:
     if is_typeddict(kind):
         return _object(kind)
     if origin is Annotated:
-        what = args[1]
+        what = args[1]() if callable(args[1]) else args[1]
         return {**schema_of(args[0]), "minimum": what} if isinstance(what, int) else {"enum": list(what)}
     if origin is Literal:
         return {"enum": list(args)}

@@ -13,7 +13,7 @@ import typer
 from stlc.cli.framework.completion import requirement_names, run_names
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.files import real
-from stlc.registry import GUARDS, PLANNERS
+from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
     from stlc.controller.training.budget import Clock
@@ -23,7 +23,6 @@ MOST_SEED = 2**63 - 1
 """Greatest seed of torch's random numbers."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
-GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS), help="Guard of the policy.")]
 SystemOption = Annotated[
     str | None,
     typer.Option(
