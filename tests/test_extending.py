@@ -11,12 +11,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.tools import load_tool
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
-BLOCK = re.compile(r"^<!-- (file|change|check): (.+?) -->\n```\w+\n(.*?)^```", re.MULTILINE | re.DOTALL)
-BLOCKS = BLOCK.findall(TEXT)
-CHECKS = [(name, body) for kind, name, body in BLOCKS if kind == "check"]
+CHANGES = load_tool("structure").changes(TEXT)
+FILES = [each for change in CHANGES for each in change.files.items()]
+DIFFS = [each for change in CHANGES for each in change.diffs.items()]
+CHECKS = [each for change in CHANGES for each in change.checks.items()]
 
 RUNNER = """
 import json, sys, traceback
@@ -49,13 +51,12 @@ def failures(tmp_path_factory) -> dict[str, str]:
     skipped = shutil.ignore_patterns("results")
     for folder in ("stlc", "benchmarks", "specs", "examples"):
         shutil.copytree(ROOT / folder, tree / folder, ignore=skipped)
-    for kind, name, body in BLOCKS:
-        if kind == "file":
-            assert not (tree / name).exists(), f"{name} is there already"
-            (tree / name).parent.mkdir(exist_ok=True)
-            (tree / name).write_text(body, encoding="utf-8")
-        elif kind == "change":
-            change(tree / name, body)
+    for name, body in FILES:
+        assert not (tree / name).exists(), f"{name} is there already"
+        (tree / name).parent.mkdir(exist_ok=True)
+        (tree / name).write_text(body, encoding="utf-8")
+    for name, diff in DIFFS:
+        change(tree / name, diff)
     environment = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", RUNNER],
@@ -73,36 +74,27 @@ def failures(tmp_path_factory) -> dict[str, str]:
 
 def test_the_page_has_an_example_of_each_extension():
     assert len(CHECKS) == 15
-    assert len([kind for kind, *_ in BLOCKS if kind == "file"]) == 15
-    changed = [name for kind, name, _ in BLOCKS if kind == "change" and name.endswith(".py")]
+    assert len(FILES) == 15
+    changed = [name for name, _ in DIFFS if name.endswith(".py")]
     assert len(changed) == 10  # an operator, a trace format, a function, a kind of plant; 6 for a node
 
 
 def test_an_extension_needs_the_files_that_the_page_promises():
     """New files and changed lines of source of each section; a table entry counts as one line."""
     promised = dict(re.findall(r"^\| \[([\w -]+)\]\(#[\w-]+\)[^|]* \| (.+?) \|", TEXT, re.MULTILINE))
-    sections = re.split(r"^## An? ", TEXT, flags=re.MULTILINE)[1:]
-    found = {}
-    for section in sections:
-        blocks = [
-            (kind, body)
-            for kind, name, body in BLOCK.findall(section)
-            if kind == "change" or name[-3:] == ".py"
-        ]
-        added = [body for kind, body in blocks if kind == "change"]
-        lines = sum(line.startswith("+") for body in added for line in body.splitlines())
-        found[section.partition("\n")[0]] = (sum(kind == "file" for kind, _ in blocks), len(added), lines)
-    entry, line = (0, 1), (1, 1, 1)
     names = {"method": "training method"}
-    assert {names.get(name, name) for name in found} == set(promised)
-    for name, counts in found.items():
-        text = promised[names.get(name, name)]
+    assert {names.get(each.kind, each.kind) for each in CHANGES} == set(promised)
+    for each in CHANGES:
+        text = promised[names.get(each.kind, each.kind)]
+        new = each.counted - len(each.diffs)
         if "changed" in text:
-            assert counts[:2] == (0, int(text.split()[0])), name
+            assert (new, each.counted) == (0, int(text.split()[0])), each.kind
         elif "1 entry" in text:
-            assert counts[:2] == entry, name
+            assert (new, each.counted) == (0, 1), each.kind
         else:
-            assert counts == (line if "1 line" in text else (int(re.match(r"\d+", text)[0]), 0, 0)), name
+            lines = int("1 line" in text)
+            files = 1 if lines else int(re.match(r"\d+", text)[0])
+            assert (new, len(each.diffs), each.lines) == (files, lines, lines), each.kind
 
 
 @pytest.mark.apart
@@ -112,15 +104,15 @@ def test_an_example_works(name, failures):
 
 
 def test_the_examples_are_laid_out_like_the_source(tmp_path):
-    for kind, name, body in BLOCKS:
-        if kind == "file" and name.endswith(".py"):
+    for name, body in FILES:
+        if name.endswith(".py"):
             (tmp_path / Path(name).name).write_text(body, encoding="utf-8")
-        elif kind == "change":
-            path = tmp_path / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if not path.exists():
-                shutil.copy(ROOT / name, path)
-            change(path, body)
+    for name, diff in DIFFS:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            shutil.copy(ROOT / name, path)
+        change(path, diff)
     config = ["--config", str(ROOT / "pyproject.toml")]
     for action in (["check", "--ignore", "INP001"], ["format", "--check"]):
         command = [sys.executable, "-m", "ruff", *action, "-q", *config, str(tmp_path)]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.tools import load_tool
 
 from stlc.controller.policies.policy import Policy
 
@@ -37,13 +36,7 @@ GUARDED = ("specs/traffic.stl", "specs/ship_safe.stl", "specs/ship_track.stl", "
 
 @pytest.fixture(scope="module")
 def pins() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("pins", ROOT / "tools" / "pins.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["pins"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_tool("pins")
 
 
 @pytest.fixture

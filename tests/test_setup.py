@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shlex
 import tomllib
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers.tools import load_tool
 
 from stlc.cli.framework.app import main
 from stlc.version import __version__
@@ -20,9 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 @pytest.fixture
 def environment(monkeypatch, tmp_path):
     """`tools/environment.py` on a tree of its own, with the commands recorded instead of run."""
-    spec = importlib.util.spec_from_file_location("environment", ROOT / "tools/environment.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_tool("environment")
     for name in module.INPUTS:
         (tmp_path / name).write_text((ROOT / name).read_text())
     ran = []

@@ -1,259 +1,440 @@
-"""Metrics of the code's structure.
+"""Measures of the code's structure.
 
-`python tools/structure.py` prints counts and the place of each finding; `--folder` measures another tree.
+`python tools/structure.py` prints, for the package `stlc` of this folder or of `--folder`:
+
+- the syntax nodes, lines and files of each room, and of the package,
+- the names that modules take from other rooms, per 1,000 syntax nodes, and between which rooms most cross,
+- the pairs of rooms that import each other,
+- the places that implement each meaning of `MEANINGS`,
+- the files of each extension that `docs/extending.md` shows.
+
+`--against FOLDER` prints a table of the rooms of both folders instead. A room is a package at most two levels
+below the top (`compile/ir`, `lint`); modules outside of such packages are the room `.`. The limits are in
+`tests/test_structure.py`.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import tokenize
+import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeAlias
 
-CRUMB = 100
-"""Lines below which a module with one importer should be merged into it."""
-NODES = 6
-"""Number of distinguished node classes from which on a function counts as a tree traversal."""
-SHORT = 5
-"""Lines up to which a function with one use should read well without a long docstring, or in its caller."""
-_NO_CODE = (
-    *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
-    *(tokenize.ENCODING, tokenize.ENDMARKER),
-)
-TREES = ("stlc.grammar.ast", "stlc.compile.ir.nodes", "stlc.compile.ir.typed")
-"""Modules that define the tree classes."""
+ROOT = Path(__file__).resolve().parent.parent
+WORST = 12
+"""Number of pairs of rooms that are printed, those between which most names cross."""
+MIRRORED = 0.7
+"""Share of a document's fields from which on it repeats a record that has them too."""
+_UNCOUNTED = (ast.expr_context, ast.operator, ast.cmpop, ast.boolop, ast.unaryop)
 
 
-@dataclass
-class House:
-    """A package as a set of parsed modules.
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Syntax nodes, lines and files of a room."""
 
-    Attributes:
-        root: the folder that holds the package.
-        package: its name.
-    """
+    nodes: int = 0
+    lines: int = 0
+    files: int = 0
+
+    def __add__(self, other: Size) -> Size:
+        return Size(self.nodes + other.nodes, self.lines + other.lines, self.files + other.files)
+
+    def __sub__(self, other: Size) -> Size:
+        return Size(self.nodes - other.nodes, self.lines - other.lines, self.files - other.files)
+
+
+@dataclass(frozen=True)
+class Module:
+    """A parsed module: its path below the package, as names, its room and its text."""
+
+    path: str
+    room: str
+    text: str
+
+    @cached_property
+    def tree(self) -> ast.Module:
+        """Its syntax tree."""
+        return ast.parse(self.text)
+
+    @cached_property
+    def nodes(self) -> Mapping[type[ast.AST], Sequence[Any]]:
+        """All nodes of its syntax tree, by class."""
+        found: defaultdict[type[ast.AST], list[ast.AST]] = defaultdict(list)
+        for node in ast.walk(ast.parse(self.text)):
+            found[type(node)].append(node)
+        return found
+
+    @cached_property
+    def size(self) -> Size:
+        """Syntax nodes, lines and one file.
+
+        Docstrings, annotations of functions, contexts of names and kinds of operators are not counted.
+        """
+        count = sum(len(nodes) for kind, nodes in self.nodes.items() if not issubclass(kind, _UNCOUNTED))
+        omitted: list[ast.AST | None] = [each.annotation for each in self.nodes[ast.arg]]
+        for kind in (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Module):
+            for node in self.nodes[kind]:
+                omitted.append(getattr(node, "returns", None))
+                if node.body and _is_docstring(node.body[0]):
+                    omitted.append(node.body[0])
+                    count += len(node.body) == 1  # as if it were `pass`
+        for each in omitted:
+            if each is not None:
+                count -= sum(not isinstance(node, _UNCOUNTED) for node in ast.walk(each))
+        return Size(count, self.text.count("\n"), 1)
+
+
+def _is_docstring(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
+
+# ------------------------------------------------------------------------------------ rooms and borders
+
+
+@dataclass(frozen=True, order=True)
+class Border:
+    """Two rooms, the first of which takes names from the second."""
+
+    taker: str
+    giver: str
+
+
+@dataclass(frozen=True)
+class Package:
+    """The modules of the package below `root`."""
 
     root: Path
-    package: str = "stlc"
-    files: dict[str, Path] = field(init=False)
-
-    def __post_init__(self) -> None:
-        found = sorted((self.root / self.package).rglob("*.py"))
-        self.files = {self._name(path): path for path in found}
-
-    def _name(self, path: Path) -> str:
-        parts = path.relative_to(self.root).with_suffix("").parts
-        return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+    name: str = "stlc"
 
     @cached_property
-    def lines(self) -> dict[str, int]:
-        """Lines of each module."""
-        return {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in self.files.items()}
+    def modules(self) -> tuple[Module, ...]:
+        """All modules, in the order of their paths."""
+        top = self.root / self.name
+        return tuple(
+            Module(place.as_posix(), self._room(place.parts[:-1]), path.read_text(encoding="utf-8"))
+            for path in sorted(top.rglob("*.py"))
+            for place in (path.relative_to(top),)
+        )
+
+    def _room(self, parts: tuple[str, ...]) -> str:
+        for depth in (2, 1):
+            if len(parts) >= depth and (self.root / self.name).joinpath(*parts[:depth]).is_dir():
+                return "/".join(parts[:depth])
+        return "."
 
     @cached_property
-    def code(self) -> dict[str, int]:
-        """Lines of code of each module: without blank lines, comments and docstrings.
+    def rooms(self) -> dict[str, Size]:
+        """Size of each room, in the order of their names."""
+        sizes: defaultdict[str, Size] = defaultdict(Size)
+        for module in self.modules:
+            sizes[module.room] += module.size
+        return dict(sorted(sizes.items()))
 
-        A text that stands alone as a statement counts as a docstring.
+    @cached_property
+    def size(self) -> Size:
+        """Size of the package."""
+        return sum(self.rooms.values(), Size())
+
+    @cached_property
+    def crossings(self) -> dict[Border, set[str]]:
+        """Names that the modules of a room take from another room.
+
+        A name is imported from a module, or is an attribute of an imported module; the two count apart.
         """
-        return {name: _code_lines(path, self.trees[name]) for name, path in self.files.items()}
+        found: defaultdict[Border, set[str]] = defaultdict(set)
+        for module in self.modules:
+            modules = {}
+            for node in module.nodes[ast.ImportFrom]:
+                top, *parts = (node.module or "").split(".")
+                for alias in node.names if top == self.name else ():
+                    if self._is_module((*parts, alias.name)):
+                        modules[alias.asname or alias.name] = (*parts, alias.name)
+                    elif (giver := self._room(tuple(parts))) != module.room:
+                        found[Border(module.room, giver)].add(f"{node.module}:{alias.name}")
+            for node in module.nodes[ast.Attribute]:
+                place = modules.get(node.value.id) if isinstance(node.value, ast.Name) else None
+                if place and (giver := self._room(place)) != module.room:
+                    found[Border(module.room, giver)].add(".".join((*place, node.attr)))
+        return dict(found)
 
-    @cached_property
-    def trees(self) -> dict[str, ast.Module]:
-        """Syntax tree of each module."""
-        return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in self.files.items()}
+    def _is_module(self, parts: tuple[str, ...]) -> bool:
+        path = (self.root / self.name).joinpath(*parts)
+        return path.is_dir() or path.with_suffix(".py").exists()
 
-    @cached_property
-    def imports(self) -> dict[str, set[str]]:
-        """Modules of the package that each module imports, those for type checkers too."""
-        return {name: set(self._imports(name)) - {name} for name in self.files}
+    @property
+    def crossings_per_1000(self) -> float:
+        """Names that cross rooms, per 1,000 syntax nodes."""
+        return 1000.0 * sum(map(len, self.crossings.values())) / max(self.size.nodes, 1)
 
-    def _imports(self, name: str) -> Iterator[str]:
-        for node in ast.walk(self.trees[name]):
-            if isinstance(node, ast.Import):
-                yield from (alias.name for alias in node.names if alias.name in self.files)
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                for alias in node.names:
-                    full = f"{node.module}.{alias.name}"
-                    if full in self.files:
-                        yield full
-                    elif node.module in self.files:
-                        yield node.module
-
-    def packages(self) -> list[tuple[str, int, int, int]]:
-        """Files, lines and lines of code of each package, two levels deep."""
-        files: Counter[str] = Counter()
-        lines: Counter[str] = Counter()
-        code: Counter[str] = Counter()
-        for name, count in self.lines.items():
-            parts = name.split(".")
-            inner = [".".join(parts[:depth]) for depth in (1, 2, 3)]
-            for package in dict.fromkeys(inner):
-                if (self.root / package.replace(".", "/")).is_dir():
-                    files[package] += 1
-                    lines[package] += count
-                    code[package] += self.code[name]
-        return [(package, files[package], lines[package], code[package]) for package in sorted(files)]
-
-    def crumbs(self) -> list[str]:
-        """Modules with one importer and under `CRUMB` lines, without `__init__.py` files."""
-        importers: dict[str, set[str]] = defaultdict(set)
-        for name, targets in self.imports.items():
-            for target in targets:
-                importers[target].add(name)
-        return [
-            f"{name} ({self.lines[name]} lines, for {next(iter(importers[name]))})"
-            for name, path in self.files.items()
-            if path.name != "__init__.py" and self.lines[name] < CRUMB and len(importers[name]) == 1
-        ]
-
-    def circles(self) -> list[str]:
-        """Import cycles, imports for type checkers included."""
-        index: dict[str, int] = {}
-        low: dict[str, int] = {}
-        stack: list[str] = []
-        found: list[str] = []
-
-        def visit(name: str) -> None:
-            index[name] = low[name] = len(index)
-            stack.append(name)
-            for target in sorted(self.imports[name]):
-                if target not in index:
-                    visit(target)
-                    low[name] = min(low[name], low[target])
-                elif target in stack:
-                    low[name] = min(low[name], index[target])
-            if low[name] == index[name]:
-                group = stack[stack.index(name) :]
-                del stack[-len(group) :]
-                if len(group) > 1:
-                    found.append(" <-> ".join(sorted(group)))
-
-        for name in self.files:
-            if name not in index:
-                visit(name)
-        return found
-
-    def packed(self) -> list[str]:
-        """Parameters that are tuples of different types."""
-        return [
-            f"{name}:{argument.lineno} {function.name}({argument.arg}: {ast.unparse(argument.annotation)})"
-            for name, function in self._functions()
-            for argument in (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)
-            if argument.annotation is not None and _unlike(argument.annotation)
-        ]
-
-    def homonyms(self) -> list[str]:
-        """Public class names in more than one module, except those of the trees."""
-        homes: dict[str, list[str]] = defaultdict(list)
-        for name, tree in self.trees.items():
-            for node in tree.body:
-                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                    homes[node.name].append("the trees" if name in TREES else name)
-        return [f"{name}: {', '.join(where)}" for name, where in sorted(homes.items()) if len(set(where)) > 1]
-
-    def walks(self) -> list[str]:
-        """Functions that distinguish at least `NODES` node classes."""
-        nodes = {
-            node.name
-            for module in TREES
-            for node in (self.trees[module].body if module in self.trees else ())
-            if isinstance(node, ast.ClassDef)
-        }
-        found = []
-        for name, function in self._functions():
-            told = {
-                ast.unparse(part.cls).rpartition(".")[2]
-                for part in ast.walk(function)
-                if isinstance(part, ast.MatchClass)
-            }
-            if len(told & nodes) >= NODES:
-                found.append(f"{name}.{function.name} ({len(told & nodes)})")
-        return found
-
-    def wordy(self) -> list[str]:
-        """Private functions of at most `SHORT` lines, used once in their module, with a longer docstring."""
-        found = []
-        for name, tree in self.trees.items():
-            uses = Counter(
-                node.id if isinstance(node, ast.Name) else node.attr
-                for node in ast.walk(tree)
-                if isinstance(node, ast.Name | ast.Attribute)
-            )
-            for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
-                if function.name[:1] != "_" or uses[function.name] != 1 or not ast.get_docstring(function):
-                    continue
-                prose, *code = function.body
-                lines = _extent(code[0], code[-1]) if code else SHORT + 1
-                if lines <= min(SHORT, _extent(prose, prose) - 1):
-                    found.append(f"{name}:{function.lineno} {function.name} ({lines} lines)")
-        return found
-
-    def _functions(self) -> Iterator[tuple[str, ast.FunctionDef]]:
-        for name, tree in self.trees.items():
-            for node in ast.walk(tree):
-                if isinstance(node, ast.FunctionDef):
-                    yield name, node
+    def circles(self) -> list[Border]:
+        """Pairs of rooms that import each other; no room with one that contains it, nor with the top."""
+        return sorted(
+            border
+            for border in self.crossings
+            if "." < border.taker < border.giver
+            and Border(border.giver, border.taker) in self.crossings
+            and not border.giver.startswith(f"{border.taker}/")
+        )
 
 
-def _extent(first: ast.stmt, last: ast.stmt) -> int:
-    """Number of lines from the beginning of a statement to the end of another."""
-    return (last.end_lineno or last.lineno) - first.lineno + 1
+# --------------------------------------------------------------------------------------- meaning probes
 
 
-def _code_lines(path: Path, tree: ast.Module) -> int:
-    """Number of lines of a file on which a token stands that is neither a comment nor a docstring."""
-    prose = {
-        line
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-        for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+Probe: TypeAlias = Callable[[Package], Iterator[str]]
+"""Places of a package at which something is implemented, as `file:line name`."""
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """A meaning, the module where it belongs, and a probe for its implementations in Python.
+
+    A probe knows an implementation by its form or by its name. Its count is a lower bound: C texts are not
+    looked at, and an implementation of another form is not found.
+    """
+
+    name: str
+    place: str
+    probe: Probe
+
+
+def written(*patterns: str, within: str = "") -> Probe:
+    """Probe for code of the form of a pattern, an expression in which `_` stands for any expression."""
+    wanted = [ast.parse(pattern, mode="eval").body for pattern in patterns]
+
+    def probe(package: Package) -> Iterator[str]:
+        for pattern in wanted:
+            for module, node in _nodes(package, within, type(pattern)):
+                if _has_form(node, pattern):
+                    yield f"{module.path}:{node.lineno} {ast.unparse(node).splitlines()[0]:.60}"
+
+    return probe
+
+
+def _has_form(found: object, pattern: object) -> bool:
+    """True if a syntax tree equals a pattern in which `_` stands for any expression."""
+    if isinstance(pattern, ast.Name) and pattern.id == "_":
+        return isinstance(found, ast.expr)
+    if isinstance(pattern, list):
+        return isinstance(found, list) and len(found) == len(pattern) and all(map(_has_form, found, pattern))
+    if isinstance(pattern, ast.AST):
+        return type(found) is type(pattern) and all(
+            _has_form(getattr(found, name), getattr(pattern, name))
+            for name in pattern._fields
+            if name != "kind"
+        )
+    return type(found) is type(pattern) and found == pattern
+
+
+def defined(names: str, within: str = "") -> Probe:
+    """Probe for classes and functions whose whole name matches a regular expression."""
+
+    def probe(package: Package) -> Iterator[str]:
+        for module, node in _nodes(package, within, ast.FunctionDef, ast.ClassDef):
+            if re.fullmatch(names, node.name):
+                yield f"{module.path}:{node.lineno} {node.name}"
+
+    return probe
+
+
+def recorded(*names: str, least: int) -> Probe:
+    """Probe for classes that declare at least `least` of the named fields."""
+
+    def probe(package: Package) -> Iterator[str]:
+        for module, node in _nodes(package, "", ast.ClassDef):
+            if len(_fields(node) & {*names}) >= least:
+                yield f"{module.path}:{node.lineno} {node.name}"
+
+    return probe
+
+
+def mirrored(package: Package) -> Iterator[str]:
+    """Typed dictionaries with at least `MIRRORED` of their fields, three or more, in one dataclass."""
+    documents: list[tuple[Module, ast.ClassDef, set[str]]] = []
+    records: list[tuple[Module, ast.ClassDef, set[str]]] = []
+    for module, node in _nodes(package, "", ast.ClassDef):
+        typed = any(isinstance(base, ast.Name) and base.id == "TypedDict" for base in node.bases)
+        (documents if typed else records).append((module, node, _fields(node)))
+    for module, node, names in documents:
+        if len(names) >= 3 and max(len(names & other) for *_, other in records) >= MIRRORED * len(names):
+            yield f"{module.path}:{node.lineno} {node.name}"
+
+
+def _fields(node: ast.ClassDef) -> set[str]:
+    return {
+        each.target.id
+        for each in node.body
+        if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name)
     }
-    with path.open("rb") as file:
-        tokens = [token for token in tokenize.tokenize(file.readline) if token.type not in _NO_CODE]
-    lines = {line for token in tokens for line in range(token.start[0], token.end[0] + 1)}
-    return len(lines - prose)
 
 
-def _unlike(annotation: ast.expr) -> bool:
-    """True if an annotation is a tuple of fixed length with entries of different types."""
-    if not (isinstance(annotation, ast.Subscript) and ast.unparse(annotation.value) == "tuple"):
-        return False
-    if not isinstance(annotation.slice, ast.Tuple):
-        return False
-    parts = [ast.unparse(part) for part in annotation.slice.elts]
-    return "..." not in parts and len(set(parts)) > 1
+def _nodes(package: Package, within: str, *kinds: type[ast.AST]) -> Iterator[tuple[Module, Any]]:
+    for module in package.modules:
+        if module.path.startswith(within):
+            for kind in kinds:
+                yield from ((module, node) for node in module.nodes.get(kind, ()))
+
+
+_SEARCHES = (
+    "GradientAscent|Searcher|Exploration|GaussNewton|StagedSearch|RelaxedSearch|CertifiedSearch|SearchPlanner"
+)
+MEANINGS = (
+    Meaning("numbers of one step", "dynamics/model/schedule.py", written("dict(_.lets) | _")),
+    Meaning(
+        "verdict on a requirement",
+        "monitor/judgement.py",
+        recorded(
+            "holds", "fails", "satisfied", "violated", "status", "low", "high", "robustness", "share", least=3
+        ),
+    ),
+    Meaning("document with the fields of a record", "cli/framework/documents.py", mirrored),
+    Meaning(
+        "online evaluator", "monitor/online/", defined(r"\w*Trackers?|Margins|Online", "monitor/online/")
+    ),
+    Meaning(
+        "arithmetic of bounds", "compile/backends/array/interval.py", defined("Intervals|Forms|KnownRanges")
+    ),
+    Meaning("choice among plans", "controller/guard/candidates.py", defined("best")),
+    Meaning("rank of plans", "controller/problem/task.py", defined("rank", "controller/")),
+    Meaning("improvement of a plan", "controller/guard/search.py", defined(_SEARCHES)),
+    Meaning("name of a guard", "registry.py", written("'paper'", "'full'")),
+    Meaning(
+        "verdict by the tolerance",
+        "compile/semantics/tolerance.py",
+        written("_ >= -TOLERANCE", "_ < -TOLERANCE", "_.ge(_, -TOLERANCE)"),
+    ),
+    Meaning("until", "compile/backends/array/windows.py", defined(r"\w*until\w*", "compile/backends/")),
+    Meaning("smooth maximum of two", "compile/backends/array/namespace.py", written("_.log1p(_.exp(_))")),
+    Meaning("overall robustness", "compile/semantics/tolerance.py", written("weighed(_, _, _)")),
+    Meaning("squash of a control", "dynamics/model/controls.py", defined("squash(ed)?")),
+    Meaning("archive of files", "controller/parallel/", written("tarfile.open")),
+)
+
+
+def implementations(package: Package) -> dict[str, list[str]]:
+    """Places that implement each meaning."""
+    return {meaning.name: list(meaning.probe(package)) for meaning in MEANINGS}
+
+
+# ------------------------------------------------------------------------------------- files per change
+
+
+_BLOCK = re.compile(r"^<!-- (file|change|check): (.+?) -->\n```\w+\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """An extension that the documentation shows, with the source that it needs.
+
+    Attributes:
+        kind: its name, the title of its section without the article.
+        files: new files, path -> text.
+        diffs: changed files, path -> diff.
+        checks: programs that must run afterwards, name -> text.
+    """
+
+    kind: str
+    files: Mapping[str, str]
+    diffs: Mapping[str, str]
+    checks: Mapping[str, str]
+
+    @property
+    def counted(self) -> int:
+        """Number of source files that are written or changed."""
+        return sum(name.endswith(".py") for name in (*self.files, *self.diffs))
+
+    @property
+    def lines(self) -> int:
+        """Number of lines that the diffs add."""
+        return sum(line.startswith("+") for diff in self.diffs.values() for line in diff.splitlines())
+
+
+def changes(text: str) -> list[Change]:
+    """Extensions of the page `docs/extending.md`, one a section."""
+    found = []
+    for section in re.split(r"^## An? ", text, flags=re.MULTILINE)[1:]:
+        blocks = _BLOCK.findall(section)
+        of = {
+            kind: {name: body for each, name, body in blocks if each == kind}
+            for kind in ("file", "change", "check")
+        }
+        found.append(Change(section.partition("\n")[0], of["file"], of["change"], of["check"]))
+    return found
+
+
+# ----------------------------------------------------------------------------------------------- output
+
+
+def table(sizes: Iterable[tuple[str, Size]]) -> Iterator[str]:
+    """Lines of a table of rooms."""
+    yield f"{'room':30}{'nodes':>9}{'lines':>9}{'files':>7}"
+    for room, size in sizes:
+        yield f"{room:30}{size.nodes:9,}{size.lines:9,}{size.files:7}"
+
+
+def comparison(before: Package, after: Package) -> Iterator[str]:
+    """Lines of a table of rooms before and after, with the differences; rooms of equal size are left out."""
+    head = "".join(f"{name:>9}{'then':>9}{'':>8}" for name in ("nodes", "lines", "files"))
+    yield f"{'room':30}{head}"
+    rows = [
+        (room, before.rooms.get(room, Size()), after.rooms.get(room, Size()))
+        for room in sorted({*before.rooms, *after.rooms})
+    ]
+    for room, old, new in (*rows, ("total", before.size, after.size)):
+        change = new - old
+        if old != new or room == "total":
+            cells = (
+                (old.nodes, new.nodes, change.nodes),
+                (old.lines, new.lines, change.lines),
+                (old.files, new.files, change.files),
+            )
+            yield f"{room:30}" + "".join(f"{a:9,}{b:9,}{c:+8,}" for a, b, c in cells)
+
+
+def report(package: Package) -> Iterator[str]:
+    """Lines with all measures of a package."""
+    yield from table((*package.rooms.items(), ("total", package.size)))
+    yield f"\nnames that cross rooms, per 1,000 nodes: {package.crossings_per_1000:.2f}"
+    for border, names in sorted(package.crossings.items(), key=lambda each: -len(each[1]))[:WORST]:
+        yield f"  {border.taker} takes {len(names)} of {border.giver}"
+    circles = package.circles()
+    yield f"\npairs of rooms that import each other: {len(circles)}"
+    for border in circles:
+        here, back = package.crossings[border], package.crossings[Border(border.giver, border.taker)]
+        yield f"  {border.taker} takes {len(here)} of {border.giver}, which takes {len(back)}"
+    yield "\nimplementations of a meaning, and the module where it belongs"
+    places = {meaning.name: meaning.place for meaning in MEANINGS}
+    for name, found in implementations(package).items():
+        files = Counter(place.partition(":")[0] for place in found)
+        yield f"  {name}: {len(found)} in {len(files)} files ({places[name]})"
+    if (page := package.root / "docs/extending.md").exists():
+        yield "\nsource files of an extension"
+        yield from (f"  {each.kind}: {each.counted}" for each in changes(page.read_text(encoding="utf-8")))
 
 
 def main() -> None:
-    """Print the metrics."""
+    """Print the measures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--folder", type=Path, default=Path(__file__).resolve().parent.parent)
-    parser.add_argument("--brief", action="store_true", help="counts alone")
+    parser.add_argument("--folder", type=Path, default=ROOT, help="folder that holds the package")
+    parser.add_argument(
+        "--against", type=Path, help="folder with an earlier state, for a table of differences"
+    )
+    parser.add_argument("--meaning", help="print the places that implement this meaning")
     options = parser.parse_args()
-    house = House(options.folder)
-    for package, files, lines, code in house.packages():
-        print(f"{package:40} {files:4} files {lines:6} lines {code:6} of code")
-    print()
-    for title, found in (
-        (f"modules with one importer and under {CRUMB} lines", house.crumbs()),
-        ("import circles", house.circles()),
-        ("parameters that pack a tuple of unlike things", house.packed()),
-        ("public classes of one name and two meanings", house.homonyms()),
-        (f"functions that tell {NODES} or more tree nodes apart", house.walks()),
-        (f"functions of up to {SHORT} lines with one use and a longer docstring", house.wordy()),
-    ):
-        print(f"{title}: {len(found)}")
-        if not options.brief:
-            print("".join(f"  {each}\n" for each in found), end="")
+    package = Package(options.folder)
+    if options.meaning:
+        lines: Iterable[str] = implementations(package).get(options.meaning, ())
+    elif options.against:
+        lines = comparison(Package(options.against), package)
+    else:
+        lines = report(package)
+    print("\n".join(lines))
 
 
 if __name__ == "__main__":

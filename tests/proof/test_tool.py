@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from types import ModuleType
 import pytest
 import typer
 from helpers.formula_strategies import formulas
+from helpers.tools import load_tool
 from hypothesis import strategies as st
 from proof.cases import Case
 
@@ -19,13 +19,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def proofs() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("proofs", ROOT / "tools" / "proofs.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["proofs"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_tool("proofs")
 
 
 def told(proofs: ModuleType, capsys: pytest.CaptureFixture[str], **options: object) -> tuple[int, list[str]]:
