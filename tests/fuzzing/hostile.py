@@ -69,7 +69,7 @@ DRIVING = ("simulate", "drawn", "resume")
 """Commands that run the Python of a run's own folder."""
 
 _WRITTEN = (
-    *("report.html", "driven.png", "map.png", "failures.png", "scene.png", "small.gif", "small.mp4"),
+    *("report.html", "driven.png", "map.png", "failures.png", "scene.png", "small.gif"),
     *(
         "eval/scenarios.json",
         "export/c/stlc_controller.h",
