@@ -19,7 +19,7 @@ from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.parallel import executor
-from stlc.controller.parallel.bundle import input_files
+from stlc.controller.parallel.inputs import input_files
 from stlc.controller.parallel.jobs import Job
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.budget import Clock

@@ -43,7 +43,6 @@ IMPLEMENTATIONS = {
     "smooth maximum of two": 4,
     "overall robustness": 6,
     "squash of a control": 2,
-    "archive of files": 2,
 }
 
 

@@ -311,7 +311,6 @@ MEANINGS = (
     Meaning("smooth maximum of two", "compile/backends/array/namespace.py", written("_.log1p(_.exp(_))")),
     Meaning("overall robustness", "compile/semantics/tolerance.py", written("weighed(_, _, _)")),
     Meaning("squash of a control", "dynamics/model/controls.py", defined("squash(ed)?")),
-    Meaning("archive of files", "controller/parallel/", written("tarfile.open")),
 )
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stlc.assurance.certificate import Sample
     from stlc.cli.check.judge import Question
     from stlc.cli.check.outcome import Checked
-    from stlc.controller.parallel.workers import CallFiles, LostCall
+    from stlc.controller.parallel.workers import LostCall
 
 SMALL = 1_000_000
 """File size in bytes below which the unpacked content always fits into memory."""
@@ -83,14 +83,18 @@ def _judged(works: Sequence[Work], places: Places) -> Iterator[tuple[int, list[O
         yield from enumerate(map(safe_outcomes, works))
         return
     from stlc.controller.parallel import workers_of
-    from stlc.controller.parallel.workers import LostCall, results
+    from stlc.controller.parallel.workers import CallFiles, LostCall, results
 
     sent: Sequence[Work] = works
-    read: Callable[[Work], CallFiles] = _no_files
+    texts: Sequence[Path] = ()
     if places.cluster is not None:
         sent = [replace(work, name=_seen(work)) for work in works]
-        read = _files_of(works[0].question)
-    with workers_of(places.processes(len(works)), places.cluster) as workers:
+        texts = _texts(works[0].question)
+
+    def read(work: Work) -> CallFiles:
+        return CallFiles((*texts, Path(work.name)), () if work.out is None else (work.out,))
+
+    with workers_of(places.processes(len(works)), places.cluster, files=texts) as workers:
         for ended in results(workers, safe_outcomes, sent, files=read):
             value = ended.value
             yield ended.index, [_lost(works[ended.index], value)] if isinstance(value, LostCall) else value
@@ -115,24 +119,12 @@ def _seen(work: Work) -> str:
     return work.name
 
 
-def _no_files(_work: Work) -> CallFiles:
-    from stlc.controller.parallel.workers import NO_FILES
-
-    return NO_FILES
-
-
-def _files_of(question: Question) -> Callable[[Work], CallFiles]:
-    """Return the function that lists the files of a call: the specification, what it names, and the trace."""
-    from stlc.controller.parallel.bundle import input_files
-    from stlc.controller.parallel.workers import CallFiles
+def _texts(question: Question) -> Sequence[Path]:
+    """Files of the specification and of what it names."""
+    from stlc.controller.parallel.inputs import input_files
 
     spec = question.spec
-    texts = () if spec is None else input_files(spec, question.system, question.overrides)
-
-    def of(work: Work) -> CallFiles:
-        return CallFiles((*texts, Path(work.name)), () if work.out is None else (work.out,))
-
-    return of
+    return () if spec is None else input_files(spec, question.system, question.overrides)
 
 
 def safe_outcomes(work: Work) -> list[Outcome]:

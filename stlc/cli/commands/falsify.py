@@ -278,12 +278,13 @@ class _Source:
         if not target.model:  # processes elsewhere have other folders
             target = replace(target, name=str(Path(target.name).resolve()))
         sent = replace(self, target=target, jobs=1, cluster=None)
-        calls = workers_of(self.jobs, self.cluster, fresh=True)
-        return SimulatorWorkers(sent, calls, sent.files())
+        files = sent.files()
+        calls = workers_of(self.jobs, self.cluster, fresh=True, files=files.inputs)
+        return SimulatorWorkers(sent, calls, files)
 
     def files(self) -> CallFiles:
         """Files that the simulator reads, those of a black box among them."""
-        from stlc.controller.parallel.bundle import input_files
+        from stlc.controller.parallel.inputs import input_files
         from stlc.controller.parallel.workers import CallFiles
 
         target = self.target

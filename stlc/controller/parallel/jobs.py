@@ -58,6 +58,15 @@ class JobResult:
     said: str
     cores: int
 
+    @classmethod
+    def of(cls, job: Job, code: int, outputs: tuple[str, str], share: frozenset[int]) -> JobResult:
+        """Result of a process, from its standard output and error, on the cores `share`."""
+        document = None
+        with suppress(ValueError):
+            document = json.loads(outputs[0])
+        tail = "\n".join(outputs[1].splitlines()[-TAIL:])
+        return cls(job, code, document if isinstance(document, dict) else None, tail, len(share))
+
     @property
     def result(self) -> dict[str, Any]:
         """The entry `result` of the printed JSON object, which describes the run; empty if there is none."""
@@ -127,13 +136,12 @@ class LocalExecutor:
             if process is None:
                 return JobResult(job, -signal.SIGINT, None, "", len(share))
             started(job)
-            out, said = process.communicate()
+            outputs = process.communicate()
             with self.lock:
                 self.live.discard(process)
         finally:
             self.shares.put(share)
-        tail = "\n".join(said.splitlines()[-TAIL:])
-        return JobResult(job, process.returncode, document_of(out), tail, len(share))
+        return JobResult.of(job, process.returncode, outputs, share)
 
     def _start(self, job: Job, share: frozenset[int]) -> subprocess.Popen[str] | None:
         """Start the job's process on the cores `share`; return None if the executor was stopped."""
@@ -166,15 +174,12 @@ class LocalExecutor:
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-def start(
-    arguments: Sequence[str], share: frozenset[int] | None = None, folder: Path | None = None
-) -> subprocess.Popen[str]:
+def start(arguments: Sequence[str], share: frozenset[int] | None = None) -> subprocess.Popen[str]:
     """Start a process of `stlc train --json` with pipes for its outputs, and return it.
 
     Args:
         arguments: arguments of `stlc train`.
         share: cores to which the process is pinned; all if None.
-        folder: working directory; the current one if None.
     """
     process = subprocess.Popen(
         [sys.executable, "-m", "stlc", "train", *arguments, "--json"],
@@ -183,7 +188,6 @@ def start(
         text=True,
         encoding="utf-8",
         env={**os.environ, "PYTHONIOENCODING": "utf-8", CHILD: f"{0.7 * PATIENCE}"},
-        cwd=folder,
         start_new_session=True,  # Ctrl-C reaches it once, through the caller
     )
     if share and hasattr(os, "sched_setaffinity"):
@@ -203,12 +207,3 @@ def core_shares(jobs: int) -> list[frozenset[int]]:
         return [frozenset(cores)] * jobs
     edges = [round(i * len(cores) / jobs) for i in range(jobs + 1)]
     return [frozenset(cores[edges[i] : edges[i + 1]]) for i in range(jobs)]
-
-
-def document_of(text: str) -> dict[str, Any] | None:
-    """Parse the output `text` of a process as a JSON object; None if it is not one."""
-    with suppress(ValueError):
-        found = json.loads(text)
-        if isinstance(found, dict):
-            return found
-    return None

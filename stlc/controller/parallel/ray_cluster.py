@@ -1,31 +1,24 @@
-"""Tasks of a Ray cluster (`pip install 'stlc[cluster]'`): calls of functions, and training runs."""
+"""Workers of a Ray cluster (`pip install 'stlc[cluster]'`)."""
 
 from __future__ import annotations
 
 import io
 import os
-import signal
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout, suppress
-from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Self, TextIO, cast
 
-from stlc.controller.parallel.bundle import BundleResult, JobBundle, import_run, run_bundle
-from stlc.controller.parallel.elsewhere import RemoteCall, RemoteValue, answer
-from stlc.controller.parallel.jobs import Job, JobResult
+from stlc.controller.parallel.elsewhere import RemoteCall, RemoteValue, answer, linked
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, LostCall
 from stlc.diagnostics import Diagnostic, MissingError
 
-LOST = -signal.SIGKILL
-"""Exit code of a job whose worker is lost."""
-
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-_PATIENCE = 60.0
-"""Seconds for interrupted trainings to save."""
 _AHEAD = 2
 """Submitted calls per CPU of the cluster, so that no worker waits for the next one."""
 
@@ -41,12 +34,14 @@ class RayWorkers:
             machine alone.
         cores: CPUs per call.
         gpus: GPUs per call.
+        files: files and folders that calls read, sent to every machine of the cluster.
     """
 
-    def __init__(self, address: str, cores: int = 1, gpus: int = 0) -> None:
-        self._address, self._cores, self._gpus = address, cores, gpus
+    def __init__(self, address: str, cores: int = 1, gpus: int = 0, files: Sequence[Path] = ()) -> None:
+        self._address, self._cores, self._gpus, self._files = address, cores, gpus, files
         self._ray: Any = None
-        self._remotes: dict[Callable[[Any], Any], Any] = {}
+        self._answer: Any = None
+        self._linked: Mapping[str, str] = {}
         self._going: dict[Any, int] = {}
         self._calls: dict[int, RemoteCall] = {}
         self._sends = False
@@ -54,12 +49,18 @@ class RayWorkers:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Connect to the cluster.
+        """Connect to the cluster, and hand it the files.
 
         Raises:
-            MissingError: R301, Ray is not installed; R302, there is no such cluster.
+            MissingError: R301, Ray is not installed; R302, there is no such cluster, or it does not take the
+                files, which are too large.
+            RunError: R110, a folder of a run contains a link.
         """
-        self._ray = _connected(self._address)
+        with tempfile.TemporaryDirectory(prefix="stlc-") as folder:
+            self._linked = linked(self._files, Path(folder))
+            self._ray = _connected(self._address, folder if self._linked else None)
+        options = {"num_cpus": self._cores, "num_gpus": self._gpus, "max_retries": 0}
+        self._answer = self._ray.remote(answer).options(**options)
         if sys.stdout is not None:  # closed by the caller
             self._stack.enter_context(redirect_stdout(cast(TextIO, _WithoutNotices(sys.stdout))))
         return self
@@ -91,16 +92,12 @@ class RayWorkers:
         self, key: int, function: Callable[[Any], Any], argument: object, files: CallFiles = NO_FILES
     ) -> None:
         """Start a call. Once a worker has asked for its files, those of later calls are sent at once."""
-        call = RemoteCall.of(function, argument, files)
-        self._calls[key] = call
-        self.start(key, answer, call.with_files() if self._sends else call)
+        call = RemoteCall.of(function, argument, files, self._linked)
+        self._start(key, call.with_files() if self._sends else call)
 
-    def start(self, key: int, function: Callable[[Any], Any], argument: object) -> None:
-        """Start a call as it is, in the working directory of the worker."""
-        if function not in self._remotes:
-            options = {"num_cpus": self._cores, "num_gpus": self._gpus, "max_retries": 0}
-            self._remotes[function] = self._ray.remote(function).options(**options)
-        self._going[self._remotes[function].remote(argument)] = key
+    def _start(self, key: int, call: RemoteCall) -> None:
+        self._calls[key] = call
+        self._going[self._answer.remote(call)] = key
 
     def result(self) -> tuple[int, Any]:
         """Wait for the end of a call, and return its key with its value or a `LostCall`.
@@ -108,20 +105,26 @@ class RayWorkers:
         Raises:
             Exception: what the function raised.
         """
+        key, found = self.answered(raises=True)
+        return key, found if isinstance(found, LostCall) else found.delivered()
+
+    def answered(self, *, raises: bool = False) -> tuple[int, RemoteValue | LostCall]:
+        """Wait for the end of a call, and return its key with the answer of the worker.
+
+        An exception of the function is raised if `raises`; otherwise it counts as a lost worker.
+        """
         while True:
             (done, *_), _ = self._ray.wait(list(self._going))
             key = self._going.pop(done)
-            call = self._calls.pop(key, None)
-            value = self._value(done, raises=call is not None)
-            if call is None or not isinstance(value, RemoteValue):
-                return key, value
-            if not value.missing:
-                return key, value.delivered()
-            self._calls[key], self._sends = call, True
-            self.start(key, answer, call.with_files())
+            call = self._calls.pop(key)
+            found = self._value(done, raises=raises)
+            if isinstance(found, LostCall) or not found.missing:
+                return key, found
+            self._sends = True
+            self._start(key, call.with_files())
 
-    def recalled(self, patience: float) -> Iterator[tuple[int, Any]]:
-        """Ask all calls in progress to end, and yield the results of those that do within `patience` seconds.
+    def recalled(self, patience: float) -> Iterator[tuple[int, RemoteValue | LostCall]]:
+        """Ask all calls in progress to end, and yield the answers of those that do within `patience` seconds.
 
         A call that has not begun is dropped; in any other one `KeyboardInterrupt` is raised.
         """
@@ -136,85 +139,20 @@ class RayWorkers:
             with suppress(Exception):
                 yield going[task], self._value(task, raises=False)
 
-    def _value(self, task: Any, *, raises: bool) -> Any:
-        """Value of a finished task; a `LostCall` if its worker was lost.
+    def _value(self, task: Any, *, raises: bool) -> RemoteValue | LostCall:
+        """Answer of a finished task; a `LostCall` if its worker was lost.
 
         An exception of the function is raised if `raises`; otherwise it counts as a lost worker.
         """
         try:
-            return self._ray.get(task)
+            found: RemoteValue = self._ray.get(task)
+            return found
         except self._ray.exceptions.RayError as error:
             raised = isinstance(error, self._ray.exceptions.RayTaskError)
             if raised and raises:
                 raise getattr(error, "cause", error) from error
             lines = [line.strip() for line in str(error).splitlines() if line.strip()]
             return LostCall((lines or [type(error).__name__])[-1 if raised else 0])
-
-
-@dataclass(frozen=True, slots=True)
-class RayExecutor:
-    """Executor of jobs as Ray tasks, as many at a time as the cluster has CPUs for.
-
-    Attributes:
-        address: address of the cluster, see `RayWorkers`.
-        cores: CPUs per job.
-        gpus: GPUs per job.
-    """
-
-    address: str
-    cores: int = 1
-    gpus: int = 0
-
-    def run(
-        self, jobs: Sequence[Job], started: Callable[[Job], None] = lambda _: None
-    ) -> Iterator[JobResult]:
-        """Run jobs, store their runs in the jobs' folders, and yield the result of each when it ends.
-
-        When the caller is interrupted or closes the iterator, running jobs are asked to save and stop, and
-        the runs that they save are stored in the same way.
-
-        Raises:
-            MissingError: R301, Ray is not installed; R302, there is no such cluster.
-        """
-        going: dict[int, _Sent] = {}
-        with RayWorkers(self.address, self.cores, self.gpus) as workers:
-            try:
-                for key, job in enumerate(jobs):
-                    bundle = JobBundle.of(job, self.cores)
-                    going[key] = _Sent(job, bundle)
-                    workers.start(key, run_bundle, bundle)
-                    started(job)
-                while going:
-                    key, found = workers.result()
-                    yield going.pop(key).received(found)
-            except BaseException:
-                for sent in going.values():
-                    sent.bundle.close()
-                for key, found in workers.recalled(_PATIENCE):
-                    with suppress(Exception):
-                        going[key].received(found)
-                raise
-            finally:
-                for sent in going.values():
-                    sent.bundle.close()
-
-
-@dataclass(frozen=True, slots=True)
-class _Sent:
-    """A submitted job and its bundle."""
-
-    job: Job
-    bundle: JobBundle
-
-    def received(self, found: BundleResult | LostCall) -> JobResult:
-        """Store the run of a finished job among the caller's runs, and return its result.
-
-        If the job was lost, the result has the exit code `LOST`.
-        """
-        self.bundle.close()
-        if isinstance(found, LostCall):
-            return JobResult(self.job, LOST, None, found.reason, 0)
-        return import_run(self.job, self.bundle, found)
 
 
 class _WithoutNotices:
@@ -235,11 +173,13 @@ class _WithoutNotices:
         return getattr(self._stream, name)
 
 
-def _connected(address: str) -> Any:
+def _connected(address: str, folder: str | None) -> Any:
     """Connect to the cluster at `address` and return the module `ray`.
 
+    `folder`: files for the working directories of the workers; None if there are none.
+
     Raises:
-        MissingError: R301, Ray is not installed; R302, there is no such cluster.
+        MissingError: R301, Ray is not installed; R302, there is no such cluster, or it refuses the files.
     """
     os.environ.update({key: value for key, value in _QUIET.items() if key not in os.environ})
     try:
@@ -247,20 +187,23 @@ def _connected(address: str) -> Any:
     except ModuleNotFoundError:
         message = "`--cluster` needs ray, which is not installed"
         raise MissingError(Diagnostic("R301", message, help=("pip install 'stlc[cluster]'",))) from None
+    settings = {"log_to_driver": False, "logging_level": "error", "ignore_reinit_error": True}
+    environment = None if folder is None else {"working_dir": folder}
     try:
-        ray.init(address=address, log_to_driver=False, logging_level="error", ignore_reinit_error=True)
+        ray.init(address=address, runtime_env=environment, **settings)
+    except ray.exceptions.RuntimeEnvSetupError as error:
+        raise _no_cluster(f"the cluster at `{address}` does not take the input files", error) from error
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-        reason = str(error).strip().splitlines()[:1]
-        raise MissingError(
-            Diagnostic(
-                "R302",
-                f"there is no cluster at `{address}`",
-                note=tuple(reason),
-                help=(
-                    "`ray start --head` begins one",
-                    "`--cluster local` is one of this machine alone",
-                    "if the cluster asks for a token, set RAY_AUTH_MODE=token",
-                ),
-            )
+        raise _no_cluster(
+            f"there is no cluster at `{address}`",
+            error,
+            "`ray start --head` begins one",
+            "`--cluster local` is one of this machine alone",
+            "if the cluster asks for a token, set RAY_AUTH_MODE=token",
         ) from error
     return ray
+
+
+def _no_cluster(message: str, error: Exception, *ways_out: str) -> MissingError:
+    reason = str(error).strip().splitlines()[:1]
+    return MissingError(Diagnostic("R302", message, note=tuple(reason), help=ways_out))

@@ -17,11 +17,12 @@ import pytest
 from helpers.documents import misfits
 
 from stlc.cli.check.judge import Question, Work
-from stlc.cli.check.many import _files_of, safe_outcomes
+from stlc.cli.check.many import safe_outcomes
 from stlc.cli.check.table import COLUMNS
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.elsewhere import RemoteCall, answer
+from stlc.controller.parallel.workers import CallFiles
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor, first_violation
 from stlc.trace import Trace, load_trace
@@ -232,8 +233,8 @@ def test_a_machine_that_does_not_see_the_files_gives_the_same(tmp_path: Path) ->
     for name in ("logs/1/high.csv", str(tmp_path / "logs/2/broken.csv")):
         work = Work(name, question, Path("runs"), Path("out") / f"{Path(name).stem}.npz", table=True)
         here = safe_outcomes(work)[0]
-        call = RemoteCall.of(safe_outcomes, work, _files_of(question)(work)).with_files()
-        far = answer(_unseen(call))
+        files = CallFiles((tmp_path / "s.stl", Path(name)), (work.out,))
+        far = answer(_unseen(RemoteCall.of(safe_outcomes, work, files, {}).with_files()))
         assert replace(far.delivered()[0], seconds=0.0) == replace(here, seconds=0.0)
         assert (far.outputs == {}) == bool(here.errors)
     assert load_trace("out/high.npz").data["low"].min() == -2.0

@@ -12,8 +12,9 @@ import pytest
 
 from benchmarks.__main__ import main as measure
 from stlc.cli.framework.app import main
+from stlc.controller.parallel.elsewhere import SeenFile
 from stlc.controller.parallel.jobs import Job
-from stlc.controller.parallel.ray_cluster import RayExecutor
+from stlc.controller.parallel.ray_jobs import RayExecutor
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[3]
@@ -45,16 +46,22 @@ def test_without_ray_it_is_said_how_to_get_it(
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("shared", [True, False])
 def test_specifications_are_trained_for_on_a_cluster(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    shared: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("ray")
+    if not shared:  # no machine recognises the files of the caller
+        monkeypatch.setattr(SeenFile, "of", lambda path: SeenFile(str(path), -1, 0))
     code = main(["train", *SPECS, *QUICK, "--runs", str(tmp_path), "--cluster", "local", "--json"])
     document = json.loads(capsys.readouterr().out)
     assert document["exit_code"] == code
     assert [run["spec"] for run in document["result"]["runs"]] == SPECS
     assert sorted(run.path.parent.name for run in every_run(tmp_path)) == ["ship_safe", "traffic"]
     assert {run.status for run in every_run(tmp_path)} == {"finished"}
+    assert {run.path for run in every_run(tmp_path)} == {
+        Path(run["run"]).resolve() for run in document["result"]["runs"]
+    }
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from stlc.cli.framework.app import main
+from stlc.controller.parallel.elsewhere import SeenFile
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
 
@@ -137,6 +138,54 @@ def test_a_file_whose_workers_are_always_killed_is_not_judged(
         code, result = printed(capsys, *words)
     assert len(killed) == 3
     assert (code, result) == (5, {"trace": "long.npz", "verdict": "not judged"})
+
+
+@pytest.fixture
+def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Input files that no machine recognises as those of the caller, so that copies are sent."""
+    monkeypatch.setattr(SeenFile, "of", lambda path: SeenFile(str(path), -1, 0))
+
+
+@pytest.mark.usefixtures("recordings", "unseen")
+def test_files_are_judged_where_nobody_sees_them(cluster: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("far").mkdir()
+    words = ("check", "s.stl", "logs/**/00*.npz")
+    here = printed(capsys, *words, "--out", "near")
+    there = printed(capsys, *words, "--out", "far", "--cluster", cluster.address)
+    assert there == here
+    names = sorted(path.name for path in Path("near").iterdir())
+    assert sorted(path.name for path in Path("far").iterdir()) == names
+    assert len(names) > 1
+    for name in names:
+        assert Path("far", name).read_bytes() == Path("near", name).read_bytes()
+
+
+@pytest.mark.usefixtures("unseen")
+def test_searches_where_nobody_sees_the_files(
+    cluster: Any, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("oscillator.yaml").write_text(SYSTEM)
+    Path("oscillator.stl").write_text(CLAIMS)
+    words = ["falsify", "oscillator.stl", "--simulations", "40", "--batch", "4", "--require", "bounded"]
+    code, here = printed(capsys, *words)
+    there = printed(capsys, *words, "--cluster", cluster.address)
+    for each in (*here["requirements"], *there[1]["requirements"]):
+        del each["seconds"]
+    assert there == (code, here)
+
+
+def test_files_that_are_too_large_are_refused(
+    cluster: Any, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ray._private.runtime_env.packaging.GCS_STORAGE_MAX_SIZE", 100)
+    Path("oscillator.yaml").write_text(f"{SYSTEM}# not sent before\n")
+    Path("oscillator.stl").write_text(CLAIMS)
+    assert main(["falsify", "oscillator.stl", "--cluster", cluster.address]) == 5
+    said = capsys.readouterr().err
+    assert f"error[R302]: the cluster at `{cluster.address}` does not take the input files" in said
+    assert "exceeds the maximum size" in said
 
 
 SYSTEM = """

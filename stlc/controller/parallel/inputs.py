@@ -1,0 +1,49 @@
+"""Input files of a training run: the specification, and what it and its system name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from stlc.compile.frontend.modules import Module, load_modules
+from stlc.diagnostics import StlcError
+from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.robots.functions import function_files
+from stlc.files import find_spec, find_system, read_source
+from stlc.grammar.parse.parser import parse
+
+
+def input_files(
+    path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
+) -> tuple[Path, ...]:
+    """Paths of the input files of a training run.
+
+    If a file has errors, the files that it names may be missing; the training itself reports the errors.
+
+    Args:
+        path: path of the specification.
+        system: system file that replaces the one named by the specification.
+        overrides: values of `--set`.
+    """
+    path = find_spec(path)
+    found: dict[Path, None] = {path: None}
+    with suppress(StlcError):
+        spec = parse(read_source(path))
+        found.update(dict.fromkeys(_imported(load_modules(spec))))
+        if (wanted := system or spec.system) is not None:
+            there = find_system(wanted, path)
+            found[there] = None
+            decl = load_system_decl(there, overrides or {})
+            found.update(dict.fromkeys(function_files(decl).values()))
+            found.update(dict.fromkeys(world.path for world in decl.worlds))
+            for judge in decl.judges:
+                found[judge.path] = None
+                found.update(dict.fromkeys(_imported(load_modules(parse(read_source(judge.path))))))
+    return tuple(file for file in found if file.is_file())
+
+
+def _imported(modules: tuple[Module, ...]) -> Iterator[Path]:
+    for module in modules:
+        yield Path(module.spec.source.name)
+        yield from _imported(module.imports)
