@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.deployments import sampled_states
 from benchmarks.timing import Times, after_warm_up
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import TO_SPARE, Limits
 from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.guard.guard import Guard

@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
 from stlc.cli.framework.output import say
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.parallel import executor

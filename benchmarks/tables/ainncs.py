@@ -32,7 +32,7 @@ from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.load import load_task
 from stlc.controller.training.budget import clock_of
 from stlc.diagnostics import usage

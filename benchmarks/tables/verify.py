@@ -23,7 +23,7 @@ from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.controller.training.budget import clock_of
 from stlc.controller.training.run import Run

@@ -16,8 +16,7 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numbers, written
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
 from stlc.compile.ir import nodes as ir
-from stlc.compile.semantics.semantics import TOLERANCE
-from stlc.compile.semantics.tolerance import weighed
+from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor
 from stlc.controller.problem.task import TIE, Task

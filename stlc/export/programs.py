@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import best, finite, grid_of
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.problem.task import PlanVerdicts, Task, rank

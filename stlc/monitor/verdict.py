@@ -17,8 +17,8 @@ from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.schedule.schedule import Boundary
-from stlc.compile.semantics.semantics import TOLERANCE, Semantics, semantics_of
-from stlc.compile.semantics.tolerance import weighed
+from stlc.compile.semantics.semantics import Semantics, semantics_of
+from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast

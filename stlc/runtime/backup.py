@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.runtime.facts import ControllerQuantity
 from stlc.runtime.graphs import Graphs, JudgedPlans, Numbers, joined
 

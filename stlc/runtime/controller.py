@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.registry import GUARDS
 from stlc.runtime.backup import POLICY, Found, search

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.escape import script_json
 from stlc.jsontext import dumps
 from stlc.monitor.judgement import beside

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import margin_unit
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.explain.report import violations

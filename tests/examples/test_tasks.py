@@ -13,7 +13,7 @@ import torch
 from examples.test_plants import PLANTS
 
 from stlc.cli.framework.app import main
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.closed_loop import fresh_share
 from stlc.controller.problem.task import Task
 from stlc.controller.training.run import Run

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.online.margins import Margins
 from stlc.monitor.online.trackers import RecomputeTracker

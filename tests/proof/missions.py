@@ -22,7 +22,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import absolute, nodes
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic
 
 BATCH = 4

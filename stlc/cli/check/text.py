@@ -14,7 +14,7 @@ from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import margin_units
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.escape import operand, shell, visible
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.judgement import Judgement, Part, Verdict, beside

@@ -408,7 +408,7 @@ def _command(source: _Source, path: Path) -> str:
 def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: Path) -> Answer[FalsifyResult]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
     from stlc.assurance.simulation import Focus
-    from stlc.compile.semantics.semantics import TOLERANCE
+    from stlc.compile.semantics.tolerance import TOLERANCE
     from stlc.trace import load_trace
 
     stored = _stored(path)

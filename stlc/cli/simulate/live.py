@@ -17,7 +17,7 @@ from rich.text import Text
 from stlc.cli.check.text import percent, signed
 from stlc.cli.framework.output import table
 from stlc.compile.ir.traverse import margin_unit
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import SOURCES
 
 if TYPE_CHECKING:

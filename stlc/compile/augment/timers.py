@@ -16,7 +16,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import joined
 from stlc.compile.ir.traverse import map_children
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.signature import Column
 from stlc.source import Span
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.metrics import measure

@@ -16,7 +16,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.support import reach
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
 from stlc.controller.guard.feasibility import viable as search_safe
 

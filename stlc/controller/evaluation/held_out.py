@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED

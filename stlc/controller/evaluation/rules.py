@@ -17,7 +17,7 @@ import torch
 
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import safety_task, solvable
 from stlc.controller.training.run import INDEX, read_library, save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError

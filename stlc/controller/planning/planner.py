@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import FINITE, bounds_of
 from stlc.controller.policies.policy import Policy
 from stlc.diagnostics import Diagnostic, UsageError, usage

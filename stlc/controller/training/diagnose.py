@@ -27,8 +27,8 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
-from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import Hard
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.exploration import EFFORTS, Exploration

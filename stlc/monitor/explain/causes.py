@@ -42,7 +42,7 @@ from stlc.compile.ir.traverse import (
     substitute_frozen,
 )
 from stlc.compile.lowering.lower import lower
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.cells import over_columns
 from stlc.monitor.holes import KNOWN
 from stlc.monitor.values import Record, assume_missing_true, bounds

@@ -12,7 +12,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import leaves, nodes
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic
 from stlc.monitor.facts.evidence import Evidence
 from stlc.monitor.facts.extent import samples_read

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir.support import columns, history
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
 from stlc.monitor.online.history import ColumnHistory, Floats

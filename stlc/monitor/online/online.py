@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, final
 import numpy as np
 
 from stlc.compile.pipeline import Compiled, CompiledRequirement
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, beyond, check_length, starts_of, widened

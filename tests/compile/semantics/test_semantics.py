@@ -19,7 +19,6 @@ from stlc.compile.ir import typed
 from stlc.compile.lowering.lower import lower
 from stlc.compile.semantics.semantics import (
     SEMANTICS,
-    TOLERANCE,
     ArithmeticGeometricMean,
     Exact,
     GeneralizedMean,
@@ -28,6 +27,7 @@ from stlc.compile.semantics.semantics import (
     Semantics,
     semantics_of,
 )
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import UsageError
 
 ALL = [SEMANTICS.get(name)() for name in SEMANTICS.names]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.methods import Validation
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
