@@ -192,11 +192,13 @@ def _connected(address: str, folder: str | None) -> Any:
     try:
         ray.init(address=address, runtime_env=environment, **settings)
     except ray.exceptions.RuntimeEnvSetupError as error:
-        raise _no_cluster(f"the cluster at `{address}` does not take the input files", error) from error
+        ray.shutdown()
+        message = f"the cluster at `{address}` does not take the input files"
+        raise _no_cluster(message, str(error).partition("\n")[2]) from error
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
         raise _no_cluster(
             f"there is no cluster at `{address}`",
-            error,
+            str(error),
             "`ray start --head` begins one",
             "`--cluster local` is one of this machine alone",
             "if the cluster asks for a token, set RAY_AUTH_MODE=token",
@@ -204,6 +206,7 @@ def _connected(address: str, folder: str | None) -> Any:
     return ray
 
 
-def _no_cluster(message: str, error: Exception, *ways_out: str) -> MissingError:
-    reason = str(error).strip().splitlines()[:1]
-    return MissingError(Diagnostic("R302", message, note=tuple(reason), help=ways_out))
+def _no_cluster(message: str, reason: str, *ways_out: str) -> MissingError:
+    return MissingError(
+        Diagnostic("R302", message, note=tuple(reason.strip().splitlines()[:1]), help=ways_out)
+    )
