@@ -74,7 +74,7 @@ def kernel() -> None:
 
 
 def lines_of(data: bytes, width: int, wanted: tuple[int, ...] | None = None) -> list[list[float]] | None:
-    """What the kernel reads."""
+    """Numbers that the kernel reads, a list for each column."""
     columns = read_lines(data, 0, width, ",", range(width) if wanted is None else wanted)
     return None if columns is None else [column.tolist() for column in columns]
 

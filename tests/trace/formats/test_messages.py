@@ -1,4 +1,4 @@
-"""What is read of logged messages: names, elements by their names, stamps, texts, and what has no values."""
+"""Signals of logged messages: names, elements by their names, stamps, texts; messages without values."""
 
 from __future__ import annotations
 
