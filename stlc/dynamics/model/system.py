@@ -337,7 +337,11 @@ class System:
             else:
                 generator.manual_seed(seed)
         states = self.initial.sample(n, generator)
-        return self.with_added(states, generator).to(device=device, dtype=dtype)
+        return self._completed(self.with_added(states, generator).to(device=device, dtype=dtype))
+
+    def _completed(self, states: Tensor) -> Tensor:
+        """Initial states, (n, dim), with what this system alone knows of them."""
+        return states
 
     # -------------------------------------------------------------- policy, objective
 

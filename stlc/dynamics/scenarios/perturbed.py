@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from stlc.compile.frontend.scope import Entry, Known
@@ -208,30 +207,20 @@ class PerturbedSystem(System):
         """The true system of the agents `rows`, (k,) int64, alone."""
         return PerturbedSystem(self._factored, self.values[rows])
 
-    def sample(
-        self,
-        n: int,
-        *,
-        seed: int | None = None,
-        generator: torch.Generator | None = None,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str | None = None,
-    ) -> Tensor:
-        """Draw n initial states of the model, (n, dim); see `System.sample`.
-
-        Columns that follow from the others, such as held values, are computed with the errors of the agents.
+    def _completed(self, states: Tensor) -> Tensor:
+        """Compute columns that follow from the others, such as held values, with the errors of the agents.
 
         Raises:
             UsageError: U101, they depend on the errors, and there are not as many states as agents.
         """
-        drawn = super().sample(n, seed=seed, generator=generator, dtype=dtype, device=device)
         if not self._started:
-            return drawn
-        if n != len(self.values):
+            return states
+        if len(states) != len(self.values):
             names = ", ".join(f"`{each.name}`" for each in self._started)
             message = f"{names} at the start depends on the errors of the {len(self.values)} agents"
-            raise usage(f"{message}, and the world draws {n} states", "draw one state for each agent")
-        return completed(drawn, self.names, self._started, self._factors)
+            ways_out = "draw one state for each agent"
+            raise usage(f"{message}, and the world draws {len(states)} states", ways_out)
+        return completed(states, self.names, self._started, self._factors)
 
     def _inputs(self, u: Tensor) -> Columns:
         """Return the controls and the factors of the uncertain numbers as columns by name."""
