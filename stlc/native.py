@@ -62,9 +62,6 @@ def never() -> bool:
     return False
 
 
-Doubles = "NDArray[np.float64]"
-
-
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
     """Parameters of a local search in native code; all arrays are contiguous float64.

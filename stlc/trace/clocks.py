@@ -60,9 +60,6 @@ _OF_DAY = re.compile(r"(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2}(?:[.,]\d+)?))?
 _OFFSET = re.compile(r"(.*:.*\d)\s*(?:(?P<sign>[+-])(?P<h>\d{2}):?(?P<m>\d{2})|Z|UTC)", re.IGNORECASE)
 _YEAR_LAST = re.compile(r"(?P<d>\d{1,2})\.(?P<m>\d{1,2})\.(?P<y>\d{4})(?P<rest>.*)", re.DOTALL)
 _SECONDS, _NANOSECONDS = {"sec", "secs"}, ("nanosec", "nsec", "nsecs")
-_OF_SOURCE = re.compile(
-    r"(?:gps|gnss|utc|sim|ros|sys|system|log|host|wall|unix|boot|server)[ _]", re.IGNORECASE
-)
 _SAME = 1e-6
 _PACE = 0.02
 """Logarithm of the ratio of the steps of two clocks up to which they agree; crystals drift less."""

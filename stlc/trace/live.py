@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.jsontext import loads
@@ -38,7 +37,6 @@ from stlc.trace.time_grid import (
 from stlc.trace.trace import Reading
 from stlc.trace.tracks import OneTrace
 
-Floats = NDArray[np.float64]
 Sample = Mapping[str, float]
 """Signal -> number; NaN where it is unknown. The components of a vector are `q[0]`, `q[1]`, …"""
 

@@ -19,7 +19,6 @@ from stlc.trace.meta import TraceMeta
 from stlc.units import CELSIUS, DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_unit, same_dims
 
 Array = NDArray[Any]
-Floats = NDArray[np.float64]
 
 CLOCK = "t"
 ROSTOPIC = "%time"

@@ -178,10 +178,6 @@ class Page:
             for match in _FENCE.finditer(self.text)
         )
 
-    def having(self, note: str) -> tuple[Example, ...]:
-        """Return the examples whose notes include `note`."""
-        return tuple(example for example in self.examples if note in example.notes)
-
 
 def read_page(name: str) -> Page | None:
     """Return the manual page `name` (an error code or `precedence`); None if there is no such page."""

@@ -41,16 +41,14 @@ class Joint:
         name: name in the robot description.
         kind: type of the joint, such as `revolute`.
         parent: link that it is attached to.
-        child: link that it moves.
-        offset: origin of the child's frame, (3,), in metres.
-        rotation: rotation matrix of the child's frame at joint position 0, (3, 3).
-        axis: unit vector in the frame of the child, (3,).
+        offset: origin of the frame of the link that it moves, (3,), in metres.
+        rotation: rotation matrix of this frame at joint position 0, (3, 3).
+        axis: unit vector in this frame, (3,).
     """
 
     name: str
     kind: Kind
     parent: str
-    child: str
     offset: Doubles
     rotation: Doubles
     axis: Doubles
@@ -124,7 +122,6 @@ def _joint(element: ElementTree.Element) -> Joint:
         name=name,
         kind=kind,
         parent=_link(element, "parent"),
-        child=_link(element, "child"),
         offset=_triple(origin, "xyz", (0.0, 0.0, 0.0), name),
         rotation=_rotation(*_triple(origin, "rpy", (0.0, 0.0, 0.0), name)),
         axis=along / length if kind != "fixed" else along,
