@@ -275,7 +275,8 @@ def find_system(name: str, spec_path: Path | None = None) -> Path:
         for suffix in _SYSTEM_SUFFIXES:
             path = folder / f"{name}{suffix}"
             if path.is_file():
-                return _straight(path)
+                short = Path(os.path.normpath(path))  # not `specs/../examples/car.yaml`, unless links differ
+                return short if short.is_file() and short.samefile(path) else path
     raise UsageError(_no_such("system", name, folders))
 
 
@@ -294,12 +295,6 @@ def find_spec(name: Path | str) -> Path:
     if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
         return path
     return next((there for folder in (LIBRARY, SPECS) if (there := folder / path).is_file()), path)
-
-
-def _straight(path: Path) -> Path:
-    """Shorten `specs/../examples/car.yaml` to `examples/car.yaml`, unless that is another file (links)."""
-    short = Path(os.path.normpath(path))
-    return short if short.is_file() and short.samefile(path) else path
 
 
 def find_trace(name: str, runs: Path = Path("runs")) -> Path:

@@ -44,15 +44,6 @@ def plain(value: object) -> Json:
             return [plain(item) for item in value]
         case PurePath():
             return value.as_posix()
-    return _foreign(value)
-
-
-def _foreign(value: object) -> Json:
-    """Convert an object to JSON data: a dataclass, or an array with a method `tolist` (NumPy, torch).
-
-    Raises:
-        TypeError: the object is neither.
-    """
     if is_dataclass(value) and not isinstance(value, type):
         return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
     to_list = getattr(value, "tolist", None)

@@ -252,7 +252,11 @@ def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
                 )
             started = process
             with leaving(lambda _code: _kill(started)):
-                _limit_time(process)
+                with suppress(ImportError, AttributeError, OSError, ValueError):
+                    import resource
+
+                    most = int(BUSY) + 5  # ends the program and its children even if this process ends first
+                    resource.prlimit(process.pid, resource.RLIMIT_CPU, (most, most))
                 _await(process)
         except BaseException:
             if process is not None:
@@ -287,18 +291,6 @@ def _signals_deferred() -> Iterator[None]:
             signal.signal(number, handler)
         for each in received:
             signal.raise_signal(each)
-
-
-def _limit_time(process: subprocess.Popen[bytes]) -> None:
-    """Limit the processor time of a program and its children.
-
-    The limit ends them even if this process ends first.
-    """
-    with suppress(ImportError, AttributeError, OSError, ValueError):
-        import resource
-
-        most = int(BUSY) + 5
-        resource.prlimit(process.pid, resource.RLIMIT_CPU, (most, most))
 
 
 def _await(process: subprocess.Popen[bytes]) -> None:

@@ -108,10 +108,6 @@ def _declaration(comment: Span) -> Span:
     at = bisect_right(starts, items[index].start)
     limit = starts[at] if at < len(starts) else len(text)
     last = bisect_left(items, limit, key=lambda item: item.start) - 1
-    ends = _line_end(text, max(comment.end + alone, items[last].end))
+    found = text.find("\n", max(comment.end + alone, items[last].end))
+    ends = len(text) if found < 0 else found
     return source.span(min(comment.start, starts[at - 1]), ends)
-
-
-def _line_end(text: str, offset: int) -> int:
-    found = text.find("\n", offset)
-    return len(text) if found < 0 else found

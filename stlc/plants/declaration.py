@@ -569,7 +569,9 @@ class _Reading:
         free = [name for name in names if name not in controller.writes]
         own = [each.name for each in inputs]
         for section, used, known in (("reads", controller.reads, free), ("writes", controller.writes, own)):
-            nodes = self._items(section)
+            keys = self.keys.controller
+            node = keys.get(section) if isinstance(keys, MappingNode) else None
+            nodes = node.items if isinstance(node, Sequence) else ()
             for index, name in enumerate(used):
                 span = nodes[index].span if index < len(nodes) else self.root.span
                 if name not in known:
@@ -577,10 +579,6 @@ class _Reading:
                     self.reader.report("S103", f"`{name}` is no name that `{section}` can have", span, listed)
                 elif name in used[:index]:
                     self.reader.report("S103", f"`{name}` is named twice in `{section}`", span)
-
-    def _items(self, section: str) -> tuple[Node, ...]:
-        node = self.keys.controller.get(section) if isinstance(self.keys.controller, MappingNode) else None
-        return node.items if isinstance(node, Sequence) else ()
 
     def _distinct(
         self,

@@ -265,7 +265,10 @@ class Plant:
             process.end()
             raise
         finally:
-            self._returned(process)
+            if process.alive and not self.decl.limits.fresh:
+                self._idle.append(process)
+            else:
+                self._discard(process)
 
     def watch(self, point: Floats, monitor: Online, *, seed: int = 0) -> PlantFinding | None:
         """Simulate the plant at one point, and feed its samples into an online monitor.
@@ -303,12 +306,6 @@ class Plant:
             self._discard(process)
             raise KeyboardInterrupt
         return process
-
-    def _returned(self, process: PlantProcess) -> None:
-        if process.alive and not self.decl.limits.fresh:
-            self._idle.append(process)
-        else:
-            self._discard(process)
 
     def _discard(self, process: PlantProcess) -> None:
         process.end()

@@ -104,7 +104,10 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
         try:
             if simulator is None:
                 layout = layout_of(request.header["layout"])
-                _limit_memory(layout.memory)
+                with suppress(ImportError, OSError, ValueError):  # where the system has no limit
+                    import resource
+
+                    resource.setrlimit(resource.RLIMIT_AS, (layout.memory, layout.memory))
                 simulator = ControlledPlant(layout)
                 reply = Message({"units": simulator.units}, np.zeros((0, 0)))
             else:
@@ -135,14 +138,6 @@ def _failure(error: BaseException, step: int) -> dict[str, Any]:
         sys.stderr.flush()
     message = f"{type(error).__name__}: {error}".strip(": ")[:500]
     return {"fault": "error", "message": message, "step": step}
-
-
-def _limit_memory(most: int) -> None:
-    """Limit the address space of this process to `most` bytes, where the system can."""
-    with suppress(ImportError, OSError, ValueError):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
 def _disconnect(*numbers: int) -> None:

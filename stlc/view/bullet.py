@@ -115,7 +115,10 @@ class Renderer:
             self.count = stage.joints.shape[1]
             self.places = PITCH * stage.reach * np.arange(self.count)[:, None] * np.array([1.0, 0.0, 0.0])
             if mode == "window":
-                self._prepare_window()
+                self.client.configureDebugVisualizer(self.client.COV_ENABLE_GUI, 0)
+                self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)  # while robots load
+                away = 0.5 * PITCH * self.stage.reach * max(self.count, 2)
+                self.client.resetDebugVisualizerCamera(away, 10, -20, self._middle())
             self.robots = self._robots()
             self.discs = [self._disc(place) for place in self.places]
             self.balls = [[self._ball(ball) for _ in range(self.count)] for ball in stage.balls]
@@ -210,13 +213,6 @@ class Renderer:
     def _middle(self) -> list[float]:
         return [float(self.places[:, 0].mean()), 0.0, 0.5 * self.stage.reach]
 
-    def _prepare_window(self) -> None:
-        """Hide the window's panels, and suspend rendering while robots are loaded."""
-        self.client.configureDebugVisualizer(self.client.COV_ENABLE_GUI, 0)
-        self.client.configureDebugVisualizer(self.client.COV_ENABLE_RENDERING, 0)
-        away = 0.5 * PITCH * self.stage.reach * max(self.count, 2)
-        self.client.resetDebugVisualizerCamera(away, 10, -20, self._middle())
-
     def _rendered(self) -> NDArray[np.float64]:
         reach = self.stage.reach
         wide, high = 0.5 * PITCH * reach * self.count, _FIELD * reach
@@ -291,7 +287,10 @@ def with_visuals(urdf: Path, meshes: Mapping[str, str], folder: Path) -> Path:
     ends = _ends(robot)
     for link in robot.findall("link"):
         name = link.get("name", "")
-        _weigh(link)
+        if link.find("inertial") is None:  # PyBullet warns of links without a mass
+            inertial = ElementTree.SubElement(link, "inertial")
+            ElementTree.SubElement(inertial, "mass", value="1")
+            ElementTree.SubElement(inertial, "inertia", attrib=_UNIT_MASS)
         mesh = _mesh(meshes.get(name))
         if mesh is not None:
             geometry = ElementTree.SubElement(ElementTree.SubElement(link, "visual"), "geometry")
@@ -323,14 +322,6 @@ def _ends(robot: ElementTree.Element) -> dict[str, list[tuple[float, float, floa
         if parent is not None:
             found.setdefault(parent.get("link", ""), []).append((x, y, z))
     return found
-
-
-def _weigh(link: ElementTree.Element) -> None:
-    """Give a link a mass, since PyBullet warns of links without one."""
-    if link.find("inertial") is None:
-        inertial = ElementTree.SubElement(link, "inertial")
-        ElementTree.SubElement(inertial, "mass", value="1")
-        ElementTree.SubElement(inertial, "inertia", attrib=_UNIT_MASS)
 
 
 def _rod(link: ElementTree.Element, end: tuple[float, float, float]) -> None:

@@ -138,7 +138,10 @@ def judge(name: str, question: Question, runs: Path) -> list[Checked]:
     """
     path = found(name, runs)
     loaded = load(path, question)
-    remarks = (*_newest_remark(name, path), *([loaded.note] if loaded.note else ()))
+    remarks = (
+        *(() if path == Path(name) else (f"taking {path}, of the newest run",)),
+        *([loaded.note] if loaded.note else ()),
+    )
     return [_judged(trace, loaded, question, remarks) for trace in loaded.traces]
 
 
@@ -195,14 +198,6 @@ def _judged(trace: Trace, loaded: Loaded, question: Question, remarks: tuple[str
     lint = _lint_codes(loaded.monitor, everywhere=question.at == "all")
     known = (trace, loaded.source, verdict, causes, options, remarks, question.uncertain)
     return Checked(*known, facts=verdict.facts, lint=lint)
-
-
-def _newest_remark(name: str, path: Path) -> tuple[str, ...]:
-    """Return a remark that names the file `path`, if it was found in the newest run; else an empty tuple.
-
-    `name` is the name that the user gave.
-    """
-    return () if path == Path(name) else (f"taking {path}, of the newest run",)
 
 
 def options_of(question: Question) -> dict[str, tuple[str, ...]]:

@@ -49,7 +49,11 @@ def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> 
     if (folder / "run.json").is_file():
         ending.append(f"next: {shell(('stlc', 'report', str(folder)))}")
     gaps = (
-        *(*_clock_texts(result), *_error_texts(result), *_gap_texts(result).values()),
+        *(
+            *[f"clock {visible(str(clock))}" for clock in result.trace.clocks if not clock.plain],
+            *[f"`{visible(name)}` may be off by {error}" for name, error in result.uncertain.items()],
+            *_gap_texts(result).values(),
+        ),
         *map(fact_text, result.facts_on("")),
     )
     return text_of(title, rows, gaps, reasons, ending, several=verdict.traces > 1)
@@ -205,15 +209,6 @@ def _gap_texts(result: Checked) -> dict[str, str]:
         name: gap_text(name, gap, samples, (moment(gap.first), moment(gap.last)))
         for name, gap in subject.gaps.items()
     }
-
-
-def _clock_texts(result: Checked) -> list[str]:
-    """Lines on the clocks that were chosen, unless there was nothing to choose."""
-    return [f"clock {visible(str(clock))}" for clock in result.trace.clocks if not clock.plain]
-
-
-def _error_texts(result: Checked) -> list[str]:
-    return [f"`{visible(name)}` may be off by {error}" for name, error in result.uncertain.items()]
 
 
 def _inconclusive(judged: Judgement, result: Checked) -> str:

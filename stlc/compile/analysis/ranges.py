@@ -66,7 +66,10 @@ def bounds(num: ir.Num, facts: KnownRanges) -> Bounds | None:
         case ir.Op(name, args):
             return _op(name, [bounds(arg, facts) for arg in args])
         case ir.Where(_, yes, no):
-            return _hull(bounds(yes, facts), bounds(no, facts))
+            left, right = bounds(yes, facts), bounds(no, facts)
+            if left is None or right is None:
+                return None
+            return (min(left[0], right[0]), max(left[1], right[1]))
         case ir.Indicator():
             return (0.0, 1.0)
         case ir.Extern():
@@ -88,12 +91,6 @@ def has_value(num: ir.Op) -> bool:
 
 
 _ANYTHING = (-math.inf, math.inf)
-
-
-def _hull(left: Bounds | None, right: Bounds | None) -> Bounds | None:
-    if left is None or right is None:
-        return None
-    return (min(left[0], right[0]), max(left[1], right[1]))
 
 
 def _op(name: str, args: Sequence[Bounds | None]) -> Bounds | None:

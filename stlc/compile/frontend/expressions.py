@@ -165,7 +165,12 @@ def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str
         truth = ir.Const(float(cond.value)) if isinstance(cond, ir.Truth) else ir.Indicator(cond)
         return Number(truth, kind="bool", span=expr.span)
     if column is not None and column.labels and isinstance(value, EnumMember):
-        return _member_of_column(value, expr, column, scope)
+        known = dict(column.labels)
+        if value.name not in known:
+            names = ", ".join(f"`{name}`" for name in known)
+            message = f"`{value.name}` is not a member of the enum of `{column.name}`"
+            scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
+        return Number(ir.Const(known[value.name]), kind="enum", labels=column.labels, span=expr.span)
     if isinstance(value, typed.Node) and not isinstance(value, typed.Truth) and not scope.in_spec:
         help_ = (f"`ind({expr.span.text})` is 1 where it holds and 0 elsewhere",) if is_state(value) else ()
         scope.fail(
@@ -175,15 +180,6 @@ def _stored_value(value: Value, expr: ast.Expr, column: Column | None, what: str
         )
     number = loose_number(value, expr, Expectation(f"{what} is a number"), scope)
     return number if column is None else _fitted(number, expr, column, scope)
-
-
-def _member_of_column(value: EnumMember, expr: ast.Expr, column: Column, scope: Scope) -> Number:
-    known = dict(column.labels)
-    if value.name not in known:
-        names = ", ".join(f"`{name}`" for name in known)
-        message = f"`{value.name}` is not a member of the enum of `{column.name}`"
-        scope.fail(Diagnostic("E205", message, expr.span, help=(f"its members are {names}",)))
-    return Number(ir.Const(known[value.name]), kind="enum", labels=column.labels, span=expr.span)
 
 
 def _fitted(number: Number, expr: ast.Expr, column: Column, scope: Scope) -> Number:

@@ -207,13 +207,10 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
         general = Bounds(float(option.name in _POSITIVE), _MOST.get(option.name, MOST))
         bounds = bounds_of(option, general)
         each = value if option.name == "hidden" else (value,)
-        if not all(_is_number(number, kinds) and number in bounds for number in each):
+        fits = (isinstance(x, kinds) and not isinstance(x, bool) and x in bounds for x in each)
+        if not all(fits):
             raise ValueError(f"`{option.name}` is {value!r:.40}, not {bounds}")
     return config
-
-
-def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
-    return isinstance(value, kinds) and not isinstance(value, bool)
 
 
 def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:

@@ -177,20 +177,14 @@ class Missions(Supply):
         self.pool, self.age = self._at(judged, legs), self.age + legs
         seen = torch.cat((*glimpses, self.pool))
         seen = seen[self.task.alive(seen)]
-        self._begin_anew(satisfied(judged.rho))
-        starts = self._starts(max(int(STARTS * len(seen)), 1))
-        seen = torch.cat((seen, starts))
-        return seen[self._order(len(seen))]
-
-    def _begin_anew(self, good: Tensor) -> None:
-        """Restart missions that are over or can no longer succeed, and some missions whose plan fails.
-
-        `good`: mask of the missions whose present plan satisfies the specification, (POOL,).
-        """
-        given_up = ~good & (self._rand(len(good)) < GIVE_UP)
+        failing = ~satisfied(judged.rho)
+        given_up = failing & (self._rand(len(failing)) < GIVE_UP)
         ended = (self.age > mission_steps(self.task)) | ~self.task.alive(self.pool) | given_up
         place = ended.nonzero()[:, 0]
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
+        starts = self._starts(max(int(STARTS * len(seen)), 1))
+        seen = torch.cat((seen, starts))
+        return seen[self._order(len(seen))]
 
     def _legs(self, n: int) -> Tensor:
         """Draw numbers of steps to simulate, one for each of `n` plans, (n,) int64.

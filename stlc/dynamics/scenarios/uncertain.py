@@ -58,7 +58,7 @@ def uncertain_numbers(decl: SystemDecl, found: SystemKeys) -> UncertainNumbers:
     Raises:
         SystemFileError: S212, an error of a number cannot be carried to a place where it stands.
     """
-    listed, reads = decl.test.uncertain, _reads_of_constants(found.const)
+    listed, reads = decl.test.uncertain, {name: _names_in(value) for name, value in _items(found.const)}
     if listed is not None:
         _require_carried(found, decl, listed, reads)
         return UncertainNumbers(tuple(sorted(set(listed))), {})
@@ -203,11 +203,6 @@ def _names_read(text: str) -> frozenset[str]:
     except StlcError:  # a word of the format, or text
         return frozenset()
     return frozenset(part.name for part in descendants(expr) if isinstance(part, ast.Name))
-
-
-def _reads_of_constants(node: Node | None) -> Mapping[str, frozenset[str]]:
-    """Return the names that the value of each constant reads."""
-    return {name: _names_in(value) for name, value in _items(node)}
 
 
 def _with_sources(names: Iterable[str], reads: Mapping[str, frozenset[str]]) -> frozenset[str]:

@@ -151,7 +151,12 @@ class Fmu:
         """Instantiate the FMU, set its start values, and initialise it."""
         from fmpy.simulation import instantiate_fmu
 
-        self._release()
+        self._solver = None
+        if self._instance is not None:
+            if not self.ended:
+                self._instance.terminate()
+            self._instance.freeInstance()
+            self._instance = None
         self._steps, self.ended = 0, False
         kind = "ModelExchange" if self._exchange else "CoSimulation"
         self._instance = instance = instantiate_fmu(self._folder, self._description, kind)
@@ -217,15 +222,6 @@ class Fmu:
             for place, value in zip(places, values, strict=True):
                 found[place] = float(value)
         return found
-
-    def _release(self) -> None:
-        """Free the instance of the previous simulation."""
-        self._solver = None
-        if self._instance is not None:
-            if not self.ended:
-                self._instance.terminate()
-            self._instance.freeInstance()
-            self._instance = None
 
 
 def _grouped(variables: _Variables, ports: Sequence[Any]) -> dict[str, tuple[list[int], list[int]]]:
