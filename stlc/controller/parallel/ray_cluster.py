@@ -56,8 +56,10 @@ class RayWorkers:
                 files, which are too large.
             RunError: R110, a folder of a run contains a link.
         """
+        ray = sys.modules.get("ray")
         with tempfile.TemporaryDirectory(prefix="stlc-") as folder:
-            self._linked = linked(self._files, Path(folder))
+            if ray is None or not ray.is_initialized():  # a connection that is there keeps its own folder
+                self._linked = linked(self._files, Path(folder))
             self._ray = _connected(self._address, folder if self._linked else None)
         options = {"num_cpus": self._cores, "num_gpus": self._gpus, "max_retries": 0}
         self._answer = self._ray.remote(answer).options(**options)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +17,10 @@ from benchmarks.__main__ import main as measure
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.elsewhere import SeenFile
 from stlc.controller.parallel.jobs import Job
+from stlc.controller.parallel.ray_cluster import RayWorkers
 from stlc.controller.parallel.ray_jobs import RayExecutor
+from stlc.controller.parallel.workers import CallFiles, results
+from stlc.diagnostics import MissingError
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[3]
@@ -42,6 +48,98 @@ def test_without_ray_it_is_said_how_to_get_it(
     assert program([*command, "--steps", "5", "--cluster", "local"]) == 5
     assert "pip install 'stlc[cluster]'" in capsys.readouterr().err
     assert list(tmp_path.glob("*")) == []
+
+
+class Ray:
+    """A cluster of one worker in this process, whose working directory is the one that it was given."""
+
+    class exceptions:  # noqa: N801
+        RayError = type("RayError", (Exception,), {})
+        RayTaskError = type("RayTaskError", (RayError,), {})
+        RuntimeEnvSetupError = type("RuntimeEnvSetupError", (RayError,), {})
+
+    def __init__(self, folder: Path, limit: int = 1000) -> None:
+        self.folder, self.limit, self.connected = folder, limit, False
+
+    def is_initialized(self) -> bool:
+        return self.connected
+
+    def init(self, runtime_env: dict[str, str] | None, **_: Any) -> None:
+        if runtime_env is not None and not self.connected:
+            shutil.copytree(runtime_env["working_dir"], self.folder, dirs_exist_ok=True)
+            if sum(path.stat().st_size for path in self.folder.iterdir()) > self.limit:
+                raise self.exceptions.RuntimeEnvSetupError("Failed.\nThe package is too large.\nMore.")
+        self.connected = True
+
+    def shutdown(self) -> None:
+        self.connected = False
+
+    def remote(self, function: Any) -> Any:
+        def call(argument: Any) -> Task:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.chdir(self.folder)
+                return Task([function(argument)])
+
+        return SimpleNamespace(options=lambda **_: SimpleNamespace(remote=call))
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 1.0}
+
+    def wait(self, tasks: list[Task]) -> tuple[list[Task], list[Task]]:
+        return tasks[:1], tasks[1:]
+
+    def get(self, task: Task) -> Any:
+        return task.value[0]
+
+
+@dataclass(eq=False)
+class Task:
+    value: list[Any]
+
+
+def texts(paths: tuple[str, ...]) -> list[str]:
+    return [Path(path).read_text() for path in paths]
+
+
+@pytest.fixture
+def ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ray:
+    (tmp_path / "worker").mkdir()
+    for name in ("spec.stl", "a.csv", "b.csv"):
+        (tmp_path / name).write_text(f"text of {name}")
+    found = Ray(tmp_path / "worker")
+    monkeypatch.setitem(sys.modules, "ray", found)  # type: ignore[arg-type]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(SeenFile, "here", False)
+    return found
+
+
+@pytest.mark.parametrize("connected", [False, True])
+def test_files_of_every_call_are_sent_once(ray: Ray, connected: bool) -> None:
+    ray.connected = connected
+    with RayWorkers("auto", files=[Path("spec.stl")]) as workers:
+        assert [path.read_text() for path in ray.folder.iterdir()] == (
+            [] if connected else ["text of spec.stl"]
+        )
+        found = results(
+            workers,
+            texts,
+            [("spec.stl", "a.csv"), ("spec.stl", "b.csv"), ("spec.stl",)],
+            files=lambda names: CallFiles(tuple(map(Path, names))),
+        )
+        assert sorted(each.value for each in found) == [
+            ["text of spec.stl"],
+            ["text of spec.stl", "text of a.csv"],
+            ["text of spec.stl", "text of b.csv"],
+        ]
+
+
+def test_a_cluster_that_does_not_take_the_files(ray: Ray) -> None:
+    ray.limit = 3
+    with pytest.raises(MissingError) as found, RayWorkers("10.0.0.1:6379", files=[Path("spec.stl")]):
+        pass
+    (finding,) = found.value.diagnostics
+    assert (finding.code, finding.note) == ("R302", ("The package is too large.",))
+    assert "the cluster at `10.0.0.1:6379` does not take the input files" in finding.message
 
 
 @pytest.mark.slow
