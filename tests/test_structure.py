@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 459_685
+NODES = 459_701
 CROSSINGS = 6.73
 CIRCLES = {
     ("cli/certify", "cli/check"),
