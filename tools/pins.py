@@ -105,6 +105,7 @@ VOLATILE: Mapping[str, str] = {
     "runs*.versions.*": "of the installation",
     "runs*.hardware.*": "of the machine",
     "runs*.git*": "of the checkout",
+    "*.evidence.trace.sha256": "of a file with the version of the program and times of decisions",
 }
 """Patterns of places that differ between runs, each with the reason.
 
@@ -255,8 +256,10 @@ Pins = Iterator[tuple[str, Any]]
 
 
 def stem(path: str) -> str:
-    """The name of a file without folder and suffix."""
-    return Path(path).stem
+    """The name of a file without suffix; with its folder, `tasks-either_or`, if another is called alike."""
+    file = Path(path)
+    alike = [each for each in (*SPECS, *SYSTEMS) if Path(each).name == file.name]
+    return f"{file.parent.name}-{file.stem}" if len(alike) > 1 else file.stem
 
 
 # ---------------------------------------------------------------------------------------------- documents
@@ -356,7 +359,7 @@ def verdicts(place: Place) -> Pins:
     """Pins of verdicts on traces of every shipped specification, with all options."""
     for number, spec in enumerate(SPECS):
         name = stem(spec)
-        if name == "transmission":
+        if spec.endswith("/transmission.stl"):
             columns, dt = transmission(), 0.05
         else:
             columns, dt = wander(system_of(place, spec), number)
@@ -479,7 +482,7 @@ def online(monitor: Monitor, signals: Mapping[str, Any]) -> list[list[Any]]:
 def emitted(place: Place) -> Pins:
     """Pins of the C texts of every specification with a system, with their sha256."""
     for spec in SPECS:
-        if stem(spec) == "transmission":
+        if spec.endswith("/transmission.stl"):
             continue
         try:
             texts = kernels(Task.of(load(place.work / spec), system_of(place, spec)))

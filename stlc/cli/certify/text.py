@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment
     from stlc.cli.framework.assured import Assurance
 
-GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS), help="Guard of the policy.")]
+GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS.installed), help="Guard of the policy.")]
 CertifyOption = Annotated[
     float | None,
     typer.Option(

@@ -79,7 +79,7 @@ def simulate(
     guard: Annotated[
         str | None,
         typer.Option(
-            metavar="|".join(GUARDS),
+            metavar="|".join(GUARDS.installed),
             help=f"Guard, by default {GUARDS.default}; {EACH}.",
         ),
     ] = None,

@@ -7,7 +7,7 @@ from stlc.registry import GUARDS
 
 Num: TypeAlias = float | str
 Count = Annotated[int, 0]
-GuardName = Annotated[str, GUARDS]
+GuardName = Annotated[str, lambda: GUARDS.installed]
 ComparedGuard = Annotated[str, compared_guards]
 
 
