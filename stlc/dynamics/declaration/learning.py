@@ -11,7 +11,7 @@ from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.declaration.motion import Assign, state_assigns
+from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
 from stlc.dynamics.model.algebra import names_in, substitute
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, ControlDecl, each_number
@@ -212,22 +212,26 @@ def _feedback(cx: Context, node: Node, label: str) -> dict[str, Any]:
 
 
 @reads(items_of(VECTOR))
-def _observed(cx: Context, node: Node, label: str) -> tuple[ir.Num, ...]:
-    return tuple(num for item in cx.reader.items(node, label) for num in _seen(item, cx))
+def _observed(cx: Context, node: Node, label: str) -> dict[str, Any]:
+    seen = [each for item in cx.reader.items(node, label) for each in _seen(item, cx)]
+    return {"observe": tuple(num for num, _ in seen), "observe_text": tuple(text for _, text in seen)}
 
 
-def _seen(node: Node, cx: Context) -> tuple[ir.Num, ...]:
+def _seen(node: Node, cx: Context) -> tuple[tuple[ir.Num, str], ...]:
     """Read one item of `observe`, the list of inputs of the policy network.
 
-    An item is a number, a formula (observed as 0 or 1), or a vector. Returns the expressions of its
-    components; there are none if the item is invalid.
+    An item is a number, a formula (observed as 0 or 1), or a vector. Returns a pair (expression, source text)
+    for each component; the tuple is empty if the item is invalid.
     """
     expr = cx.here.parse(node, "an observation")
     if isinstance(expr, ast.Bool | ast.Compare | ast.Not | ast.Logic | ast.Member):
         value = cx.here.truth(node, "an observation")
-        return () if value is None else (value,)
+        return () if value is None else ((value, written(node)),)
     numbers = None if expr is None else cx.here.numbers(node, "an observation")
-    return tuple(number.num for number in numbers or ())
+    if numbers is None:
+        return ()
+    texts = (written(node),) if len(numbers) == 1 else component_texts(node, len(numbers))
+    return tuple(zip((number.num for number in numbers), texts, strict=True))
 
 
 @reads(mapping_of(VECTOR))
@@ -272,7 +276,10 @@ class PolicyDecl:
 
     type: str = key(word(("mlp",)), "kind of network", "mlp", label="`{name}` of the policy")
     hidden: tuple[int, ...] = key(INTEGERS, "widths of the hidden layers", (256, 256, 256))
-    observe: tuple[ir.Num, ...] = key(_observed, "inputs of the network; every state unless given", ())
+    observe: tuple[ir.Num, ...] = key(
+        _observed, "inputs of the network; every state unless given", (), spread=True
+    )
+    observe_text: tuple[str, ...] = field(default=(), compare=False)
     mirror: tuple[Assign, ...] = key(
         _mirror, "images of states and controls under a symmetry of system and specification", (), spread=True
     )

@@ -20,7 +20,7 @@ from stlc.controller.training.checkpoint import (
     save_checkpoint,
 )
 from stlc.controller.training.run import load_config
-from stlc.diagnostics import MissingError, RunError
+from stlc.diagnostics import MissingError, PluginError, RunError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 
@@ -185,7 +185,6 @@ def test_what_does_not_fit_is_the_fault_of_the_checkpoint(run: RunDir) -> None:
     [
         *[("ranks", [1]), ("hold", 1.0), ("hold", []), ("hidden", 3), ("hidden", [10**9]), ("every", 0)],
         *[
-            ("method", "magic"),
             ("lr", None),
             ("seed", True),
             ("seed", 1e308),
@@ -202,6 +201,13 @@ def test_an_engine_that_is_none(run: RunDir, name: str, value: object) -> None:
     with pytest.raises(RunError) as caught:
         load_config(run)
     assert caught.value.diagnostics[0].code == "R101"
+
+
+def test_a_method_that_stlc_does_not_have(run: RunDir) -> None:
+    engine = {"method": "magic", "seed": 0, "hidden": [4], "plans": 1, "batch": 2, "hard": 0, "lr": 0.1}
+    (run.path / "config.resolved.yaml").write_text(json.dumps(engine))
+    with pytest.raises(PluginError, match="needs the method `magic`"):
+        load_config(run)
 
 
 @pytest.mark.parametrize(
