@@ -235,22 +235,26 @@ def _searches(case: Case, seeds: Sequence[int], store: ResultStore) -> Result:
         "simulations": case.most,
         "version": FALSIFIER_VERSION,
     }
-    return store.get(Key(case.name, values), lambda: {"searches": _side_by_side(case, simulator, seeds)})
+
+    def compute() -> Result:
+        say(f"falsifying {case.name}")
+        requirement = simulator.requirements.index(case.requirement)
+        searches = [ViolationSearch(simulator, requirement, seed) for seed in seeds]
+        side_by_side(simulator, searches, case.most)
+        return {"searches": [_record(search, seed) for search, seed in zip(searches, seeds, strict=True)]}
+
+    return store.get(Key(case.name, values), compute)
 
 
-def _side_by_side(case: Case, simulator: ModelSimulator, seeds: Sequence[int]) -> list[Mapping[str, Any]]:
-    """Carry out the searches of all seeds, one simulation of each at a time."""
-    say(f"falsifying {case.name}")
-    requirement = simulator.requirements.index(case.requirement)
-    searches = [ViolationSearch(simulator, requirement, seed) for seed in seeds]
+def side_by_side(simulator: ModelSimulator, searches: Sequence[ViolationSearch], most: int) -> None:
+    """Carry out searches, one simulation of each at a time and at most `most` of each."""
     going = searches
     while going:
         points = [search.ask(1) for search in going]
         outcomes = simulator.simulate_apart(points, [search.focus for search in going])
         for search, point, outcome in zip(going, points, outcomes, strict=True):
             search.tell(point, outcome)
-        going = [each for each in going if each.found is None and each.tried < case.most]
-    return [_record(search, seed) for search, seed in zip(searches, seeds, strict=True)]
+        going = [each for each in going if each.found is None and each.tried < most]
 
 
 def _record(search: ViolationSearch, seed: int) -> Mapping[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from time import perf_counter
@@ -120,12 +120,22 @@ class ViolationSearch:
         least: least robustness of all simulations with a verdict.
     """
 
-    def __init__(self, simulator: Simulator, requirement: int, seed: int, *, random: bool = False) -> None:
-        """Begin a search; arguments as of `falsify`."""
+    def __init__(
+        self,
+        simulator: Simulator,
+        requirement: int,
+        seed: int,
+        *,
+        random: bool = False,
+        without: Collection[str] = (),
+    ) -> None:
+        """Begin a search; arguments as of `falsify`, and names of strategies that have no turns."""
         self._simulator, self._requirement = simulator, requirement
         self._part = simulator.space.visible(simulator.seen(requirement))
         generator, graded = np.random.default_rng(seed), simulator.graded(requirement)
-        self._portfolio = Portfolio(self._part.space, generator, self._gradient, random=random, graded=graded)
+        self._portfolio = Portfolio(
+            self._part.space, generator, self._gradient, random=random, graded=graded, without=without
+        )
         self.focus = Focus(requirement, sized=True)
         self.found: Counterexample | None = None
         self.tried, self.inconclusive, self.least = 0, 0, math.inf

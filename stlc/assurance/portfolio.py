@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +33,8 @@ FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
 OPENING = 12
 """Points of random pieces with which a search begins, after vertices and constant inputs."""
+VERTICES = 5
+"""Vertices before them."""
 SMALL_OPENING = 4
 """The same in a small space, all of whose vertices come first."""
 PERTURBATIONS = 16
@@ -88,6 +90,7 @@ class Portfolio:
         *,
         random: bool = False,
         graded: bool = True,
+        without: Collection[str] = (),
     ) -> None:
         """Take turns between all strategies, or draw random points if `random`.
 
@@ -99,6 +102,7 @@ class Portfolio:
                 declared distribution.
             graded: whether the robustness varies with the signals. If it takes only a few values, points are
                 drawn at random.
+            without: names of strategies that have no turns, to see what they contribute.
         """
         surrogate = SurrogateSearch(space, generator)
         self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
@@ -137,6 +141,10 @@ class Portfolio:
         elif not random and not graded:
             self._blind = [*[uniform] * (BLIND_TURNS - 1), even]
             self._first.append(_Opening(even, BLIND))
+        kept = [each for each in self._first if each.count != 0 and each.strategy.name not in without]
+        self._first = deque(kept)
+        for turns in (self._samplers, self._drawn, self._leading, self._others, self._late):
+            turns[:] = [each for each in turns if each.name not in without] or [uniform]
         self._turn = 0
         self._values: deque[float] = deque(maxlen=FLAT_VALUES)
 
@@ -152,7 +160,7 @@ class Portfolio:
             return _Opening(self._even, 2), constants, uniform, perturbed, descent
         drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
         alternating = _Opening(AlternatingVertices(space, generator), None)
-        simple = alternating, _Opening(constant, 2), _Opening(self._vertices, 5)
+        simple = alternating, _Opening(constant, 2), _Opening(self._vertices, VERTICES)
         if len(space.blocks) > 1:
             return (*simple, *drawn[:4], descent, constants, *drawn[4:])
         return (*simple, constants, perturbed, *drawn[:4], descent, *drawn[4:])

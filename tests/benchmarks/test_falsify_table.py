@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.tables.falsify import CASES, _row, _side_by_side
-from stlc.assurance.falsify import SearchBudget, falsify
+from benchmarks.tables.falsify import CASES, _record, _row, side_by_side
+from stlc.assurance.falsify import SearchBudget, ViolationSearch, falsify
 from stlc.assurance.model_simulator import ModelSimulator
 from stlc.files import SPECS
 
@@ -20,7 +20,9 @@ def test_every_case_has_a_name_of_its_own_and_both_instances_are_there():
 def test_searches_side_by_side_are_those_of_one_seed_alone():
     (case,) = [each for each in CASES if each.name == "NNx, instance 1"]
     simulator = ModelSimulator.load(str(SPECS / "arch" / f"{case.spec}.stl"), None, dict(case.changes))
-    together = _side_by_side(case, simulator, (1, 2, 3))
+    searches = [ViolationSearch(simulator, 0, seed) for seed in (1, 2, 3)]
+    side_by_side(simulator, searches, case.most)
+    together = [_record(search, seed) for search, seed in zip(searches, (1, 2, 3), strict=True)]
     for each in together:
         alone = falsify(simulator, 0, budget=SearchBudget(case.most), seed=each["seed"], shrinks=False)
         assert alone.found is not None
