@@ -104,16 +104,14 @@ def _setting(name: str, setting: str, value: Any, *acts: str) -> Removal:
 
 REMOVALS = (
     Removal(WHOLE),
-    *map(_turns, ("alternating vertices", "constant vertices", "coarse", "settling", "trend", "surrogate")),
-    *map(_turns, ("trust region", "hill climbing", "perturbation", "periodic", "cma-es", "uniform")),
+    *map(_turns, ("alternating vertices", "constant vertices", "coarse", "surrogate", "trust region")),
+    *map(_turns, ("periodic", "uniform")),
     _turns("vertices", "input vertices"),
     Removal("gradient", frozenset({"gradient"})),  # its turns count even where there is none
     _setting("vertices of the opening", "portfolio.VERTICES", 0, "vertices", "input vertices"),
-    _setting("random points of the opening", "portfolio.OPENING", 0),
-    _setting("perturbations of the opening", "portfolio.PERTURBATIONS", 0, "perturbation"),
     _setting("means in the distance", "surrogate.WEIGHTS", (0.0,), "surrogate"),
-    _setting("moves in time", "strategies.RETIMED", 0.0, "surrogate", "hill climbing"),
-    _setting("the deciding sample", "strategies.LOOKING_BACK", 0.0, "surrogate", "hill climbing"),
+    _setting("moves in time", "strategies.RETIMED", 0.0, "surrogate"),
+    _setting("the deciding sample", "strategies.LOOKING_BACK", 0.0, "surrogate"),
     _setting("scales of predicates", "falsify.scales_of", lambda _: None),
 )
 """Parts of the search, each left out alone; the first one is the whole search."""

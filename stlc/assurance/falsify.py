@@ -26,7 +26,7 @@ from stlc.assurance.strategies import GradientVertices
 from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
-FALSIFIER_VERSION = 11
+FALSIFIER_VERSION = 12
 """Version of the search; results of older versions are recomputed."""
 CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,30 +16,19 @@ from stlc.assurance.strategies import (
     AlternatingVertices,
     CoarseSampling,
     ConstantVertices,
-    CovarianceAdaptation,
     GradientVertices,
-    HillClimbing,
     PeriodicInputs,
-    Perturbation,
-    SettlingInputs,
     Strategy,
     UniformSampling,
     VertexSampling,
     vertex_sampling,
 )
-from stlc.assurance.surrogate import SurrogateSearch, TrendSampling, TrustRegionSearch
+from stlc.assurance.surrogate import SurrogateSearch, TrustRegionSearch
 
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
-OPENING = 12
-"""Points of random pieces with which a search begins, after vertices and constant inputs."""
-VERTICES = 5
-"""Vertices before them."""
-SMALL_OPENING = 4
-"""The same in a small space, all of whose vertices come first."""
-PERTURBATIONS = 16
-"""Greatest number of small perturbations of the best point, before these points and in a small space. Large
-spaces with several inputs have none."""
+VERTICES, OPENING = 5, 4
+"""Vertices and random points with which a search begins, after simple inputs."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
 BLIND, BLIND_TURNS = 4, 12
@@ -56,30 +45,21 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True)
 class _Opening:
-    """Points with which a search begins: those of one strategy, as many as given.
-
-    Attributes:
-        strategy: the strategy.
-        count: number of its points; None: all that it has.
-        worthwhile: condition under which it goes on.
-    """
+    """Points with which a search begins: one of a strategy, or all that it has."""
 
     strategy: Strategy
-    count: int | None = 1
-    worthwhile: Callable[[], bool] = lambda: True
+    once: bool = True
 
 
 class Portfolio:
     """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
 
     Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogates of the whole space and of a
-    trust region, two ninths are random, and the rest goes to the other strategies in turn. In a small space,
-    all of whose vertices come first, four ninths are those of CMA-ES, a third is chosen by the surrogate, and
-    a ninth is random. Of the points after these a third is random, a third goes to the strategy that has
-    found the least robust point, and a third to all in turn. If the robustness takes few values, as that of
-    conditions on gears does, nothing can be learnt from it: then points are drawn at random. In a space most
-    of whose coordinates have no effect, `SensitiveClimbing` is the only strategy, and points are uniform
-    while the robustness hardly ever changes.
+    trust region, two ninths are random, and a ninth follows the gradient or is periodic. Of the points after
+    these a third is random, a third goes to the strategy that has found the least robust point, and a third
+    to all in turn. If the robustness takes few values, as that of conditions on gears does, nothing can be
+    learnt from it: then points are drawn at random. In a space most of whose coordinates have no effect,
+    `SensitiveClimbing` is the only strategy, and points are uniform while the robustness hardly ever changes.
     """
 
     def __init__(
@@ -104,66 +84,42 @@ class Portfolio:
                 drawn at random.
             without: names of strategies that have no turns, to see what they contribute.
         """
-        surrogate = SurrogateSearch(space, generator)
+        uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
         self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
         self._guided = not random and not space.sparse and graded and space.dim > 0
-        uniform, even = UniformSampling(space, generator), VertexSampling(space, generator)
-        vertices = vertex_sampling(space, generator)
-        self._even, self._vertices = even, vertices
-        self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, even]
-        self._samplers: list[Strategy] = [vertices, uniform]
-        trends: list[Strategy] = []
-        if self._guided and any(len(block.values) > max(PIECES) for block in space.blocks):
-            trends.append(TrendSampling(space, generator))
-            self._samplers = [*trends, CoarseSampling(space, generator), SettlingInputs(space, generator)]
-        self._leading: list[Strategy] = [surrogate]
-        self._drawn = [*self._samplers]
+        self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
+        self._drawn: Strategy = vertices
+        self._leading: list[Strategy] = []
         self._others: list[Strategy] = []
-        self._late: list[Strategy] = []
-        self._first: deque[_Opening] = deque()
+        first = list[_Opening]()
         if self._guided:
-            climb, perturbation = GradientVertices(space, generator, gradient), Perturbation(space, generator)
-            self._others = [climb, HillClimbing(space, generator), perturbation]
+            climb, constant = GradientVertices(space, generator, gradient), ConstantVertices(space, generator)
+            constants, descent = _Opening(constant, once=False), _Opening(climb, once=False)
+            self._leading, self._others = [SurrogateSearch(space, generator)], [climb]
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
-            if not space.small:
+            if space.small:
+                self._drawn, first = uniform, [*[_Opening(vertices)] * 2, constants, descent]
+            else:
                 self._leading.append(TrustRegionSearch(space, generator))
-            self._late = [*self._others, *self._leading]
-            if CovarianceAdaptation.available(space):
-                adaptation = CovarianceAdaptation(space, generator)
-                self._late.append(adaptation)
-                if space.small:
-                    self._leading, self._drawn = [adaptation, surrogate], [adaptation, uniform]
-                else:
-                    self._others.append(adaptation)
-            self._late += trends
-            self._first.extend(self._opening(space, generator, perturbation, climb))
+                if any(len(block.values) > max(PIECES) for block in space.blocks):
+                    self._drawn = CoarseSampling(space, generator)
+                drawn, alternating = _Opening(self._drawn), AlternatingVertices(space, generator)
+                opposite = [_Opening(constant)] * 2 if len(space.blocks) > 1 else [constants]
+                varied = [_Opening(vertex_sampling(space, generator))] * VERTICES
+                first = [_Opening(alternating, once=False), *opposite, *varied, drawn, descent, constants]
+                first += [drawn] * (OPENING - 1)
         elif not random and not graded:
-            self._blind = [*[uniform] * (BLIND_TURNS - 1), even]
-            self._first.append(_Opening(even, BLIND))
-        kept = [each for each in self._first if each.count != 0 and each.strategy.name not in without]
-        self._first = deque(kept)
-        for turns in (self._samplers, self._drawn, self._leading, self._others, self._late):
-            turns[:] = [each for each in turns if each.name not in without] or [uniform]
+            self._blind = [*[uniform] * (BLIND_TURNS - 1), vertices]
+            first = [_Opening(vertices)] * BLIND
+        self._first = [each for each in first if each.strategy.name not in without]
+        if self._drawn.name in without:
+            self._drawn = uniform
+        for turns in (self._leading, self._others):
+            turns[:] = [each for each in turns if each.name not in without] or [self._drawn]
+        self._late = [*self._others, *self._leading]
         self._turn = 0
         self._values: deque[float] = deque(maxlen=FLAT_VALUES)
-
-    def _opening(
-        self, space: SearchSpace, generator: np.random.Generator, perturbation: Perturbation, climb: Strategy
-    ) -> Sequence[_Opening]:
-        """Points with which a guided search begins."""
-        constant = ConstantVertices(space, generator)
-        constants, descent = _Opening(constant, None), _Opening(climb, None)
-        perturbed = _Opening(perturbation, PERTURBATIONS, lambda: perturbation.scattered)
-        if space.small:
-            uniform = _Opening(self._samplers[-1], SMALL_OPENING)
-            return _Opening(self._even, 2), constants, uniform, perturbed, descent
-        drawn = [_Opening(self._samplers[index % len(self._samplers)]) for index in range(OPENING)]
-        alternating = _Opening(AlternatingVertices(space, generator), None)
-        simple = alternating, _Opening(constant, 2), _Opening(self._vertices, VERTICES)
-        if len(space.blocks) > 1:
-            return (*simple, *drawn[:4], descent, constants, *drawn[4:])
-        return (*simple, constants, perturbed, *drawn[:4], descent, *drawn[4:])
 
     @property
     def flat(self) -> bool:
@@ -174,12 +130,9 @@ class Portfolio:
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
         while (opening := next((each for each in self._first if each.strategy.ready), None)) is not None:
-            index = self._first.index(opening)
-            point = opening.strategy.propose() if opening.worthwhile() else None
-            if point is None or opening.count == 1:
-                del self._first[index]
-            elif opening.count is not None:
-                self._first[index] = replace(opening, count=opening.count - 1)
+            point = opening.strategy.propose()
+            if point is None or opening.once:
+                self._first.remove(opening)
             if point is not None:
                 return Proposal(opening.strategy, point)
         while True:
@@ -198,9 +151,9 @@ class Portfolio:
         if self._turn <= SURROGATE_TURNS:
             if self._turn % 3:
                 return _rotated(self._leading)
-            return _rotated(self._others if self._turn % 9 == 0 else self._drawn)
+            return self._drawn if self._turn % 9 else _rotated(self._others)
         if self._turn % 3 == 0:
-            return _rotated(self._samplers)
+            return self._drawn
         if self._turn % 3 == 1:
             return min(self._late, key=lambda each: each.best)
         return _rotated(self._late)

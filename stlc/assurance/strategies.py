@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import warnings
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, cycle
-from typing import Any
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
 
-STARTS = 10
-"""Points from which the best is the start of a climb."""
 KEPT = 8
 """Points that a local search keeps, and starts from."""
-PATIENCE = 60
-"""Steps without progress after which a climb starts anew."""
 NARROW, WIDE = 0.01, 0.5
-"""Least and greatest step width of a climb, in the unit cube."""
-CMA_WIDTH, CMA_NARROW = 0.3, 0.1
-"""First step width of CMA-ES, in general and in a small space, whose vertices have all been simulated."""
-CMA_LENGTH, CMA_DIMENSIONS = 400, 200
-"""Evaluations after which CMA-ES restarts, and coordinates up to which it is used."""
+"""Least and greatest width of a change, in the unit cube."""
 REDRAWN = 0.35
 """Share of the changes that draw a value anew, at an end of its range or uniform between them."""
 RETIMED = 0.25
@@ -36,27 +24,14 @@ RETIMED = 0.25
 LOOKING_BACK, RECENT = 0.5, 0.35
 """Share of the other neighbours that differ before the deciding sample only, and the parameter of the
 geometric distribution of the number of pieces that the change lies before it."""
-PERTURBED = (0.02, 0.05)
-"""Least and greatest width of a perturbation of all values."""
-SCATTER, JUDGED = 0.1, 3
-"""Interquartile range of the robustness of perturbations, as a share of that of other points, above which it
-counts as scattered; and the number of perturbations that are judged at least."""
-REMEMBERED = 100
-"""Points at most by which the scatter is judged."""
 SHORTEST, LONGEST = 0.01, 0.5
 """Half periods of periodic inputs, as shares of the duration."""
 SWEPT = 12
 """Half periods that are tried before the best is refined."""
 ENDS = 2.0 / 3.0
 """Share of the values of vertices at the ends of their ranges."""
-SHARES = (1.0, ENDS)
-"""The same for vertices of several inputs, for one point after the other."""
 PIECES = (1, 2, 3, 5)
 """Maximum numbers of pieces of coarse inputs; one of them is drawn for each point."""
-SETTLING = (0.1, 0.2, 0.5)
-"""Mean lengths, as shares of the duration, of the stretches after which an input settles, one per point."""
-SECOND_STRETCH = 1.0 / 3.0
-"""Probability of a second such stretch."""
 
 
 class Strategy(ABC):
@@ -166,15 +141,8 @@ class VertexSampling(Strategy):
 
     name = "vertices"
 
-    def __init__(
-        self, space: SearchSpace, generator: np.random.Generator, ends: Sequence[float] = (ENDS,)
-    ) -> None:
-        """Draw points whose values are at ends with the probabilities `ends`, of one point each in turn."""
-        super().__init__(space, generator)
-        self._ends = cycle(ends)
-
     def propose(self) -> Point:
-        return _values(self.space, self.generator, np.arange(self.space.dim), next(self._ends))
+        return _values(self.space, self.generator, np.arange(self.space.dim), ENDS)
 
 
 class InputVertices(VertexSampling):
@@ -186,24 +154,18 @@ class InputVertices(VertexSampling):
     name = "input vertices"
 
     def propose(self) -> Point:
-        ends = next(self._ends)
-        point = _values(self.space, self.generator, np.arange(self.space.dim), ends)
+        point = super().propose()
         for block in self.space.blocks:
             share = self.generator.random()
             at_end, high, drawn = self.generator.random((3, len(block.values)))
-            point[list(block.values)] = np.where(at_end < ends, high < share, drawn)
+            point[list(block.values)] = np.where(at_end < ENDS, high < share, drawn)
         return point
 
 
-def vertex_sampling(
-    space: SearchSpace, generator: np.random.Generator, ends: Sequence[float] = SHARES
-) -> VertexSampling:
-    """Vertices for a space: with a share of high values per input if there are several inputs.
-
-    `ends`: probabilities that a value of several inputs is at an end, of one point each in turn.
-    """
+def vertex_sampling(space: SearchSpace, generator: np.random.Generator) -> VertexSampling:
+    """Vertices for a space: with a share of high values per input if there are several inputs."""
     several = len(space.blocks) > 1 and not space.small
-    return InputVertices(space, generator, ends) if several else VertexSampling(space, generator)
+    return InputVertices(space, generator) if several else VertexSampling(space, generator)
 
 
 class CoarseSampling(Strategy):
@@ -214,29 +176,6 @@ class CoarseSampling(Strategy):
     def propose(self) -> Point:
         most = PIECES[int(self.generator.integers(len(PIECES)))]
         return _values(self.space, self.generator, self.space.held(self.generator, most), 0.0)
-
-
-class SettlingInputs(Strategy):
-    """Inputs that settle: one or two stretches with uniform values at first, then one end of the range.
-
-    So a plant is moved and then left to itself, as in a test of its step response. Other coordinates are
-    those of vertices.
-    """
-
-    name = "settling"
-
-    def propose(self) -> Point:
-        generator = self.generator
-        point = _values(self.space, generator, np.arange(self.space.dim), ENDS)
-        share = SETTLING[int(generator.integers(len(SETTLING)))]
-        for block in self.space.blocks:
-            count, first = len(block.values), 0
-            values = np.full(count, float(generator.integers(2)))
-            for _ in range(1 + (generator.random() < SECOND_STRETCH)):
-                last = first + int(generator.geometric(1.0 / max(share * count, 1.0)))
-                values[first:last], first = generator.random(), last
-            point[list(block.values)] = values
-        return point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,86 +193,39 @@ class Told:
     decided: float = math.nan
 
 
-class _Start:
-    """The best of the last points that were simulated, from which a local search starts.
-
-    Attributes:
-        seen: number of points.
-    """
-
-    def __init__(self) -> None:
-        self._best: list[Told] = []
-        self.seen = 0
-
-    @property
-    def point(self) -> Point | None:
-        """The best point; None if there is none."""
-        return self._best[0].point if self._best else None
-
-    @property
-    def value(self) -> float:
-        """Guidance value of the best point."""
-        return self._best[0].value if self._best else math.inf
-
-    def add(self, told: Told) -> None:
-        """Take a point into account; the earlier one of equally good points is the better one."""
-        self.seen += 1
-        if math.isfinite(told.value):
-            self._best = sorted([*self._best, told], key=lambda each: each.value)[:KEPT]
-
-    def one_of_the_best(self, generator: np.random.Generator) -> Told:
-        """The best point with probability one half, else the second best with one half, and so on."""
-        index = min(int(generator.geometric(0.5)) - 1, len(self._best) - 1)
-        return self._best[index]
-
-
 class LocalSearch(Strategy):
-    """Search that starts from the best of the points so far, whichever strategy has found it."""
+    """Search that starts from the best points so far, whichever strategy has found them."""
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
-        self._start = _Start()
+        self._kept: list[Told] = []
 
     @property
     def ready(self) -> bool:
-        return self._start.point is not None
+        return bool(self._kept)
 
     def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
         super().tell(point, value, decided)
-        self._start.add(Told(point, value, decided))
+        self.observe(point, value, decided)
 
     def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
-        self._start.add(Told(point, value, decided))
+        """Take a point into account; the earlier one of equally good points is the better one."""
+        if math.isfinite(value):
+            known = [*self._kept, Told(point, value, decided)]
+            self._kept = sorted(known, key=lambda each: each.value)[:KEPT]
+
+    def _one_of_the_best(self) -> Told:
+        """The best point with probability one half, else the second best with one half, and so on."""
+        return self._kept[min(int(self.generator.geometric(0.5)), len(self._kept)) - 1]
 
 
-class HillClimbing(LocalSearch):
-    """Steps from one of the best points so far: in single values, or in pieces and runs of successive values.
-
-    After `PATIENCE` steps without progress it starts anew from the best of `STARTS` later points.
-    """
-
-    name = "hill climbing"
+class Neighbours:
+    """Changed copies of points: in single values, in pieces and runs of successive values, or in time."""
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
-        super().__init__(space, generator)
-        self._coarse = CoarseSampling(space, generator), SettlingInputs(space, generator)
-        self._restart()
+        self.space, self.generator = space, generator
 
-    def _restart(self) -> None:
-        self._start, self._failed = _Start(), 0
-
-    def propose(self) -> Point:
-        if self._start.point is None or self._start.seen < STARTS:
-            return self._coarse[int(self.generator.integers(2))].propose()
-        return self._neighbour(self._start.one_of_the_best(self.generator))
-
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        self._failed = 0 if value < self._start.value else self._failed + 1
-        super().tell(point, value, decided)
-        if self._failed > PATIENCE:
-            self._restart()
-
-    def _neighbour(self, start: Told) -> Point:
+    def of(self, start: Told) -> Point:
         """Copy of a point with other values, of a few coordinates or successive values, or at other times."""
         generator, changed = self.generator, start.point.copy()
         if self.space.blocks and generator.random() < RETIMED:
@@ -429,55 +321,6 @@ class HillClimbing(LocalSearch):
                 yield list(block.values[first : last + 1])
 
 
-class Perturbation(LocalSearch):
-    """The best point so far with a small change of all values, mirrored at the ends of their ranges.
-
-    Where robustness varies more between close points than between distant ones, as in a closed loop that
-    chatters, the surroundings of a good vertex hold violations that the vertex itself misses.
-    """
-
-    name = "perturbation"
-
-    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
-        super().__init__(space, generator)
-        self._own: deque[float] = deque(maxlen=REMEMBERED)
-        self._others: deque[float] = deque(maxlen=REMEMBERED)
-        self._judged = 0
-
-    @property
-    def scattered(self) -> bool:
-        """True if the robustness varies much among perturbations, or too few of them are known."""
-        return self._judged < JUDGED or _spread(self._own) > SCATTER * _spread(self._others)
-
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().tell(point, value, decided)
-        self._judged += 1
-        if math.isfinite(value):
-            self._own.append(value)
-
-    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().observe(point, value, decided)
-        if math.isfinite(value):
-            self._others.append(value)
-
-    def propose(self) -> Point | None:
-        if self._start.point is None:
-            return None
-        low, high = map(math.log, PERTURBED)
-        width = math.exp(self.generator.uniform(low, high))
-        moved = self._start.point + width * self.generator.standard_normal(self.space.dim)
-        mirrored: Point = 1.0 - np.abs(1.0 - np.abs(moved) % 2.0)
-        return mirrored
-
-
-def _spread(values: Sequence[float]) -> float:
-    """Interquartile range of values; 0 if there are fewer than two."""
-    if len(values) < 2:
-        return 0.0
-    low, high = np.quantile(values, (0.25, 0.75))
-    return float(high) - float(low)
-
-
 def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
     """Coordinates of the neighbours in `values` that share the value at `index`."""
     first = last = index
@@ -505,7 +348,7 @@ class GradientVertices(LocalSearch):
         self._last: Point | None = None
 
     def propose(self) -> Point | None:
-        start = self._start.point
+        start = self._kept[0].point if self._kept else None
         if start is None or start is self._last:
             return None
         self._last, slope = start, self._gradient(start)
@@ -581,61 +424,6 @@ class PeriodicInputs(Strategy):
 def _van_der_corput(index: int) -> float:
     """Element of the van der Corput sequence in base 2: 1/2, 1/4, 3/4, 1/8 and so on."""
     return int(f"{index:b}"[::-1], 2) / (1 << index.bit_length())
-
-
-class CovarianceAdaptation(LocalSearch):
-    """CMA-ES (Hansen and Ostermeier 2001) in the unit cube, by the package `cma`.
-
-    It starts from the best point so far, and then from the best of later ones.
-    """
-
-    name = "cma-es"
-
-    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
-        super().__init__(space, generator)
-        self._search: Any = None
-        self._asked: list[Point] = []
-        self._open: list[Point] = []
-        self._told: list[tuple[Point, float]] = []
-
-    @classmethod
-    def available(cls, space: SearchSpace) -> bool:
-        """True if the package is installed, and the space is small enough for a covariance matrix."""
-        return importlib.util.find_spec("cma") is not None and 1 < space.dim <= CMA_DIMENSIONS
-
-    def propose(self) -> Point:
-        if not self._open and len(self._told) == len(self._asked):
-            if self._search is None or self._search.countevals > CMA_LENGTH or self._search.stop():
-                self._search = self._started()
-            self._asked = [np.asarray(each) for each in self._search.ask()]
-            self._open, self._told = self._asked[::-1], []
-        if not self._open:  # a whole generation is being simulated
-            return np.asarray(self._search.ask(1)[0])
-        return self._open.pop()
-
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().tell(point, value, decided)
-        if any(point is each for each in self._asked):
-            self._told.append((point, value))
-        if self._told and len(self._told) == len(self._asked):
-            finite = [min(value, 1e9) for _, value in self._told]
-            self._search.tell([each for each, _ in self._told], finite)
-            self._asked, self._told = [], []
-
-    def _started(self) -> Any:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import cma
-        options = {
-            "bounds": [0.0, 1.0],
-            "seed": int(self.generator.integers(1, 2**31)),
-            "verbose": -9,
-            "verb_log": 0,
-        }
-        start = self.generator.random(self.space.dim) if self._start.point is None else self._start.point
-        self._start = _Start()
-        width = CMA_NARROW if self.space.small else CMA_WIDTH
-        return cma.CMAEvolutionStrategy(start, width, options)
 
 
 def quantiles_of(times: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,13 +3,12 @@
 A simulation tells more than whether its point is better than the best one. A Gaussian process (Rasmussen and
 Williams 2006), fitted to all points so far or to those near a good one, predicts the robustness of candidates
 with an uncertainty. The candidate with the least lower confidence bound (Srinivas and others 2010) is
-simulated. A linear model, which needs few points, does the same for random vertices.
+simulated.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from statistics import NormalDist
 
@@ -17,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.strategies import ENDS, HillClimbing, Strategy, Told, UniformSampling, vertex_sampling
+from stlc.assurance.strategies import (
+    CoarseSampling,
+    LocalSearch,
+    Neighbours,
+    UniformSampling,
+    vertex_sampling,
+)
 
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)
 """Length scales that are compared, times the root of the number of coordinates."""
@@ -41,14 +46,6 @@ FIRST_WIDTH, LEAST_WIDTH, MOST_WIDTH = 0.2, 0.02, 0.5
 """Standard deviations of the changes in a trust region: at first, and their bounds."""
 WIDENED, NARROWED, FAILURES = 1.5, 0.7, 8
 """Factors of the width after progress, and after this number of proposals without any."""
-SCREENED = 100
-"""Vertices of which a linear model chooses one."""
-SLOPE = 3.0
-"""Variance of the slopes of the linear model before it has seen points, times that of its noise."""
-LEAST_NOISE = 0.05
-"""Least variance of the noise of the linear model, times that of the robustness."""
-BEGUN, MODELLED = 20, 1000
-"""Points from which a linear model of many numbers begins, and last points to which it is fitted."""
 DIGITS = 6
 """Decimal digits of what is compared, so that rounding, which depends on the machine, decides nothing."""
 
@@ -145,27 +142,26 @@ def _normal_scores(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([normal.inv_cdf((rank + 0.5) / count) for rank in ranks.tolist()])
 
 
-class SurrogateSearch(HillClimbing):
+class SurrogateSearch(LocalSearch):
     """The candidate with the least lower confidence bound of a Gaussian process, fitted to all points so far.
 
-    Candidates are neighbours of the best points, as of hill climbing, and random points. None of them is
-    simulated twice.
+    Candidates are neighbours of the best points, and random points. None of them is simulated twice.
     """
 
     name = "surrogate"
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
-        self._process = RobustnessProcess(space)
-        vertices, uniform = vertex_sampling(space, generator), UniformSampling(space, generator)
-        self._samplers = (*self._coarse, vertices, uniform)
+        self._process, self._neighbours = RobustnessProcess(space), Neighbours(space, generator)
+        kinds = CoarseSampling, vertex_sampling, UniformSampling
+        self._samplers = tuple(kind(space, generator) for kind in kinds)
         self._points: list[Point] = []
         self._values: list[float] = []
         self._known: set[bytes] = set()
 
     def propose(self) -> Point:
-        if self._start.point is None:
-            return self._coarse[0].propose()
+        if not self._kept:
+            return self._samplers[0].propose()
         kept = np.argsort(np.array(self._values), kind="stable")[:FITTED]
         return self._least(self._process, kept, self._candidates(), BOLDNESS)
 
@@ -192,17 +188,13 @@ class SurrogateSearch(HillClimbing):
 
     def _candidates(self) -> list[Point]:
         """Neighbours of the best points, and random ones."""
-        generator, near = self.generator, CANDIDATES // 2
-        found = [self._neighbour(self._start.one_of_the_best(generator)) for _ in range(near)]
+        near = CANDIDATES // 2
+        found = [self._neighbours.of(self._one_of_the_best()) for _ in range(near)]
         found += [self._samplers[index % len(self._samplers)].propose() for index in range(CANDIDATES - near)]
         return found
 
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        self.best = min(self.best, value)
-        self.observe(point, value, decided)
-
     def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
-        self._start.add(Told(point, value, decided))
+        super().observe(point, value, decided)
         self._points.append(point)
         self._values.append(value)
         self._known.add(point.tobytes())
@@ -222,10 +214,10 @@ class TrustRegionSearch(SurrogateSearch):
         self._width, self._least_before, self._failures = FIRST_WIDTH, math.inf, 0
 
     def propose(self) -> Point:
-        if self._start.point is None:
-            return self._coarse[0].propose()
+        if not self._kept:
+            return self._samplers[0].propose()
         self._adapt()
-        centre = self._start.one_of_the_best(self.generator).point
+        centre = self._one_of_the_best().point
         distances = _distances(centre[None], np.array(self._points))[0]
         near = np.argsort(np.round(distances, DIGITS), kind="stable")[:NEAREST]
         candidates = [self._moved(centre) for _ in range(CANDIDATES)]
@@ -233,9 +225,9 @@ class TrustRegionSearch(SurrogateSearch):
 
     def _adapt(self) -> None:
         """Widen the region if there was progress since the last proposal, and narrow it if there is none."""
-        if self._start.value < self._least_before:
+        if self._kept[0].value < self._least_before:
             self._width, self._failures = min(WIDENED * self._width, MOST_WIDTH), 0
-            self._least_before = self._start.value
+            self._least_before = self._kept[0].value
             return
         self._failures += 1
         if self._failures >= FAILURES:
@@ -249,64 +241,3 @@ class TrustRegionSearch(SurrogateSearch):
         steps = np.where(changed, self._width * generator.standard_normal(dim), 0.0)
         moved: Point = np.clip(centre + steps, 0.0, 1.0)
         return moved
-
-
-class TrendSampling(Strategy):
-    """The least robust one of many random vertices, as expected by a linear model.
-
-    Where violations are frequent often depends on how much each input is high. So the model knows the mean of
-    each input and all other numbers, and nothing else: it learns from few points, and what it chooses is
-    otherwise random, whereas neighbours of the best point share its faults. Its coefficients are drawn from
-    their distribution after the points so far (Thompson 1933), so that it explores what it does not know yet.
-    """
-
-    name = "trend"
-
-    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
-        super().__init__(space, generator)
-        self._vertices = vertex_sampling(space, generator, (ENDS,))
-        self._averages = np.zeros((space.dim, len(space.handles)))
-        for index, each in enumerate(space.handles):
-            self._averages[list(each), index] = 1.0 / len(each)
-        self._features: deque[NDArray[np.float64]] = deque(maxlen=MODELLED)
-        self._values: deque[float] = deque(maxlen=MODELLED)
-
-    def propose(self) -> Point:
-        if len(self._values) < min(self._averages.shape[1] + 3, BEGUN):
-            return self._vertices.propose()
-        candidates = np.array([self._vertices.propose() for _ in range(SCREENED)])
-        expected = self._described(candidates) @ self._coefficients()
-        chosen: Point = candidates[int(np.argmin(np.round(expected, DIGITS)))]
-        return chosen
-
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().tell(point, value, decided)
-        self.observe(point, value, decided)
-
-    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: ARG002
-        if math.isfinite(value):
-            self._features.append(self._described(point[None])[0])
-            self._values.append(value)
-
-    def _described(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Features (count, 1 + groups) of points: one, and the mean of each input and the other numbers.
-
-        Means and numbers are from -1 to 1.
-        """
-        return np.column_stack((np.ones(len(points)), 2.0 * points @ self._averages - 1.0))
-
-    def _coefficients(self) -> NDArray[np.float64]:
-        """Coefficients (1 + groups,), drawn from their distribution given the points so far.
-
-        Noise and slopes are taken as normally distributed (Bayesian linear regression, Rasmussen and Williams
-        2006, section 2.1), and the constant as any number.
-        """
-        features, values = np.array(self._features), _normal_scores(np.array(self._values))
-        precision = np.full(features.shape[1], 1.0 / SLOPE)
-        precision[0] = JITTER  # the constant may be any number
-        covariance = np.linalg.inv(features.T @ features + np.diag(precision))
-        means = covariance @ features.T @ values
-        noise = max(float(((values - features @ means) ** 2).mean()), LEAST_NOISE)
-        drawn = np.linalg.cholesky(noise * covariance) @ self.generator.standard_normal(len(means))
-        found: NDArray[np.float64] = means + drawn
-        return found

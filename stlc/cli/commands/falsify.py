@@ -113,14 +113,13 @@ def falsify(
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
     the random numbers of the world in which its policy drives. Inputs that alternate between the ends of
     their ranges, or stay there, come first. Then models of the robustness choose most of the points, and
-    random ones, hill climbing, CMA-ES (if the package `cma` is installed), gradients and periodic inputs take
-    turns; the numbers of a world are changed where this has an effect. A violation counts only if it remains
-    at half the time step. It is written as a trace, simplified as far as it still violates the requirement,
-    with a file for --replay. If nothing is found, that is no proof. The same --seed and --batch give the same
-    simulations, whatever processes there are. Of a plant, simulations that fail are written, too. A
-    simulation that ends before a requirement can be judged is no evidence. Exit code: 1 if a requirement is
-    violated or a simulation fails; else 5 if simulations were lost with their processes, three times each;
-    else 4 if simulations ended before a verdict; else 0.
+    random ones, gradients and periodic inputs take turns; the numbers of a world are changed where this has
+    an effect. A violation counts only if it remains at half the time step. It is written as a trace,
+    simplified as far as it still violates the requirement, with a file for --replay. If nothing is found,
+    that is no proof. The same --seed and --batch give the same simulations, whatever processes there are. Of
+    a plant, simulations that fail are written, too. A simulation that ends before a requirement can be judged
+    is no evidence. Exit code: 1 if a requirement is violated or a simulation fails; else 5 if simulations
+    were lost with their processes, three times each; else 4 if simulations ended before a verdict; else 0.
     """
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
     from stlc.files import require_folder
