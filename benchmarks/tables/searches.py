@@ -110,8 +110,6 @@ REMOVALS = (
     Removal("gradient", frozenset({"gradient"})),  # its turns count even where there is none
     _setting("vertices of the opening", "portfolio.VERTICES", 0, "vertices", "input vertices"),
     _setting("means in the distance", "surrogate.WEIGHTS", (0.0,), "surrogate"),
-    _setting("moves in time", "strategies.RETIMED", 0.0, "surrogate"),
-    _setting("the deciding sample", "strategies.LOOKING_BACK", 0.0, "surrogate"),
     _setting("scales of predicates", "falsify.scales_of", lambda _: None),
 )
 """Parts of the search, each left out alone; the first one is the whole search."""

@@ -189,7 +189,7 @@ class ViolationSearch:
     def _teach(self, outcome: Simulations, told: NDArray[np.float64]) -> None:
         for index, each in enumerate(self._open):
             value = float(told[index]) if outcome.admissible[index] else math.inf
-            self._portfolio.tell(each, value, float(outcome.decided[index]))
+            self._portfolio.tell(each, value)
 
     def _count(self, points: NDArray[np.float64], outcome: Simulations, told: NDArray[np.float64]) -> None:
         """Count simulations, and examine violations; `told`, (count,), becomes what strategies are told."""

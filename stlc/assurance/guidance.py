@@ -40,7 +40,6 @@ class ScaledRobustness:
         self._formula = formula
         found = () if _freezes(formula) else nodes(formula)
         every = [node for node in found if isinstance(node, ir.Predicate) and not node.guard]
-        self._deciding = tuple(dict.fromkeys(every))  # also those that differ in the sign only
         sized = {node.num: node for node in every}
         self.predicates: tuple[ir.Predicate, ...] = tuple(sized.values()) if len(sized) > 1 else ()
 
@@ -49,7 +48,10 @@ class ScaledRobustness:
         first = next(iter(columns.values()))
         found = np.zeros((first.shape[1], len(self.predicates)))
         for index, predicate in enumerate(self.predicates):
-            values = _series(predicate, columns)
+            reach = reach_of(predicate.num)
+            before, after = max(reach.past, 0), max(reach.future, 0)  # samples at which it has no value alone
+            count = max(len(first) - before - after, 1)
+            values = evaluate([predicate], columns, ops=NUMPY, start=before, count=count)[0]
             found[:, index] = np.quantile(np.abs(values), 0.9, axis=0) if np.ndim(values) else 0.0
         return found
 
@@ -67,27 +69,6 @@ class ScaledRobustness:
         count = next(iter(columns.values())).shape[1]
         found: NDArray[np.float64] = evaluate([self.scaled(scales)], columns, ops=NUMPY)[0][0]
         return np.broadcast_to(found, (count,))
-
-    def deciding(
-        self, columns: Columns, scales: tuple[float, ...] | None, values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Sample that decides the robustness: the last that a predicate of just this value reads, (batch,).
-
-        The exact robustness of a formula is the value of one of its predicates at one sample, which signals
-        after this sample do not affect. NaN if there is no such sample, or if predicates read frozen values.
-
-        Args:
-            columns: signals of the simulations.
-            scales: factor of each predicate; None: all 1.
-            values: guidance values of the simulations, (batch,).
-        """
-        found = np.full(len(values), np.nan)
-        for own in self._deciding:
-            before, after = _offsets(own)
-            equal = _series(_scaled(own, self.predicates, scales), columns) == values
-            last = before + len(equal) - 1.0 - np.argmax(equal[::-1], axis=0) + after
-            found = np.fmax(found, np.where(equal.any(0), last, np.nan))
-        return found
 
 
 def scales_of(sizes: NDArray[np.float64]) -> tuple[float, ...] | None:
@@ -133,18 +114,3 @@ def _multiplied(formula: ir.Formula, factors: Mapping[ir.Num, float]) -> ir.Form
 def _freezes(formula: ir.Formula) -> bool:
     """True if a predicate may read a frozen value, which has no size outside of its formula."""
     return any(isinstance(node, ir.Freeze) for node in nodes(formula))
-
-
-def _series(predicate: ir.Formula, columns: Columns) -> NDArray[np.float64]:
-    """Values of a predicate at all samples at which it can be evaluated alone, (samples, batch or 1)."""
-    assert isinstance(predicate, ir.Predicate)
-    before, after = _offsets(predicate)
-    count = max(len(next(iter(columns.values()))) - before - after, 1)
-    found: NDArray[np.float64] = evaluate([predicate], columns, ops=NUMPY, start=before, count=count)[0]
-    return found
-
-
-def _offsets(predicate: ir.Predicate) -> tuple[int, int]:
-    """Samples before the first and after the last at which a predicate can be evaluated alone."""
-    found = reach_of(predicate.num)
-    return max(found.past, 0), max(found.future, 0)

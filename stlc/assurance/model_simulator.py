@@ -162,9 +162,8 @@ class ModelSimulator:
         if focus.scales is not None:
             guidance = np.where(np.isneginf(margins), -np.inf, guide(columns, focus.scales))
         sizes = guide.sizes(columns) if focus.sized else np.zeros((len(margins), 0))
-        decided = guide.deciding(columns, focus.scales, guidance) * task.system.dt / _duration(task)
         every = np.ones(len(margins), dtype=np.bool_)
-        return Simulations(margins, guidance, admissible & in_scope(task, columns), sizes, decided, every)
+        return Simulations(margins, guidance, admissible & in_scope(task, columns), sizes, every)
 
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None for a system in discrete time.

@@ -64,7 +64,6 @@ class _JudgedTrace:
         margin: exact robustness; +inf if the simulation failed.
         guidance: robustness with scaled predicates.
         sizes: sizes of the margins of the predicates, (predicates,); empty if they are not wanted.
-        decided: last sample that decides the guidance; NaN if it is unknown.
         inside: whether the assumptions of the specification hold.
         failed: whether there is no trace.
         judged: whether there is a verdict: a simulation that ended early may have none.
@@ -73,7 +72,6 @@ class _JudgedTrace:
     margin: float
     guidance: float
     sizes: NDArray[np.float64]
-    decided: float = np.nan
     inside: bool = True
     failed: bool = False
     judged: bool = True
@@ -109,15 +107,11 @@ class _Judging:
             record = Record.of(signals.env, signals.ops)
             _, high = rule_bounds(rule, record, starts, compiled.grid.horizon, "open")
             guidance = float(high.min())
-        (decided,) = guide.deciding(signals.env, focus.scales, np.array([guidance]))
-        return _JudgedTrace(margin, guidance, sizes, decided, inside, judged=judged)
+        return _JudgedTrace(margin, guidance, sizes, inside, judged=judged)
 
 
-def _together(found: Sequence[_JudgedTrace], step: float) -> Simulations:
-    """Outcomes of several simulations; the sizes of failed ones are taken to be typical of the others.
-
-    `step`: time step of the traces as a share of the inputs' duration.
-    """
+def _together(found: Sequence[_JudgedTrace]) -> Simulations:
+    """Outcomes of several simulations; the sizes of failed ones are taken to be typical of the others."""
     sizes = np.stack([each.sizes for each in found])
     failed = np.array([each.failed for each in found], dtype=np.bool_)
     if failed.any() and not failed.all():
@@ -127,7 +121,6 @@ def _together(found: Sequence[_JudgedTrace], step: float) -> Simulations:
         np.array([each.guidance for each in found]),
         np.array([each.inside for each in found], dtype=np.bool_),
         sizes,
-        np.array([each.decided * step for each in found]),
         np.array([each.judged for each in found], dtype=np.bool_),
     )
 
@@ -226,7 +219,7 @@ class PlantSimulator:
             known = any(np.array_equal(each.point, point) for each in self.findings)
             if isinstance(run.outcome, PlantFinding) and not known:
                 self.findings.append(FailedSimulation(point, run.outcome))
-        return _together([self._judging(run, focus) for run in runs], self._step(self.plant))
+        return _together([self._judging(run, focus) for run in runs])
 
     def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
         """Outcomes at half the time step; None if the plant file does not allow it.
@@ -242,12 +235,7 @@ class PlantSimulator:
         plant = self._finer.plant
         found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]
         confirmed = [each if each.judged else replace(each, margin=np.nan) for each in found]
-        return _together(confirmed, self._step(plant))
-
-    @staticmethod
-    def _step(plant: Plant) -> float:
-        """Time step of a plant's traces as a share of the duration of its inputs."""
-        return float(plant.decl.dt) / float(plant.decl.duration)
+        return _together(confirmed)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
         """None: a black box has no gradient."""

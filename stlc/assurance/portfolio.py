@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -163,19 +162,18 @@ class Portfolio:
         for each in self._learning():
             each.observe(point, value)
 
-    def tell(self, proposal: Proposal, value: float, decided: float = math.nan) -> None:
+    def tell(self, proposal: Proposal, value: float) -> None:
         """Report the guidance value at a point to its strategy, and to those that learn from others.
 
         Args:
             proposal: the point and its strategy.
             value: guidance value at the point.
-            decided: share of the inputs' duration at the sample that decides the value; NaN if unknown.
         """
         self._values.append(value)
-        proposal.strategy.tell(proposal.point, value, decided)
+        proposal.strategy.tell(proposal.point, value)
         for other in self._learning():
             if other is not proposal.strategy:
-                other.observe(proposal.point, value, decided)
+                other.observe(proposal.point, value)
 
     def _learning(self) -> Sequence[Strategy]:
         """Strategies that learn from the points of others."""

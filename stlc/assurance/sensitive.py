@@ -85,8 +85,8 @@ class SensitiveClimbing(Strategy):
         self._open[id(point)] = _Change(point, parent, coordinates)
         return point
 
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().tell(point, value, decided)
+    def tell(self, point: Point, value: float) -> None:
+        super().tell(point, value)
         change = self._open.pop(id(point), None)
         if change is None:
             self._keep(point, value)
@@ -101,7 +101,7 @@ class SensitiveClimbing(Strategy):
         if parent.tried > TIRED and len(self._kept) > 1 and parent in self._kept:
             self._kept.remove(parent)
 
-    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: ARG002
+    def observe(self, point: Point, value: float) -> None:
         self._made += 1
         self._keep(point, value)
 

@@ -189,8 +189,8 @@ def _missing(count: int, sizes: NDArray[np.float64]) -> Simulations:
     """Outcomes of lost simulations; the sizes of their predicates are taken to be typical, of `sizes`."""
     typical = np.median(sizes, axis=0) if len(sizes) else np.zeros(sizes.shape[1])
     nothing = np.full(count, np.inf)
-    unknown, outside = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
-    return Simulations(nothing, nothing, outside, np.tile(typical, (count, 1)), unknown, outside)
+    outside = np.zeros(count, dtype=np.bool_)
+    return Simulations(nothing, nothing, outside, np.tile(typical, (count, 1)), outside)
 
 
 @dataclass(frozen=True, slots=True)

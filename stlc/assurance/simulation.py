@@ -44,8 +44,6 @@ class Simulations:
         admissible: whether the initial state meets the conditions of `where`, (count,).
         sizes: sizes of the margins of the predicates, (count, predicates); no columns if they are not
             wanted, or there is nothing to compare.
-        decided: share of the inputs' duration at the sample that decides the guidance, (count,): only inputs
-            before it affect the value there. NaN if it is unknown.
         judged: whether the requirement has a verdict, (count,); not if a simulation ended before it, or
             failed.
     """
@@ -54,7 +52,6 @@ class Simulations:
     guidance: NDArray[np.float64]
     admissible: NDArray[np.bool_]
     sizes: NDArray[np.float64]
-    decided: NDArray[np.float64]
     judged: NDArray[np.bool_]
 
     @classmethod
@@ -62,8 +59,7 @@ class Simulations:
         cls, margins: NDArray[np.float64], admissible: NDArray[np.bool_], judged: NDArray[np.bool_]
     ) -> Simulations:
         """Outcomes whose guidance is the exact robustness."""
-        unknown = np.full(len(margins), np.nan)
-        return cls(margins, margins, admissible, np.zeros((len(margins), 0)), unknown, judged)
+        return cls(margins, margins, admissible, np.zeros((len(margins), 0)), judged)
 
     @classmethod
     def joined(cls, parts: Sequence[Simulations]) -> Simulations:
@@ -73,7 +69,6 @@ class Simulations:
             np.concatenate([part.guidance for part in parts]),
             np.concatenate([part.admissible for part in parts]),
             np.concatenate([part.sizes for part in parts]),
-            np.concatenate([part.decided for part in parts]),
             np.concatenate([part.judged for part in parts]),
         )
 

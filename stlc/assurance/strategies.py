@@ -19,11 +19,6 @@ NARROW, WIDE = 0.01, 0.5
 """Least and greatest width of a change, in the unit cube."""
 REDRAWN = 0.35
 """Share of the changes that draw a value anew, at an end of its range or uniform between them."""
-RETIMED = 0.25
-"""Share of the neighbours whose inputs, or switches of an input, are moved in time."""
-LOOKING_BACK, RECENT = 0.5, 0.35
-"""Share of the other neighbours that differ before the deciding sample only, and the parameter of the
-geometric distribution of the number of pieces that the change lies before it."""
 SHORTEST, LONGEST = 0.01, 0.5
 """Half periods of periodic inputs, as shares of the duration."""
 SWEPT = 12
@@ -57,15 +52,12 @@ class Strategy(ABC):
     def propose(self) -> Point | None:
         """Return the next point, (dim,); None if the strategy is finished."""
 
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: ARG002
-        """Take the guidance value at a point that this strategy proposed; less is closer to a violation.
-
-        `decided`: share of the inputs' duration at the sample that decides the value; NaN if unknown.
-        """
+    def tell(self, point: Point, value: float) -> None:  # noqa: ARG002
+        """Take the guidance value at a point that this strategy proposed; less is closer to a violation."""
         self.best = min(self.best, value)
 
-    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:  # noqa: B027
-        """Take the guidance value at a point that another strategy proposed; arguments as of `tell`."""
+    def observe(self, point: Point, value: float) -> None:  # noqa: B027
+        """Take the guidance value at a point that another strategy proposed."""
 
 
 class ConstantVertices(Strategy):
@@ -185,12 +177,10 @@ class Told:
     Attributes:
         point: the point, (dim,).
         value: its guidance value.
-        decided: share of the inputs' duration at the sample that decides the value; NaN if unknown.
     """
 
     point: Point
     value: float
-    decided: float = math.nan
 
 
 class LocalSearch(Strategy):
@@ -204,121 +194,51 @@ class LocalSearch(Strategy):
     def ready(self) -> bool:
         return bool(self._kept)
 
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().tell(point, value, decided)
-        self.observe(point, value, decided)
+    def tell(self, point: Point, value: float) -> None:
+        super().tell(point, value)
+        self.observe(point, value)
 
-    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
+    def observe(self, point: Point, value: float) -> None:
         """Take a point into account; the earlier one of equally good points is the better one."""
         if math.isfinite(value):
-            known = [*self._kept, Told(point, value, decided)]
+            known = [*self._kept, Told(point, value)]
             self._kept = sorted(known, key=lambda each: each.value)[:KEPT]
 
-    def _one_of_the_best(self) -> Told:
+    def _one_of_the_best(self) -> Point:
         """The best point with probability one half, else the second best with one half, and so on."""
-        return self._kept[min(int(self.generator.geometric(0.5)), len(self._kept)) - 1]
+        return self._kept[min(int(self.generator.geometric(0.5)), len(self._kept)) - 1].point
 
 
-class Neighbours:
-    """Changed copies of points: in single values, in pieces and runs of successive values, or in time."""
+def neighbour(space: SearchSpace, generator: np.random.Generator, point: Point) -> Point:
+    """Copy of a point with other values, of a few coordinates or successive values of an input."""
+    changed = point.copy()
+    width = math.exp(generator.uniform(math.log(NARROW), math.log(WIDE)))
+    for picked in _picked(space, generator, point):
+        if generator.random() < REDRAWN:
+            changed[picked] = generator.choice((0.0, 1.0, generator.random()))
+        else:
+            changed[picked] = np.clip(changed[picked] + width * generator.standard_normal(), 0.0, 1.0)
+    return changed
 
-    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
-        self.space, self.generator = space, generator
 
-    def of(self, start: Told) -> Point:
-        """Copy of a point with other values, of a few coordinates or successive values, or at other times."""
-        generator, changed = self.generator, start.point.copy()
-        if self.space.blocks and generator.random() < RETIMED:
-            retimed = self._shifted(changed) if generator.random() < 0.5 else self._switched(changed)
-            if not np.array_equal(retimed, start.point):
-                return retimed
-        width = math.exp(generator.uniform(math.log(NARROW), math.log(WIDE)))
-        for picked in self._picked_before(start) if self._looks_back(start) else self._picked(start.point):
-            if generator.random() < REDRAWN:
-                changed[picked] = generator.choice((0.0, 1.0, generator.random()))
-            else:
-                changed[picked] = np.clip(changed[picked] + width * generator.standard_normal(), 0.0, 1.0)
-        return changed
+def _picked(space: SearchSpace, generator: np.random.Generator, point: Point) -> Iterator[list[int]]:
+    """One or two groups of coordinates; those of a group are changed together.
 
-    def _shifted(self, point: Point) -> Point:
-        """Copy of a point at which one input, or all of them, is some pieces earlier or later.
-
-        The first or last value is held where pieces are missing.
-        """
-        generator, blocks, moved = self.generator, self.space.blocks, point.copy()
-        pieces = int(generator.geometric(0.5)) * int(generator.choice((-1, 1)))
-        shortest = min(block.length / len(block.values) for block in blocks)
-        if generator.random() < 0.5:
-            blocks = (blocks[int(generator.integers(len(blocks)))],)
-            shortest = blocks[0].length / len(blocks[0].values)
-        for block in blocks:
-            values = list(block.values)
-            own = round(pieces * shortest * len(values) / block.length)
-            moved[values] = point[values][np.clip(np.arange(len(values)) - own, 0, len(values) - 1)]
-        return moved
-
-    def _switched(self, point: Point) -> Point:
-        """Copy of a point at which an input switches some pieces earlier or later."""
-        generator, blocks, moved = self.generator, self.space.blocks, point.copy()
-        block = blocks[int(generator.integers(len(blocks)))]
-        values = point[list(block.values)]
-        switches = np.flatnonzero(np.diff(values)) + 1
-        if len(switches):
-            at, by = int(generator.choice(switches)), int(generator.geometric(0.6))
-            if generator.random() < 0.5:
-                values[at : at + by] = values[at - 1]
-            else:
-                values[max(at - by, 0) : at] = values[at]
-            moved[list(block.values)] = values
-        return moved
-
-    def _looks_back(self, start: Told) -> bool:
-        """True, at random, if only values that act before the deciding sample are to be changed.
-
-        Changes of later ones cannot lower the robustness at that sample, but may lower it at another one, so
-        both kinds are tried.
-        """
-        known = bool(self.space.blocks) and math.isfinite(start.decided)
-        return known and self.generator.random() < LOOKING_BACK
-
-    def _picked_before(self, start: Told) -> Iterator[list[int]]:
-        """One or two groups of values of an input, mostly of those that act shortly before that sample.
-
-        A group is a value, the stretch around it over which the input has the same value (even if it lasts
-        longer), or a run of values that ends with it.
-        """
-        generator = self.generator
-        for _ in range(1 + (generator.random() < 0.5)):
-            block = self.space.blocks[int(generator.integers(len(self.space.blocks)))]
-            last = max(block.acting_before(start.decided) - int(generator.geometric(RECENT)), 0)
-            kind = generator.random()
-            if kind < 0.25:
-                yield [block.values[last]]
-            elif kind < 0.5:
-                yield _piece(start.point, block.values, last)
-            else:
-                first = max(last + 1 - int(generator.geometric(0.5)), 0)
-                yield list(block.values[first : last + 1])
-
-    def _picked(self, point: Point) -> Iterator[list[int]]:
-        """One or two groups of coordinates; those of a group are changed together.
-
-        A group starts from a random coordinate. If this is a value of an input, the group is half of the time
-        the stretch around it over which the input has the same value, and otherwise a run of successive
-        values of the input, or the coordinate alone. Any other coordinate is changed alone.
-        """
-        generator = self.generator
-        for _ in range(1 + (generator.random() < 0.5)):
-            pick = int(generator.integers(self.space.dim))
-            block = next((each for each in self.space.blocks if pick in each.values), None)
-            kind = generator.random()
-            if block is None or kind < 0.25:
-                yield [pick]
-            elif kind < 0.75:
-                yield _piece(point, block.values, block.values.index(pick))
-            else:
-                first, last = np.sort(generator.integers(0, len(block.values), 2))
-                yield list(block.values[first : last + 1])
+    A group starts from a random coordinate. If this is a value of an input, the group is half of the time the
+    stretch around it over which the input has the same value, and otherwise a run of successive values of the
+    input, or the coordinate alone. Any other coordinate is changed alone.
+    """
+    for _ in range(1 + (generator.random() < 0.5)):
+        pick = int(generator.integers(space.dim))
+        block = next((each for each in space.blocks if pick in each.values), None)
+        kind = generator.random()
+        if block is None or kind < 0.25:
+            yield [pick]
+        elif kind < 0.75:
+            yield _piece(point, block.values, block.values.index(pick))
+        else:
+            first, last = np.sort(generator.integers(0, len(block.values), 2))
+            yield list(block.values[first : last + 1])
 
 
 def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
@@ -412,8 +332,8 @@ class PeriodicInputs(Strategy):
         at = np.asarray(fractions) if fractions else np.arange(count) / count
         point[list(values)] = np.floor((at + 0.5 / count) / half + phase) % 2
 
-    def tell(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().tell(point, value, decided)
+    def tell(self, point: Point, value: float) -> None:
+        super().tell(point, value)
         waves = self._open.pop(id(point))
         if value < self._value:
             self._waves, self._value, self._width = waves, value, 0.15

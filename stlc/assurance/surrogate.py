@@ -19,8 +19,8 @@ from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.strategies import (
     CoarseSampling,
     LocalSearch,
-    Neighbours,
     UniformSampling,
+    neighbour,
     vertex_sampling,
 )
 
@@ -152,7 +152,7 @@ class SurrogateSearch(LocalSearch):
 
     def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
         super().__init__(space, generator)
-        self._process, self._neighbours = RobustnessProcess(space), Neighbours(space, generator)
+        self._process = RobustnessProcess(space)
         kinds = CoarseSampling, vertex_sampling, UniformSampling
         self._samplers = tuple(kind(space, generator) for kind in kinds)
         self._points: list[Point] = []
@@ -189,12 +189,12 @@ class SurrogateSearch(LocalSearch):
     def _candidates(self) -> list[Point]:
         """Neighbours of the best points, and random ones."""
         near = CANDIDATES // 2
-        found = [self._neighbours.of(self._one_of_the_best()) for _ in range(near)]
+        found = [neighbour(self.space, self.generator, self._one_of_the_best()) for _ in range(near)]
         found += [self._samplers[index % len(self._samplers)].propose() for index in range(CANDIDATES - near)]
         return found
 
-    def observe(self, point: Point, value: float, decided: float = math.nan) -> None:
-        super().observe(point, value, decided)
+    def observe(self, point: Point, value: float) -> None:
+        super().observe(point, value)
         self._points.append(point)
         self._values.append(value)
         self._known.add(point.tobytes())
@@ -217,7 +217,7 @@ class TrustRegionSearch(SurrogateSearch):
         if not self._kept:
             return self._samplers[0].propose()
         self._adapt()
-        centre = self._one_of_the_best().point
+        centre = self._one_of_the_best()
         distances = _distances(centre[None], np.array(self._points))[0]
         near = np.argsort(np.round(distances, DIGITS), kind="stable")[:NEAREST]
         candidates = [self._moved(centre) for _ in range(CANDIDATES)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,6 @@ from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
-from stlc.compile.ir import nodes as ir
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.trace import load_trace
 
@@ -187,42 +186,6 @@ def test_guidance_has_the_sign_of_the_margin_and_scales_the_larger_predicate():
     assert scales_of(np.array([[1.0, 2.0], [2.0, 1.0]])) is None
 
 
-@pytest.mark.parametrize("name", ["resonance", "early", "mixed"])
-def test_inputs_after_the_deciding_sample_do_not_make_up_for_it(name: str):
-    simulator = ModelSimulator.load("oscillator.stl", None, {})
-    index, generator = simulator.requirements.index(name), np.random.default_rng(1)
-    part = simulator.space.visible(simulator.seen(index))
-    points = generator.random((40, part.space.dim))
-
-    def outcome(points, scales=None):
-        return simulator.simulate(np.stack([part.whole(each) for each in points]), Focus(index, scales))
-
-    scales = (0.5, 0.002) if name == "mixed" else None
-    found = outcome(points, scales)
-    assert ((found.decided >= 0.0) & (found.decided <= simulator.seen(index))).all()
-    (block,) = part.space.blocks
-    later = np.zeros(points.shape, dtype=bool)
-    for row, share in enumerate(found.decided):
-        later[row, list(block.values[block.acting_before(share) :])] = True
-    assert later.any(1).sum() > 10
-    changed = np.where(later, generator.random(points.shape), points)
-    assert (outcome(changed, scales).guidance <= found.guidance).all()  # `always`: the sample is still there
-    earlier = np.where(later, points, generator.random(points.shape))
-    assert (outcome(earlier, scales).guidance > found.guidance).any()
-
-
-def test_the_deciding_sample_is_one_at_which_a_predicate_has_the_value_of_the_formula():
-    simulator = ModelSimulator.load("oscillator.stl", None, {})
-    generator, guide = np.random.default_rng(2), ScaledRobustness(simulator.task.rules[3].formula)
-    columns = {each: generator.normal(size=(201, 20)) for each in ("x", "v", "f")}
-    columns["f"][:] = np.nan  # which the requirement does not read
-    values = guide(columns, None)
-    samples = guide.deciding(columns, None, values).astype(int)
-    both = np.stack([1.5 - columns["x"], 500.0 - 1000.0 * columns["v"]])
-    assert (both[:, samples, np.arange(20)] == values).any(0).all()
-    assert np.isnan(guide.deciding(columns, None, values + 0.123)).all()
-
-
 def test_inputs_of_different_durations_are_cut_at_the_same_time(home: Path):
     inputs = (
         "{f: {range: [-1, 1], pieces: 10, duration: 10 s}, g: {range: [-1, 1], pieces: 10, duration: 5 s}}"
@@ -232,14 +195,6 @@ def test_inputs_of_different_durations_are_cut_at_the_same_time(home: Path):
     simulator = ModelSimulator.load("oscillator.stl", None, {})
     blocks = simulator.space.visible(simulator.seen(simulator.requirements.index("early"))).space.blocks
     assert [len(block.values) for block in blocks] == [2, 4]  # pieces of 1 s and of .5 s, until 2 s
-
-
-def test_a_predicate_and_its_negation_can_both_decide():
-    simulator = ModelSimulator.load("oscillator.stl", None, {})
-    (predicate, _) = ScaledRobustness(simulator.task.rules[3].formula).predicates
-    guide = ScaledRobustness(ir.BoolOp("and", (predicate, replace(predicate, sign=-predicate.sign))))
-    columns = {each: np.random.default_rng(4).normal(size=(5, 30)) for each in ("x", "v", "f")}
-    assert (guide.deciding(columns, None, guide(columns, None)) == 0.0).all()
 
 
 def test_the_command_writes_what_it_can_replay(capsys):

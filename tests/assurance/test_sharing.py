@@ -67,7 +67,7 @@ class Bowl:
         margins = np.stack([away - 1e-3, 0.499 - away, away + 1.0], 1)[:, focus.requirement]
         sizes = np.stack([away, 100.0 * away], 1) if focus.sized else np.zeros((len(points), 0))
         every = np.ones(len(points), dtype=np.bool_)
-        return Simulations(margins, margins, every, sizes, points.mean(1), every)
+        return Simulations(margins, margins, every, sizes, every)
 
     def end(self) -> None:
         """End this process, unless enough have ended."""
