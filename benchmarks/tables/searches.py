@@ -105,10 +105,8 @@ def _setting(name: str, setting: str, value: Any, *acts: str) -> Removal:
 REMOVALS = (
     Removal(WHOLE),
     *map(_turns, ("alternating vertices", "constant vertices", "coarse", "surrogate", "trust region")),
-    *map(_turns, ("periodic", "uniform")),
-    _turns("vertices", "input vertices"),
+    *map(_turns, ("periodic", "uniform", "vertices")),
     Removal("gradient", frozenset({"gradient"})),  # its turns count even where there is none
-    _setting("vertices of the opening", "portfolio.VERTICES", 0, "vertices", "input vertices"),
     _setting("means in the distance", "surrogate.WEIGHTS", (0.0,), "surrogate"),
     _setting("scales of predicates", "falsify.scales_of", lambda _: None),
 )

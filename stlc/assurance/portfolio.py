@@ -20,14 +20,13 @@ from stlc.assurance.strategies import (
     Strategy,
     UniformSampling,
     VertexSampling,
-    vertex_sampling,
 )
 from stlc.assurance.surrogate import SurrogateSearch, TrustRegionSearch
 
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
-VERTICES, OPENING = 5, 4
-"""Vertices and random points with which a search begins, after simple inputs."""
+OPENING = 4
+"""Random points with which a search begins, after vertices and constant inputs."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
 BLIND, BLIND_TURNS = 4, 12
@@ -105,8 +104,7 @@ class Portfolio:
                     self._drawn = CoarseSampling(space, generator)
                 drawn, alternating = _Opening(self._drawn), AlternatingVertices(space, generator)
                 opposite = [_Opening(constant)] * 2 if len(space.blocks) > 1 else [constants]
-                varied = [_Opening(vertex_sampling(space, generator))] * VERTICES
-                first = [_Opening(alternating, once=False), *opposite, *varied, drawn, descent, constants]
+                first = [_Opening(alternating, once=False), *opposite, drawn, descent, constants]
                 first += [drawn] * (OPENING - 1)
         elif not random and not graded:
             self._blind = [*[uniform] * (BLIND_TURNS - 1), vertices]
