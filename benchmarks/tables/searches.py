@@ -38,7 +38,7 @@ violation that remains at half the time step (300 if there is none), without a p
 geometric mean, over all problems and seeds, of this number divided by that of the whole search; above 1 the
 part is missed. Intervals of 95 % take problems as independent. `nothing found`: searches without a violation.
 """
-_OUTPUT = Output(Path("docs/falsification.md"))
+_OUTPUT = Output()
 
 
 @dataclass(frozen=True, slots=True)
