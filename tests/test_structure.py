@@ -10,8 +10,8 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 459_701
-CROSSINGS = 6.73
+NODES = 444_900
+CROSSINGS = 6.98
 CIRCLES = {
     ("cli/certify", "cli/check"),
     ("compile/backends", "compile/semantics"),
@@ -37,10 +37,10 @@ IMPLEMENTATIONS = {
     "choice among plans": 2,
     "rank of plans": 2,
     "improvement of a plan": 8,
-    "name of a guard": 40,
+    "name of a guard": 4,
     "verdict by the tolerance": 74,
-    "until": 14,
-    "smooth maximum of two": 4,
+    "until": 13,
+    "smooth maximum of two": 3,
     "overall robustness": 6,
     "squash of a control": 2,
 }

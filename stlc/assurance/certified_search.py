@@ -20,7 +20,7 @@ from torch import Tensor
 
 from stlc.assurance.verification.tubes import TubeModel
 from stlc.compile.ir.support import columns
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, best, finite, rank
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch

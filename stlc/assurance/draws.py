@@ -17,7 +17,7 @@ from stlc.assurance.certificate import Judged, Sample, together
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.modules import library_of, spec_sha256
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.judgement import unknown_requirement

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stlc.assurance.drive_simulator import DriveSimulator
 from stlc.assurance.portfolio import Portfolio, Proposal
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, SimulationStep, Watch
 from stlc.controller.training.failures import SearchRound

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.simulation import PARTS, Focus, Simulations
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
 from stlc.controller.deployment.simulator import simulate as run_worlds

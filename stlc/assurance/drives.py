@@ -12,7 +12,7 @@ from stlc.assurance.campaign import CertificateVerification, compared, seed_rang
 from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs

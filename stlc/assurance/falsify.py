@@ -23,7 +23,7 @@ from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Focus, Simulations, Simulator
 from stlc.assurance.strategies import GradientVertices
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
 FALSIFIER_VERSION = 12

@@ -18,7 +18,7 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns as columns_read_by
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.planning.planner import PlanResult
 from stlc.controller.planning.traces import trace_of
 from stlc.controller.problem.load import load_task

@@ -17,6 +17,7 @@ from stlc.assurance.strategies import (
     ConstantVertices,
     GradientVertices,
     PeriodicInputs,
+    Perturbation,
     Strategy,
     UniformSampling,
     VertexSampling,
@@ -93,18 +94,20 @@ class Portfolio:
         if self._guided:
             climb, constant = GradientVertices(space, generator, gradient), ConstantVertices(space, generator)
             constants, descent = _Opening(constant, once=False), _Opening(climb, once=False)
+            perturbed = _Opening(Perturbation(space, generator), once=False)
             self._leading, self._others = [SurrogateSearch(space, generator)], [climb]
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
             if space.small:
-                self._drawn, first = uniform, [*[_Opening(vertices)] * 2, constants, descent]
+                self._drawn, first = uniform, [*[_Opening(vertices)] * 2, constants, perturbed, descent]
             else:
                 self._leading.append(TrustRegionSearch(space, generator))
                 if any(len(block.values) > max(PIECES) for block in space.blocks):
                     self._drawn = CoarseSampling(space, generator)
                 drawn, alternating = _Opening(self._drawn), AlternatingVertices(space, generator)
-                opposite = [_Opening(constant)] * 2 if len(space.blocks) > 1 else [constants]
-                first = [_Opening(alternating, once=False), *opposite, drawn, descent, constants]
+                several = len(space.blocks) > 1
+                simple = [_Opening(constant)] * 2 if several else [constants, perturbed]
+                first = [_Opening(alternating, once=False), *simple, drawn, descent, constants]
                 first += [drawn] * (OPENING - 1)
         elif not random and not graded:
             self._blind = [*[uniform] * (BLIND_TURNS - 1), vertices]
@@ -175,7 +178,9 @@ class Portfolio:
 
     def _learning(self) -> Sequence[Strategy]:
         """Strategies that learn from the points of others."""
-        return self._late if self._sensitive is None else (self._sensitive,)
+        if self._sensitive is not None:
+            return (self._sensitive,)
+        return tuple(dict.fromkeys((*self._late, *(each.strategy for each in self._first))))
 
 
 def _rotated(strategies: list[Strategy]) -> Strategy:

@@ -19,6 +19,11 @@ NARROW, WIDE = 0.01, 0.5
 """Least and greatest width of a change, in the unit cube."""
 REDRAWN = 0.35
 """Share of the changes that draw a value anew, at an end of its range or uniform between them."""
+PERTURBED, PERTURBATIONS = (0.02, 0.05), 16
+"""Least and greatest width of a perturbation of all values; greatest number of perturbations."""
+SCATTER, JUDGED = 0.1, 3
+"""Interquartile range of the robustness of perturbations, as a share of that of other points, above which it
+counts as scattered; and the number of perturbations that are judged at least."""
 SHORTEST, LONGEST = 0.01, 0.5
 """Half periods of periodic inputs, as shares of the duration."""
 SWEPT = 12
@@ -249,6 +254,49 @@ def _piece(point: Point, values: Sequence[int], index: int) -> list[int]:
     while last + 1 < len(values) and point[values[last + 1]] == point[values[index]]:
         last += 1
     return list(values[first : last + 1])
+
+
+class Perturbation(LocalSearch):
+    """The best point so far with a small change of all values, mirrored at the ends of their ranges.
+
+    Where robustness varies more between close points than between distant ones, as in a closed loop that
+    chatters, the surroundings of a good vertex hold violations that the vertex itself misses. The strategy is
+    finished after a few points, and where their robustness is not scattered.
+    """
+
+    name = "perturbation"
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        self._own: list[float] = []
+        self._others: list[float] = []
+        self._proposed = 0
+
+    def tell(self, point: Point, value: float) -> None:
+        super().tell(point, value)
+        self._own.append(value)
+
+    def observe(self, point: Point, value: float) -> None:
+        super().observe(point, value)
+        self._others.append(value)
+
+    def propose(self) -> Point | None:
+        calm = len(self._own) >= JUDGED and _spread(self._own) <= SCATTER * _spread(self._others)
+        if calm or not self._kept or self._proposed == PERTURBATIONS:
+            return None
+        self._proposed += 1
+        low, high = map(math.log, PERTURBED)
+        width = math.exp(self.generator.uniform(low, high))
+        moved = self._kept[0].point + width * self.generator.standard_normal(self.space.dim)
+        mirrored: Point = 1.0 - np.abs(1.0 - np.abs(moved) % 2.0)
+        return mirrored
+
+
+def _spread(values: Sequence[float]) -> float:
+    """Interquartile range of the finite ones of values; 0 if there are fewer than two."""
+    finite = [value for value in values if math.isfinite(value)]
+    low, high = np.quantile(finite, (0.25, 0.75)) if len(finite) > 1 else (0.0, 0.0)
+    return float(high - low)
 
 
 class GradientVertices(LocalSearch):

@@ -15,6 +15,7 @@ from stlc.assurance.strategies import (
     GradientVertices,
     InputVertices,
     PeriodicInputs,
+    Perturbation,
     VertexSampling,
     neighbour,
     quantiles_of,
@@ -105,6 +106,22 @@ def test_neighbours_change_whole_pieces():
     assert float(np.mean([len(each) for each in moved])) < 40
     assert sum(len(each) == 20 for each in moved) > 10
     assert np.mean([len(each) > 0 for each in moved]) > 0.9  # hardly a simulation is wasted on the same point
+
+
+def test_perturbations_stay_close_to_the_best_point_and_inside():
+    points = []
+    best = np.array([0.0, 1.0, 0.0, 1.0, 0.3, 0.0, 1.0])
+    for seed in range(20):
+        strategy = Perturbation(TWO, np.random.default_rng(seed))
+        assert strategy.propose() is None
+        strategy.observe(np.full(TWO.dim, 0.5), 1.0)
+        strategy.observe(best, 0.5)
+        points += [strategy.propose() for _ in range(16)]
+        assert strategy.propose() is None
+    found = np.array(points)
+    assert ((found >= 0.0) & (found <= 1.0)).all()
+    assert (found[:, [0, 1, 2, 3, 5, 6]] != best[[0, 1, 2, 3, 5, 6]]).all()  # mirrored, not cut off
+    assert 0.01 < np.abs(found - best).mean() < 0.05
 
 
 def test_gradients_lead_to_vertices_while_that_makes_progress():

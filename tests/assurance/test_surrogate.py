@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -172,10 +173,26 @@ def test_a_search_begins_with_vertices_and_opposite_constants():
     assert "periodic" in names
 
 
-def test_all_constant_inputs_of_a_single_one_come_at_once():
+@pytest.mark.parametrize(("scatter", "count"), [(1.0, 16), (0.01, 3)])
+def test_the_best_vertex_of_one_input_is_perturbed_while_robustness_scatters_there(
+    scatter: float, count: int
+):
     space = SearchSpace(8, (SignalBlock("reference", tuple(range(8))),))
-    names = searched(Portfolio(space, np.random.default_rng(0), lambda _: None), 8, lambda _, k: k % 7)
-    assert names == [*["alternating vertices"] * 2, *["constant vertices"] * 2, *["coarse"] * 4]
+    portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
+    names = searched(
+        portfolio, 30, lambda name, k: 1.0 + (scatter if name == "perturbation" else 1.0) * (k % 7)
+    )
+    assert names[:4] == [*["alternating vertices"] * 2, *["constant vertices"] * 2]
+    assert names[4 : 4 + count] == ["perturbation"] * count
+    assert names[4 + count :][:4] == ["coarse"] * 4
+
+
+@pytest.mark.parametrize(("value", "near"), [(lambda _: 1.0, 1.0), (lambda k: k % 7, math.inf)])
+def test_perturbations_end_where_robustness_is_flat_or_points_are_not_admissible(value, near):
+    space = SearchSpace(8, (SignalBlock("reference", tuple(range(8))),))
+    portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
+    names = searched(portfolio, 18, lambda name, k: near if name == "perturbation" else value(k))
+    assert names.count("perturbation") == 3
 
 
 @pytest.mark.parametrize("batch", [2, 4, 13])
@@ -228,10 +245,11 @@ def test_in_a_small_space_all_vertices_come_first():
         portfolio.tell(proposal, float(np.abs(proposal.point - (0.05, 0.05, 0.95)).sum()))
     assert names[:10] == ["vertices"] * 2 + ["constant vertices"] * 8
     assert len({tuple(point) for point in points[2:10]}) == 8
-    later = [names[10:].count(each) for each in ("surrogate", "uniform")]
-    assert later == pytest.approx([36, 12], abs=2)
+    assert names[10:13] == ["perturbation"] * 3  # the robustness does not scatter
+    later = [names[13:].count(each) for each in ("surrogate", "uniform")]
+    assert later == pytest.approx([34, 11], abs=2)
     near = [point for name, point in zip(names, points, strict=True) if name == "surrogate"]
-    assert np.abs(np.array(near[-10:]) - (0.05, 0.05, 0.95)).mean() < 0.1
+    assert np.median(np.abs(np.array(near[-10:]) - (0.05, 0.05, 0.95))) < 0.1
 
 
 def test_after_many_points_all_strategies_have_their_share(monkeypatch: pytest.MonkeyPatch):

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.training.local_search import Searcher
 from stlc.diagnostics import not_installed, usage

@@ -17,7 +17,7 @@ from stlc.assurance.verification.boxes import Box, Mode
 from stlc.assurance.verification.forms import Floats
 from stlc.assurance.verification.judged import PROVED
 from stlc.assurance.verification.subject import VerificationSubject
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 FIRST = 8
 """Boxes along each coordinate that the search around a state begins with."""

@@ -17,7 +17,7 @@ import torch
 
 from stlc.assurance.verification.around import narrowed
 from stlc.assurance.verification.judged import PROVED
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import CallWorkers, LostCall, results
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import frozen_in, leaves, map_children
 from stlc.compile.schedule.schedule import Boundary
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 PROVED = 0.5 * TOLERANCE
 """A lower bound on robustness of at least -`PROVED` is a proof: the monitor takes -1e-6 as satisfied."""

@@ -21,13 +21,11 @@ from stlc.compile.semantics.kinds.dgmsr import GeneralizedMean
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 from stlc.compile.semantics.protocol import Parts, Semantics
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.registry import SEMANTICS
 
 __all__ = [
     "SEMANTICS",
-    "TOLERANCE",
     "ArithmeticGeometricMean",
     "Exact",
     "GeneralizedMean",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import Candidates, Limits, finite
 from stlc.controller.guard.kind import GuardInputs
 from stlc.controller.guard.kinds.paper import GUARD as PAPER

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.problem.task import Task
 from stlc.controller.streams import seeded

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import REPAIRED, SAFEST, Candidates, Deadline, Limits, finite, grid_of
 from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.guard.safe_prefix import robustness_until

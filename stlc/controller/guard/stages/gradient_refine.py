@@ -22,9 +22,8 @@ from torch import Tensor
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.semantics import TOLERANCE
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.compile.semantics.tolerance import weighed
+from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.feasibility import extremes
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import SAFEST, Candidates, Deadline, best
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried

@@ -21,7 +21,7 @@ import torch
 
 from stlc.compile.backends.milp.encode import MARGIN, Demand, Encoding
 from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import extremes
 from stlc.controller.options import bounded
 from stlc.controller.training.local_search import Searcher

@@ -17,7 +17,7 @@ import torch
 from numpy.random import Generator
 from torch import Tensor
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.planning.newton import GaussNewton, Pull, state_gradient, values_of
 from stlc.controller.planning.schedules import GoalScheduler, tempo

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from stlc.compile.semantics.semantics import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import extremes
 from stlc.controller.options import bounded
 from stlc.controller.training.local_search import Searcher
