@@ -12,6 +12,7 @@ import pytest
 
 from stlc import Run, System
 from stlc.cli.framework.app import PROGRAM, main
+from stlc.controller.guard.stages import STAGES
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
@@ -23,7 +24,7 @@ from stlc.grammar.parse.parser import parse
 from stlc.plants.declaration import load_plant_decl, plant_schema
 from stlc.plants.kinds import KINDS
 from stlc.plugins import plugins, variable
-from stlc.registry import METHODS, PLANNERS, PackageRegistry
+from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import RunDir
 from stlc.trace.formats.registry import ELSEWHERE, suffixes
 from stlc.trace.trace import load_trace
@@ -37,10 +38,13 @@ REGISTRIES: dict[str, PackageRegistry] = {
     "stlc.formats": ELSEWHERE,
     "stlc.plants": KINDS,
     "stlc.commands": PROGRAM.elsewhere,
+    "stlc.guards": GUARDS,
+    "stlc.stages": STAGES,
 }
 NAMES = {
     **{"stlc.methods": "coasting", "stlc.planners": "levels", "stlc.formats": "ltsv"},
     **{"stlc.plants": "sum", "stlc.commands": "count"},
+    "stlc.stages": "full_braking",
 }
 PLANT = """
 plant: 1
@@ -162,6 +166,21 @@ def test_a_kind_of_plant_of_a_package(
     Path("sum.yaml").write_text(PLANT.replace("gain: 2", "gian: 2"))
     with pytest.raises(SystemFileError, match="gian"):
         load_plant_decl(Path("sum.yaml"))
+
+
+@pytest.mark.usefixtures("toy")
+def test_a_guard_of_a_package_and_its_stage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert GUARDS.installed == ("none", "paper", "braking", "full", "certified")
+    drive = ["simulate", SPEC, "--system", CAR, "--method", "search", "--budget", "1ms", "--guard", "braking"]
+    assert main([*drive, "--seeds", "0", "--agents", "2", "--steps", "2", "--no-pictures"]) == 0
+    assert "braking guard" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each != str(TOY)])
+    assert "braking" not in GUARDS
+    assert main(drive) == 2
+    assert "unknown guard `braking`" in capsys.readouterr().err
 
 
 def test_a_command_of_a_package(tmp_path: Path) -> None:

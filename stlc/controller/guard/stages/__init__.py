@@ -24,8 +24,17 @@ if TYPE_CHECKING:
     from stlc.runtime.prefixes import PrefixGrid
 
 STAGES: PackageRegistry[type[GuardStage]] = PackageRegistry(
-    "stage", "stlc.controller.guard.stages", "STAGE", default=""
+    "stage",
+    "stlc.controller.guard.stages",
+    "STAGE",
+    group="stlc.stages",
+    accepts="stlc.controller.guard.stages:is_stage",
 )
+
+
+def is_stage(entry: object) -> bool:
+    """True of a class of stages."""
+    return isinstance(entry, type) and issubclass(entry, GuardStage)
 
 
 @dataclass(frozen=True, slots=True)
