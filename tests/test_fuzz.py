@@ -100,6 +100,7 @@ def test_random_inputs_through_the_program() -> None:
     assert {"text", "spec", "system", "trace", "stream", "csv", "bag"} <= kinds
 
 
+@pytest.mark.apart
 def test_run_folders_of_strangers() -> None:
     run(24, seed=5, kinds=("hostile",), seconds=10.0)
 

@@ -130,6 +130,7 @@ def test_a_trace(code, example, tmp_path, monkeypatch, capsys):
 # ---------------------------------------------------------------------- programs
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(("code", "example"), examples("py"))
 def test_a_program(code, example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -279,6 +280,7 @@ def arranged(monkeypatch, machine):
     return arrange
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("there")
 @pytest.mark.parametrize(("code", "example"), examples("console"))
 def test_a_command(code, example, arranged, capsys):
