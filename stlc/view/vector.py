@@ -167,20 +167,24 @@ class CommandRenderer(RendererBase):
         words: list[str] = []
         x = y = 0
         begun = (0, 0)
-        for points, code in path.iter_segments(flip, simplify=False, remove_nans=True):
+        outline = path.cleaned(flip, simplify=False, curves=True, remove_nans=True)
+        corners = np.rint(np.clip(np.nan_to_num(outline.vertices), -99_999, 99_999)).astype(int).tolist()
+        codes, first = outline.codes.tolist(), 0
+        while codes[first] != Outline.STOP:
+            code, ends = codes[first], corners[first : first + Outline.NUM_VERTICES_FOR_CODE[codes[first]]]
+            first += len(ends)
             if code == Outline.CLOSEPOLY:
                 words.append("z")
                 x, y = begun
                 continue
-            ends = np.rint(np.clip(points, -99_999, 99_999)).astype(int).reshape(-1, 2)
             if code == Outline.MOVETO:
-                begun = (int(ends[0, 0]), int(ends[0, 1]))
+                begun = (ends[0][0], ends[0][1])
                 if words and (x, y) == begun and words[-1] != "z":
                     continue  # the line continues
                 words.append(f"M{begun[0]} {begun[1]}")
             else:
-                words.append(_LETTERS[code] + " ".join(f"{a - x} {b - y}" for a, b in ends.tolist()))
-            x, y = ends[-1].tolist()
+                words.append(_LETTERS[code] + " ".join(f"{a - x} {b - y}" for a, b in ends))
+            x, y = ends[-1]
         return "".join(words)
 
     def _dash(self, gc: Any) -> str | None:
