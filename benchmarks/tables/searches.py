@@ -1,4 +1,4 @@
-"""What each part of the falsification search contributes: simulations until a violation without it.
+"""Contribution of each part of the falsification search: simulations until a violation without it.
 
 The problems in `benchmarks/problems/` played no part in the choice of the search: linear, switched and neural
 plants and loops with PID controllers, from easy to hard. Rows of the ARCH-COMP category stand beside them.
