@@ -6,11 +6,15 @@ import gc
 import os
 import signal
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from stlc.__main__ import GARBAGE
+
+TESTS = Path(__file__).parent
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -44,6 +48,34 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GARBAGE)
+
+
+SMALL = {
+    "stlc.controller.training.learner.MARGIN_STATES": 8,
+    "stlc.controller.guard.feasibility.TRIES": 1000,
+    "stlc.controller.evaluation.deployment.LATENCY_SECONDS": 0.01,
+}
+"""What makes the least training take half a second, and a simulation five."""
+ROUNDS = {"pool": 128, "most": 32}
+"""States of a search round."""
+TRAINING = {
+    *("assurance", "benchmarks", "cli", "controller", "examples", "export", "gym", "runtime", "view"),
+    *("test_hostile_runs.py", "test_plugins.py"),
+}
+"""Parts of the tests that train and simulate."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_runs(request: pytest.FixtureRequest):
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.relative_to(TESTS).parts[0] in TRAINING:
+            from stlc.controller.training import loop
+
+            decided = loop.resolve_config
+            patch.setattr(loop, "resolve_config", lambda *options: replace(decided(*options), **ROUNDS))
+            for name, value in SMALL.items():
+                patch.setattr(name, value)
+        yield
 
 
 @pytest.fixture(autouse=True)

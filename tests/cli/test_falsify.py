@@ -63,15 +63,15 @@ def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
 
 
 def found(capsys: pytest.CaptureFixture[str], *args: str) -> dict:
-    main(["falsify", "latest", "--simulations", "64", *args, "--json"])
+    main(["falsify", "latest", "--simulations", "32", *args, "--json"])
     return json.loads(capsys.readouterr().out)["result"]
 
 
 def test_gusts_that_push_the_cart_out_are_found_and_replayed(capsys, tmp_path):
-    assert main(["falsify", "latest", "--simulations", "64", "-o", str(tmp_path)]) == 1
+    assert main(["falsify", "latest", "--simulations", "32", "-o", str(tmp_path)]) == 1
     text = capsys.readouterr().out
     assert "near: violated, robustness -" in text
-    assert "far: no violation in 64 simulations" in text
+    assert "far: no violation in 32 simulations" in text
     assert "this is no proof" in text
     trace = load_trace(tmp_path / "near.npz")
     assert np.abs(trace.data["x"]).max() > 1.3
@@ -110,7 +110,7 @@ def test_a_baseline_draws_as_declared(capsys, tmp_path):
     searched = found(capsys, "--require", "far", "-o", str(tmp_path))
     sampled = found(capsys, "--require", "far", "--random", "-o", str(tmp_path))
     assert "sensitive climbing" in searched["requirements"][0]["strategies"]
-    assert sampled["requirements"][0]["strategies"] == {"uniform": 64}
+    assert sampled["requirements"][0]["strategies"] == {"uniform": 32}
     assert misfits(searched, load_schema("falsify")["properties"]["result"]) == []
 
 

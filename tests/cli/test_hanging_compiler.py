@@ -43,7 +43,6 @@ def hanging(monkeypatch, tmp_path):
     monkeypatch.setattr(
         "stlc.controller.training.config.TrainConfig", functools.partial(TrainConfig, held_out=64)
     )
-    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.01)
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 16)
     caches = (trace_cells._library, window_kernel._library)
     for each in caches:

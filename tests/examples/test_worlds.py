@@ -106,7 +106,6 @@ def test_a_world_begins_anew(task: Task) -> None:
 def test_an_episode_ends_with_a_trace_that_check_reads(
     task: Task, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.05)
     everybody = "stlc.controller.evaluation.executed.search_safe"
     monkeypatch.setattr(everybody, lambda _, x0: torch.ones(len(x0), dtype=torch.bool))
     setting = Setting((0, 1), 2, task.horizon + 4, task.system.decl.test.replan)

@@ -155,7 +155,6 @@ WORLD = "from stlc.controller.world import ModelWorld\n\n\nclass Yard(ModelWorld
 def quicken(patch: pytest.MonkeyPatch) -> None:
     """Judge fewer states and decisions than a run is worth: only what is said matters here."""
     patch.setattr("stlc.controller.training.config.TrainConfig", functools.partial(TrainConfig, held_out=64))
-    patch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.01)
     patch.setattr("stlc.controller.training.learner.MARGIN_STATES", 16)
 
 

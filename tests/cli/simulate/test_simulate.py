@@ -37,7 +37,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text = (ROOT / "examples/car.yaml").read_text().replace("../specs", str(ROOT / "specs"))
         system.write_text(text + SCENARIO)
         (folder / "traffic_grid.py").write_text((ROOT / "examples/traffic_grid.py").read_text())
-        command = ["train", str(spec), "--system", str(system), "--steps", "30"]
+        command = ["train", str(spec), "--system", str(system), "--steps", "5"]
         assert main([*command, "--batch", "64", "--held-out", "100", "--no-pictures"]) == 0
     return folder
 
@@ -45,7 +45,6 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunDir:
     monkeypatch.chdir(home)
-    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.2)
     capsys.readouterr()
     return RunDir.newest()
 
@@ -229,6 +228,7 @@ def test_all_scenarios_are_driven_and_compared(there: RunDir, capsys: pytest.Cap
     assert there.read_json("eval/simulate.json")["scenario"] is None
 
 
+@pytest.mark.apart
 def test_margins_are_measured_and_what_is_wrong_is_told(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -387,6 +387,7 @@ def test_an_interruption_while_it_is_judged_keeps_everything(
     assert "the first 6 steps are in" in capsys.readouterr().err
 
 
+@pytest.mark.apart
 def test_pictures_are_drawn(
     there: RunDir, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -418,7 +419,7 @@ from stlc.cli.framework.app import main
 from stlc.diagnostics import UsageError
 from stlc.runtime import Controller
 
-deployment.LATENCY_SECONDS = 0.2
+deployment.LATENCY_SECONDS = 0.01
 small = "--guard braking --seeds 0 --agents 4 --steps 6 --no-pictures"
 for words in ("simulate --help", f"simulate {small}", "report", "schema certify", "simulate --guard brakng"):
     print(f"## {words}", flush=True)

@@ -82,7 +82,6 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunDir:
     monkeypatch.chdir(home)
-    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.01)
     capsys.readouterr()
     found = RunDir.newest()
     (found.path / "trace.npz").unlink(missing_ok=True)

@@ -74,7 +74,9 @@ def test_what_a_resumed_run_cannot_change_is_refused(
     assert finding["message"].startswith(option[0])
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.apart)]
+)
 def test_an_interrupted_run_is_saved_and_told(
     number: int, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,7 +143,7 @@ def test_a_refused_continuation_leaves_the_run_as_it_was(
     assert (folder.path / "run.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("killed", [False, True])
+@pytest.mark.parametrize("killed", [False, pytest.param(True, marks=pytest.mark.apart)])
 def test_a_continuation_that_breaks_off_before_its_first_step_has_failed(
     killed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,7 +91,7 @@ def test_seeds_are_nobody_elses() -> None:
 def test_a_training_reports_its_drives(tmp_path: Path) -> None:
     spec = parse(read_source(ROOT / "specs" / "traffic.stl"))
     task = Task.of(spec, System.load(ROOT / "examples" / "car.yaml", {**SMALL, "test.judge": "null"}))
-    config = TrainConfig(held_out=50, budget=1.5, clock="processor", drives=4, batch=32, seed=1)
+    config = TrainConfig(held_out=50, budget=0.7, clock="processor", drives=4, batch=32, seed=1)
     outcome = train(task, config, open_folder(task, config, Launch(root=tmp_path)))
     record = outcome.run.dir.record()
     assert outcome.simulated is not None

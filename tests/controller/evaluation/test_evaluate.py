@@ -269,7 +269,10 @@ def test_the_ceiling_is_searched_for_in_visited_states(car_task: Task, recorded:
     assert metrics["feasible_followed"].values[1] == pytest.approx(good[rows][some[rows] == 1.0].mean())
 
 
-def test_a_deployment_shorter_than_a_window_has_no_executed_starts(car_task: Task) -> None:
+def test_a_deployment_shorter_than_a_window_has_no_executed_starts(
+    car_task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 60.0)
     found = deploy(car_task, Careful(car_task), Setting((0, 1), 2, 3), "none")
     assert "executed_starts" not in found.metrics
     assert "plan_accuracy" in found.metrics

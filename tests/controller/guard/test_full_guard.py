@@ -23,7 +23,7 @@ QUICK = Limits(seconds=None, tries=256, drawn=30, places=2)
 
 @pytest.mark.parametrize("action", [10.0, -10.0])
 def test_it_finds_more_than_the_papers_backup_does(car_task: Task, action: float) -> None:
-    x, plan = failing(car_task, action, 200)
+    x, plan = failing(car_task, action, 80)
     policy = Constant(car_task, action)
     paper = StagedSearch(car_task, policy, PAPER, grid=grid()).search(x, plan)
     found = StagedSearch(car_task, policy, FULL, grid=grid(), limits=QUICK).search(x, plan)
@@ -82,6 +82,7 @@ def _as_they_are(_ascent: GradientAscent, _x: Tensor, places: Tensor, _until: fl
     return places
 
 
+@pytest.mark.apart
 def test_without_a_kernel_it_finds_as_much(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     x, plan = failing(car_task, 10.0, 40)
     x, plan = x[:12], plan[:12]

@@ -93,7 +93,7 @@ def test_what_is_found_is_what_it_says(car_task: Task) -> None:
 
 
 def test_batches_do_not_change_the_choice_and_bound_the_memory(car_task: Task) -> None:
-    x, plan = failing(car_task, 10.0, n=40)
+    x, plan = failing(car_task, 10.0, n=20)
     whole = paper_search(car_task, Constant(car_task, 10.0), grid()).search(x, plan)
     policy = Constant(car_task, 10.0)
     pieces = paper_search(car_task, policy, grid(batch=20)).search(x, plan)

@@ -152,6 +152,7 @@ def test_a_method_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("added")
 def test_a_method_of_one_action_a_step_is_one_file(capsys: pytest.CaptureFixture[str]) -> None:
     """It has its own option, is trained, resumed bit for bit, deployed under guards, and opened again."""

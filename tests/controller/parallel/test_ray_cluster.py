@@ -35,7 +35,11 @@ def without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("without_ray")
 @pytest.mark.parametrize(
-    ("program", "command"), [(main, ["train", *SPECS]), (measure, ["paper", "--only", "traffic"])]
+    ("program", "command"),
+    [
+        (main, ["train", *SPECS]),
+        pytest.param(measure, ["paper", "--only", "traffic"], marks=pytest.mark.apart),
+    ],
 )
 def test_without_ray_it_is_said_how_to_get_it(
     program: Any,

@@ -56,8 +56,8 @@ class Machine:
 
     def spend(self, seconds: float) -> float:
         before = self.now
-        for _ in range(10):
-            self.now += 0.1 * seconds * self.slow(self.now)
+        for _ in range(4):
+            self.now += 0.25 * seconds * self.slow(self.now)
         return self.now - before
 
     def wait(self, until: float) -> float:
@@ -288,6 +288,7 @@ def test_a_budget_that_was_interrupted_is_repeated_too(
     assert _same(folder, again)
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("ticking")
 def test_a_budget_that_was_interrupted_near_its_end_tells_its_steps(car_task: Task, tmp_path: Path) -> None:
     calls = itertools.count(1)
@@ -304,6 +305,7 @@ def test_a_budget_that_was_interrupted_near_its_end_tells_its_steps(car_task: Ta
     )
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("ticking")
 def test_a_budget_that_was_killed_before_its_first_checkpoint_is_planned_anew(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -337,7 +339,7 @@ def test_a_run_that_goes_on_past_its_end_is_repeated_too(car_task: Task, tmp_pat
 
 
 @pytest.mark.usefixtures("ticking")
-@pytest.mark.parametrize("more", [{"steps": 80}, {"budget": 20.0}])
+@pytest.mark.parametrize("more", [{"steps": 80}, pytest.param({"budget": 20.0}, marks=pytest.mark.apart)])
 def test_a_continuation_that_is_killed_at_once_still_has_its_steps_to_make(
     more: dict[str, Any], car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -369,7 +371,13 @@ def test_steps_instead_of_a_budget_hold_although_the_continuation_is_killed_at_o
 
 @pytest.mark.usefixtures("ticking")
 @pytest.mark.parametrize("more", [{"steps": 12}, {"budget": 4.0}])
-@pytest.mark.parametrize("config", [BUDGET, replace(BUDGET, steps=StepSchedule.parse("60,20@11,14@12"))])
+@pytest.mark.parametrize(
+    "config",
+    [
+        BUDGET,
+        pytest.param(replace(BUDGET, steps=StepSchedule.parse("60,20@11,14@12")), marks=pytest.mark.apart),
+    ],
+)
 def test_a_new_length_before_the_first_checkpoint_begins_anew(
     config: TrainConfig, more: dict[str, Any], car_task: Task, tmp_path: Path
 ) -> None:

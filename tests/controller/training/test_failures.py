@@ -137,7 +137,9 @@ class Clock:
         return self.time
 
 
-@pytest.mark.parametrize("interrupted", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "interrupted", [pytest.param(True, marks=pytest.mark.apart), pytest.param(False, marks=pytest.mark.slow)]
+)
 def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupted: bool
 ) -> None:
@@ -174,6 +176,7 @@ def test_rounds_take_a_share_of_a_budget_and_the_record_repeats_them(
         assert torch.equal(value, right[name]), name
 
 
+@pytest.mark.apart
 def test_an_interruption_right_after_a_round_is_repeated_by_the_record(
     car_task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

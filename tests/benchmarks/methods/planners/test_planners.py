@@ -84,7 +84,6 @@ def test_a_planner_of_a_file_drives_and_its_run_is_judged(
     laws.available(name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STLC_PLANNERS", "")
-    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.1)
     file = str(ROOT / f"benchmarks/methods/planners/{name}.py")
     words = ["simulate", str(ROOT / f"specs/{spec}.stl"), "--method", file, *SMALL]
     assert main([*words, "--json", "--fail-under", "0"]) == 0
