@@ -9,7 +9,7 @@ from pathlib import Path
 import onnx
 import pytest
 import torch
-from helpers.exported import exported, run_of, untrained
+from helpers.exported import exported, run_of, untrained, written
 
 from stlc.diagnostics import MissingError, RunError, UsageError
 from stlc.export.verify import SINGLE, same_verdicts
@@ -45,6 +45,7 @@ def test_every_benchmark_has_graphs_in_float32(spec: str, system: str, tmp_path:
     assert done.agreement is not None
 
 
+@pytest.mark.apart
 def test_graphs_in_float32_hold_no_float64(tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
     done = export(run, "onnx", tmp_path / "out", "float32")
@@ -62,9 +63,8 @@ def test_graphs_in_float32_hold_no_float64(tmp_path: Path) -> None:
         precision_of("float32", "c")
 
 
-def test_the_files_say_what_they_are(tmp_path: Path) -> None:
-    run = run_of("traffic", "car", tmp_path)
-    done = export(run, "onnx", tmp_path / "out")
+def test_the_files_say_what_they_are() -> None:
+    run, done = written("traffic", "car")
     assert done.files == (
         "continue.onnx",
         "controller.json",
@@ -152,6 +152,7 @@ def test_a_plan_that_is_no_number_counts_as_violated() -> None:
     torch.testing.assert_close(torch.from_numpy(found.each), wanted.requirements, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.apart
 def test_without_changed_copies_there_is_one_graph_less(tmp_path: Path) -> None:
     done = export(run_of("traffic", "car", tmp_path, varied=False), "onnx", tmp_path / "out")
     assert "continue.onnx" not in done.files

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import subprocess
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.documents import misfits
-from helpers.exported import CART, MISSION, STRICT, build, run_of, untrained
+from helpers.exported import CART, MISSION, STRICT, build, exported, run_of, untrained
 
 from stlc import native
 from stlc.cli.commands.schema import load_schema
@@ -48,7 +49,11 @@ def build_in_cpp(folder: Path) -> Path:
 @compiled
 @pytest.mark.parametrize(
     ("spec", "system", "varied"),
-    [("traffic", "car", True), ("traffic", "car", False), ("ship_safe", "ship_safe", True)],
+    [
+        ("traffic", "car", True),
+        pytest.param("traffic", "car", False, marks=pytest.mark.apart),
+        ("ship_safe", "ship_safe", True),
+    ],
 )
 def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: bool, tmp_path: Path) -> None:
     run = run_of(spec, system, tmp_path, varied=varied)
@@ -75,8 +80,8 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: b
     [("traffic", "car"), pytest.param("manipulation", "panda", marks=pytest.mark.slow)],
 )
 def test_the_header_may_be_included_from_cpp(spec: str, system: str, tmp_path: Path) -> None:
-    run = run_of(spec, system, tmp_path)
-    folder = export(run, "c", tmp_path / "out").folder
+    run, whole = exported(spec, system, "c")
+    folder = Path(shutil.copytree(whole, tmp_path / "out"))
     states = run.task.sample(4, seed=5, dtype=torch.float64).tolist()
     mine, theirs = (
         torch.tensor(answers([str(built), "policy"], states), dtype=torch.float64)
@@ -94,10 +99,7 @@ def mission_of(folder: Path) -> Run:
 
 
 @compiled
-@pytest.mark.parametrize("cpp", [False, True])
-def test_the_c_controller_advances_what_a_mission_adds(cpp: bool, tmp_path: Path) -> None:
-    if cpp and shutil.which("c++") is None:
-        pytest.skip("needs a C++ compiler")
+def test_the_c_controller_advances_what_a_mission_adds(tmp_path: Path) -> None:
     run = mission_of(tmp_path)
     system, far = run.task.system, 0.25
     folder = export(run, "c", tmp_path / "out").folder
@@ -110,9 +112,10 @@ def test_the_c_controller_advances_what_a_mission_adds(cpp: bool, tmp_path: Path
         whole[:, :2] = sample
         lines.append(whole[0].tolist())
         whole = torch.cat((whole[:, :2], system.added_later(whole)), 1)
-    built = build_in_cpp(folder) if cpp else build(folder)
-    wanted = answers([str(built)], lines)
-    assert answers([str(built), "mission", str(far)], drive.tolist()) == wanted
+    for how in (build, build_in_cpp) if shutil.which("c++") else (build,):
+        built = how(folder)
+        wanted = answers([str(built)], lines)
+        assert answers([str(built), "mission", str(far)], drive.tolist()) == wanted
     assert (
         len({line[len(system.decl.signature.names) + 1] for line in map(tuple, lines)}) > 10
     )  # the clock runs
@@ -189,6 +192,7 @@ def test_what_disagrees_is_not_handed_out(tmp_path: Path) -> None:
         agreement(run.policy, proud, states=8)
 
 
+@pytest.mark.apart
 def test_a_backup_policy_with_another_rule_is_not_handed_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,10 +204,9 @@ def test_a_backup_policy_with_another_rule_is_not_handed_out(
 
 
 @compiled
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e308"])
-def test_the_c_controller_says_that_a_number_is_not_finite(value: str, tmp_path: Path) -> None:
-    run = run_of("traffic", "car", tmp_path)
-    folder = export(run, "c", tmp_path / "out").folder
+def test_the_c_controller_says_that_a_number_is_not_finite(tmp_path: Path) -> None:
+    run, whole = exported("traffic", "car", "c")
+    folder = Path(shutil.copytree(whole, tmp_path / "out"))
     text = (folder / "main.c").read_text()
     for call in ("stlc_policy(&controller", "stlc_decide(&controller"):
         text = text.replace(call, f'printf("%d ", {call}', 1).replace(
@@ -211,12 +214,13 @@ def test_the_c_controller_says_that_a_number_is_not_finite(value: str, tmp_path:
         )
     (folder / "main.c").write_text(text)
     state = run.task.sample(1, seed=5, dtype=torch.float64)[0].tolist()
-    state[0] = float(value)
     program = str(build(folder))
-    for mode in (["policy"], []):
-        (row,) = answers([program, *mode], [state])
-        assert row[0] == -1 or (value == "1e308" and not mode and row[0] in (0, 1))
-        assert np.isfinite(row[5 + len(run.task.rules) :]).all()
+    for value in (math.nan, math.inf, -math.inf, 1e308):
+        state[0] = value
+        for mode in (["policy"], []):
+            (row,) = answers([program, *mode], [state])
+            assert row[0] == -1 or (value == 1e308 and not mode and row[0] in (0, 1))
+            assert np.isfinite(row[5 + len(run.task.rules) :]).all()
 
 
 def test_a_robustness_that_both_call_not_a_number_agrees(tmp_path: Path) -> None:
@@ -241,8 +245,8 @@ def test_an_unknown_target_is_a_usage_error() -> None:
 
 @compiled
 def test_the_page_compiles(tmp_path: Path) -> None:
-    run = run_of("traffic", "car", tmp_path)
-    out = export(run, "c", tmp_path / "out").folder
+    run, whole = exported("traffic", "car", "c")
+    out = Path(shutil.copytree(whole, tmp_path / "out"))
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     (out / "main.c").write_text(text.split("```c\n")[1].split("```")[0], encoding="utf-8")
     measured = " ".join(["0"] * len(run.task.system.decl.signature.names))
@@ -269,25 +273,35 @@ def test_bad_input_gives_a_diagnostic(
     assert not (made.path / "export").exists()
 
 
+@pytest.mark.apart
+@pytest.mark.parametrize("target", ["c", "onnx"])
 def test_the_command_writes_beside_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_of("traffic", "car", tmp_path / "runs")
     monkeypatch.setattr(Run, "open", lambda *_, **__: run)
-    for target in ("c", "onnx"):
-        assert main(["export", "--to", target, "--json", "-o", str(tmp_path / target)]) == 0
-        document = json.loads(capsys.readouterr().out)
-        assert misfits(document, load_schema("export/1")) == []
-        assert sorted(path.name for path in (tmp_path / target).iterdir()) == document["result"]["files"]
-        assert (document["result"]["latency"] is not None) == (target == "onnx")
-    folder = tmp_path / "c"
+    assert main(["export", "--to", target, "--json", "-o", str(tmp_path / target)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("export/1")) == []
+    assert sorted(path.name for path in (tmp_path / target).iterdir()) == document["result"]["files"]
+    assert (document["result"]["latency"] is not None) == (target == "onnx")
+    assert main(["export", "--to", target, "-o", str(tmp_path / "again")]) == 0
+    assert ("decides in" in capsys.readouterr().err) == (target == "onnx")
+
+
+def test_the_command_keeps_the_program_of_a_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, whole = exported("traffic", "car", "c")
+    monkeypatch.setattr(Run, "open", lambda *_, **__: run)
+    folder = Path(shutil.copytree(whole, tmp_path / "c"))
     (folder / "main.c").write_text("int main(void) { return 0; }\n")
     (folder / "stlc_weights.h").write_text("old")
     assert main(["export", "--to", "c", "--json", "-o", str(folder)]) == 0
     document = json.loads(capsys.readouterr().out)
+    assert misfits(document, load_schema("export/1")) == []
+    assert document["result"]["latency"] is None
     assert document["result"]["kept"] == ["main.c"]
     assert document["result"]["files"] == ["Makefile", "stlc_controller.h", "stlc_weights.h"]
     assert (folder / "main.c").read_text() == "int main(void) { return 0; }\n"
     assert (folder / "stlc_weights.h").read_text() != "old"
-    assert main(["export", "--to", "onnx", "-o", str(tmp_path / "again")]) == 0
-    assert "decides in" in capsys.readouterr().err

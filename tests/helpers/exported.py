@@ -19,7 +19,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
 from stlc.dynamics.model.system import System
 from stlc.export.verify import BUILT
-from stlc.export.write import export
+from stlc.export.write import Exported, export
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 
@@ -74,11 +74,17 @@ def untrained(spec: Path, system: Path, folder: Path, *, varied: bool = True) ->
 
 
 @cache
-def exported(spec: str, system: str) -> tuple[Run, Path]:
-    """The run of a benchmark, and the folder that it was exported to as ONNX; nobody changes them."""
+def written(spec: str, system: str, target: str = "onnx") -> tuple[Run, Exported]:
+    """The run of a benchmark, and what its export came to; nobody changes them, nor the files."""
     folder = _kept()
     run = run_of(spec, system, folder / "runs")
-    return run, export(run, "onnx", folder / "out").folder
+    return run, export(run, target, folder / "out")  # type: ignore[arg-type]
+
+
+def exported(spec: str, system: str, target: str = "onnx") -> tuple[Run, Path]:
+    """The run of a benchmark, and the folder that it was exported to."""
+    run, done = written(spec, system, target)
+    return run, done.folder
 
 
 @cache

@@ -243,6 +243,7 @@ except ModuleNotFoundError:
 """
 
 
+@pytest.mark.apart
 def test_numpy_and_onnxruntime_are_enough() -> None:
     command = [sys.executable, "-c", ALONE, str(exported("traffic", "car")[1])]
     done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
@@ -289,7 +290,7 @@ def _damage(folder: Path, rng: random.Random) -> None:
     facts.write_text(json.dumps(read))
 
 
-@pytest.mark.parametrize("count", [10, pytest.param(600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [5, pytest.param(600, marks=pytest.mark.slow)])
 def test_a_damaged_export_ends_in_a_diagnostic(count: int, tmp_path: Path) -> None:
     whole = exported("traffic", "car")[1]
     state = np.zeros(len(read_facts(whole).states))
