@@ -49,6 +49,12 @@ class Page(HTMLParser):
             self.text += data
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pages whose pictures are empty, where the text matters."""
+    monkeypatch.setattr("stlc.view.style.Picture.svg", lambda _: "<svg/>")
+
+
 def page_of(run):
     """The page alone, without the pictures beside it."""
     return Page(text_of(run))
@@ -59,6 +65,7 @@ def text_of(run):
     return render_report(contents, sections_of(contents))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_trained_run(trained):
     page = page_of(trained)
     assert page.ids == ["requirements", "failures", "training", "repeat", "texts"]
@@ -77,6 +84,7 @@ def test_a_trained_run(trained):
     assert (trained.path / "system.yaml").read_text() in page.text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_with_falsification_is_repeated_with_it(trained):
     record = trained.record()
     record["options"] = {**(record.get("options") or {}), "falsify": True}
@@ -128,6 +136,7 @@ def assert_it_needs_nothing_from_outside(page, html):
             assert not re.search(rb'href="(?!#|data:)', content)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_hostile_texts_stay_texts(trained):
     def hostile(place):
         return f"</pre><script>alert('{place}')</script><img src=x onerror=alert('{place}')>"
@@ -148,6 +157,7 @@ def test_hostile_texts_stay_texts(trained):
         assert hostile(place) in Page(html).text, place
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_is_damaged_or_missing_is_left_out(deployed):
     (deployed.path / "trace.npz").write_bytes(b"not an archive")
     (deployed.path / "eval/simulate.json").unlink()
@@ -159,6 +169,7 @@ def test_what_is_damaged_or_missing_is_left_out(deployed):
     assert "stop_sign" in page.text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_trace_of_another_specification_says_so(deployed, recording):
     meta = replace(recording.meta, spec_text="spec other\nsignal z [m]\nrequire r: always[0, T] z > 0\n")
     save_trace(deployed.path / "trace.npz", replace(recording, meta=meta))
@@ -188,6 +199,7 @@ def test_without_matplotlib_the_reason_is_given(trained, monkeypatch):
     assert not (trained.path / "report.html").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_every_metric_of_a_deployment_is_shown(deployed):
     for name in ("trace.npz", "eval/held_out.npz"):
         (deployed.path / name).unlink()
@@ -230,6 +242,7 @@ def test_a_world_that_no_plan_foresees_is_said(deployed):
 
 def test_the_head_counts_one_population_of_drives(deployed):
     """Drives of a simulation replace those of the training, and the scenario is named."""
+    (deployed.path / "trace.npz").unlink()
     record = json.loads((deployed.path / "run.json").read_text())
     record["result"]["closed_loop"] = {"share": 1.0, "recommended": "none", "guards": []}
     deployed.write_json("run.json", record)
