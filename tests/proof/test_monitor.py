@@ -1,6 +1,6 @@
 """Random specifications, as text, on random traces: the monitor against the definitions.
 
-`-m slow` runs 10,000 cases, the ordinary suite a few hundred; `tools/proofs.py` any number.
+`-m slow` runs 10,000 cases, the ordinary suite some dozens; `tools/proofs.py` any number.
 """
 
 from __future__ import annotations
