@@ -136,6 +136,7 @@ def test_what_is_used_is_not_old(kept):
     assert kept.read("kernel-1") == b"code"
 
 
+@pytest.mark.apart
 @as_root
 @pytest.mark.parametrize("home", [None, "/nonexistent", "/root"])
 def test_commands_of_a_user_without_a_home_or_a_name(home, tmp_path):

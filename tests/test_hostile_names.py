@@ -116,6 +116,7 @@ def test_a_tree_has_as_many_nodes_and_every_name(judged: list[str], said: Said) 
     assert len(edges) == len(nodes) - 1
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("judged")
 def test_printed_and_formatted_texts_mean_the_same(said: Said) -> None:
     before = parse(Source("h", Path("h.stl").read_bytes().decode()))
@@ -191,6 +192,7 @@ def test_a_verdict_has_a_line_for_each(judged: list[str], said: Said) -> None:
     assert text.count("replay:") == len(judged) // 2 + len(judged) % 2
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("judged")
 def test_colours_are_those_of_the_program(capsys: pytest.CaptureFixture[str]) -> None:
     for words in (("check", "h.stl", "h.npz"), ("explain", "h.npz", "--spec", "h.stl")):
@@ -397,6 +399,7 @@ def test_an_installation_is_looked_at_whatever_its_folders_are_called(
     assert document(said, "doctor", "--quick", "--json")[0] == code
 
 
+@pytest.mark.apart
 def test_margins_for_a_viewer_give_every_name_back(judged: list[str], said: Said) -> None:
     pytest.importorskip("mcap")
     save_trace("one.npz", zeros(REQUIRED, traces=1))

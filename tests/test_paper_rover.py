@@ -160,7 +160,7 @@ def test_the_kernel_gives_the_same() -> None:
 )  # fmt: skip
 def test_a_changed_constant_of_the_system_is_noticed(old: str, new: str) -> None:
     spec = ((old.replace(":  ", " [m] = "), new.replace(":  ", " [m] = ")),) if "r_near" in old else ()
-    assert paper.apart(ROVER, ROVER.task(spec, ((old, new),)), 300)[0] > 1e-3
+    assert paper.apart(ROVER, ROVER.task(spec, ((old, new),)), 200)[0] > 1e-3
 
 
 @pytest.mark.parametrize(

@@ -183,6 +183,7 @@ def test_a_guard_of_a_package_and_its_stage(
     assert "unknown guard `braking`" in capsys.readouterr().err
 
 
+@pytest.mark.apart
 def test_a_command_of_a_package(tmp_path: Path) -> None:
     assert stlc("count", SPEC, cwd=tmp_path).stdout.split() == ["4"]
     everything = stlc("--help", cwd=tmp_path)
@@ -191,6 +192,7 @@ def test_a_command_of_a_package(tmp_path: Path) -> None:
     assert json.loads(stlc("count", SPEC, "--json", cwd=tmp_path).stdout)["result"] == {"requirements": 4}
 
 
+@pytest.mark.apart
 def test_commands_of_stlc_look_at_no_package() -> None:
     """With packages installed, `fmt` imports as many modules as without, and reads no list of theirs."""
     code = (

@@ -112,6 +112,7 @@ def test_a_round_returns_states_of_the_system(simulator: DriveSimulator) -> None
     assert round_of(simulator.run, 2, 3, np.zeros((0, 0)), never, lambda: True) is None
 
 
+@pytest.mark.apart
 def test_a_round_ends_after_a_batch_and_begins_with_few_points_of_others(simulator: DriveSimulator) -> None:
     seen: list[np.ndarray] = []
     drive = DriveSimulator.drive
@@ -156,7 +157,7 @@ def test_states_of_wrong_decisions_and_some_before_them() -> None:
     assert set(every_fourth[:EARLIER].tolist()) == {8.0, 12.0, 16.0}
 
 
-@pytest.mark.parametrize("guard", ["none", "full"])
+@pytest.mark.parametrize("guard", ["none", pytest.param("full", marks=pytest.mark.apart)])
 def test_a_counterexample_of_a_drive_is_replayed_checked_and_plotted(
     cart: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], guard: str
 ) -> None:

@@ -289,6 +289,7 @@ def test_a_counterexample_whose_plant_fails_now(capsys):
     assert "the simulation fails, before: a violation of up; error at t = 0 s" in capsys.readouterr().out
 
 
+@pytest.mark.apart
 def test_a_counterexample_outside_of_the_assumptions_violates_nothing(home: Path, capsys):
     assert main(["falsify", "oscillator.stl", "--require", "early", "--simulations", "30"]) == 1
     before = (home / "oscillator.stl").read_text()

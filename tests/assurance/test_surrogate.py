@@ -124,6 +124,7 @@ def test_a_trust_region_narrows_without_progress_and_widens_with_it():
     assert distance() > 1.3 * last
 
 
+@pytest.mark.apart
 def test_a_trust_region_ends_in_a_narrow_valley_that_is_noise_for_the_whole_space():
     def rugged(point):
         apart = np.abs(point - 0.37)

@@ -13,6 +13,7 @@ from benchmarks.tables import device
 from benchmarks.tables.schema import document_schema
 
 
+@pytest.mark.apart
 def test_steps_are_timed_on_both_devices_and_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -48,6 +48,7 @@ def test_times_are_milliseconds() -> None:
     assert Times.of([]) is None
 
 
+@pytest.mark.apart
 def test_guards_are_timed_and_the_page_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -163,6 +163,7 @@ def test_ceilings_are_of_all_plans_together(tmp_path: Path) -> None:
     assert ceilings(store.all().values())["reach_n_avoid"].contradictions == 1
 
 
+@pytest.mark.apart
 def test_the_settings_of_the_paper_end_by_evaluations() -> None:
     cell = PlanCell("reach_n_avoid", roster()["plan:gradient:paper"], math.inf, 2)
     result = measure(cell)
@@ -305,6 +306,7 @@ def test_a_training_of_an_hour_needs_one_seed() -> None:
 # ---------------------------------------------------------------------- figures, closed loop, the command
 
 
+@pytest.mark.apart
 def test_both_figures_are_drawn(tmp_path: Path) -> None:
     bars = Bar("guided", 0.9, (0.85, 0.95), plans=False), Bar("plan:search", 0.95, (0.9, 1.0), plans=True)
     points = Point("guided", 0.1, 0.9), Point("plan:search", 1.0, 0.9), Point("plan:search", 10.0, 0.95)
@@ -323,6 +325,7 @@ def test_both_figures_are_drawn(tmp_path: Path) -> None:
     assert draw([facets[1]], tmp_path) == ()
 
 
+@pytest.mark.apart
 def test_long_names_are_not_cut_off(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     bars = tuple(Bar(name, 0.5, (0.4, 0.6), plans=True) for name in ("search", "plan:gradient:paper"))
@@ -404,6 +407,7 @@ def answer(capsys: pytest.CaptureFixture[str], words: list[str]) -> dict[str, An
     return result
 
 
+@pytest.mark.apart
 def test_the_command_from_planner_cells_to_the_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,6 +18,7 @@ from stlc.diagnostics import UsageError
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.apart
 def test_a_policy_is_verified_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = "--steps 2 --batch 16 --held-out 10 --drives 0 --no-pictures --threads 1"
     spec = str(ROOT / "specs" / "traffic.stl")

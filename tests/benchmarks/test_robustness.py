@@ -44,6 +44,7 @@ def test_a_slower_function_takes_longer() -> None:
     assert min(small) > 0
 
 
+@pytest.mark.apart
 def test_timings_and_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     command = ["robustness", "--samples", "20", "--traces", "1", "--seconds", "0"]
     assert measure([*command, "--json"]) == 0

@@ -14,6 +14,7 @@ from benchmarks.store import load
 from benchmarks.tables.schema import document_schema
 
 
+@pytest.mark.apart
 def test_the_parts_of_a_step_are_measured_and_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

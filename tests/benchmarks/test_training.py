@@ -188,6 +188,7 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
     assert paper.SHOWN["inputs"](row) == "outdated: method"  # type: ignore[operator]
 
 
+@pytest.mark.apart
 def test_a_longer_training_extends_a_shorter_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(METHODS.get("gradient")), "extendable", True, raising=False)
     place = Place(ResultStore("ablation", tmp_path), tmp_path / "runs")
@@ -338,6 +339,7 @@ def test_what_any_policy_solves_counts(tmp_path: Path, result: Callable[..., dic
     assert known_feasible(elsewhere, cells[:1])["traffic"].share == 20 / 24
 
 
+@pytest.mark.apart
 def test_states_without_a_plan_are_proved_infeasible(
     tmp_path: Path, result: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:

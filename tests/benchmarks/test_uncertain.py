@@ -16,6 +16,7 @@ from benchmarks.tables.schema import document_schema
 from benchmarks.tables.uncertain import overheads
 
 
+@pytest.mark.apart
 def test_all_formulas_and_specifications_are_measured(capsys: pytest.CaptureFixture[str]) -> None:
     assert measure(["uncertain", "--samples", "300", "--traces", "10", "--seconds", "0", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

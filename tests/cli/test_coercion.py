@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("torch", "numpy", "pydantic", "yaml", "rich", "matplotlib")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     ("words", "needed"),
     [

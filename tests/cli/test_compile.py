@@ -107,6 +107,7 @@ def test_a_changed_horizon_changes_the_steps(capsys):
     assert found["result"]["horizon"]["steps"] == 30
 
 
+@pytest.mark.apart
 def test_torch_is_not_needed():
     program = (
         "import sys; from stlc.cli.framework.app import main; "

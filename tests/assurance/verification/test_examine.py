@@ -71,7 +71,15 @@ def batch(mode: int, width: float, count: int = 60, *, dive: bool = False) -> Bo
     return BoxBatch(mode, tuple(boxes), np.ones(coordinates), 3, dive)
 
 
-@pytest.mark.parametrize(("mode", "dive"), [(1, False), (3, False), (6, False), (6, True)])
+@pytest.mark.parametrize(
+    ("mode", "dive"),
+    [
+        (1, False),
+        pytest.param(3, False, marks=pytest.mark.apart),
+        pytest.param(6, False, marks=pytest.mark.apart),
+        (6, True),
+    ],
+)
 def test_the_boxes_of_a_result_cover_the_batch(mode: int, dive: bool) -> None:
     plans, given = Source().load(), batch(mode, 0.02, dive=dive)
     found = Examiner(plans).examined(given)
@@ -109,10 +117,11 @@ def summary(found: Verification) -> list[tuple[float, float, int]]:
     return [(each.proved, each.refuted, each.examined) for each in found.modes]
 
 
+@pytest.mark.apart
 def test_other_processes_give_the_same_result() -> None:
-    here = Verifier(Source().load(), seed=2).run(1e6, boxes=12)
+    here = Verifier(Source().load(), seed=2).run(1e6, boxes=6)
     with SharedExaminer(Source(), Shuffled()) as shared:
-        there = Verifier(Source().load(), seed=2, examiner=shared).run(1e6, boxes=12)
+        there = Verifier(Source().load(), seed=2, examiner=shared).run(1e6, boxes=6)
     assert shared.processor_time() > 0.0
     assert summary(there) == summary(here)
 

@@ -196,6 +196,7 @@ def test_after_the_steps_with_errors_the_model_is_followed(steps: int) -> None:
     check(cart("all"), 400, steps=steps, seed=3)
 
 
+@pytest.mark.apart
 def test_inner_feedback_is_part_of_the_tube() -> None:
     files = (ROOT / "examples" / "tasks" / f"cart_pole.{end}" for end in ("stl", "yaml"))
     spec, system = next(files), System.load(next(files), scenario="mismatch-5")

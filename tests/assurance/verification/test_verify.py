@@ -35,7 +35,7 @@ def verifier() -> Verifier:
 
 @cache
 def verified() -> Verification:
-    return verifier().run(1e6, boxes=30)
+    return verifier().run(1e6, boxes=12)
 
 
 def small_boxes(rng: np.random.Generator, count: int, coordinates: int) -> list[Box]:
@@ -69,9 +69,9 @@ def test_bounds_are_below_the_robustness_of_every_sampled_state(number: int, ind
 
 def test_random_states_of_proved_boxes_satisfy_the_specification() -> None:
     proved = [(each, box) for each in verified().modes for box in each.boxes]
-    assert len(proved) > 10
+    assert len(proved) > 4
     rng = np.random.default_rng(2)
-    for each, box in (proved[i] for i in rng.choice(len(proved), 10, replace=False)):
+    for each, box in proved:
         at = box.centre + rng.uniform(-1, 1, (200, len(box.half))) * box.half
         assert (verifier().robustness(verifier().states(each.mode, at)) >= -1e-6).all()
 
@@ -167,7 +167,7 @@ OTHERS = [
     ("ship_track", "ship_track", 3e-3),
     ("manipulation", "panda", 3e-3),
     ("reach_n_avoid", "maze", 1e-3),
-    ("navigation", "rover", 1e-3),
+    pytest.param("navigation", "rover", 1e-3, marks=pytest.mark.apart),
 ]
 
 
@@ -186,7 +186,7 @@ def other_verifier(spec: str, system: str) -> Verifier:
 def test_bounds_on_other_benchmarks_are_below_the_robustness(spec: str, system: str, width: float) -> None:
     found, rng = other_verifier(spec, system), np.random.default_rng(4)
     plans = found.plans
-    for mode in found.modes[:: max(1, len(found.modes) // 3)]:
+    for mode in found.modes[:: max(1, len(found.modes) // 2)][:2]:
         coordinates = len(mode.coordinates)
         centre = rng.uniform(width, 1.0 - width, (24, coordinates))
         boxes = [Box(each, np.full(coordinates, 0.5 * width)) for each in centre]
@@ -292,10 +292,11 @@ def test_conditions_of_a_box_hold_for_its_states() -> None:
         assert not met[~truth.possible].any()
 
 
+@pytest.mark.apart
 def test_boxes_around_states_contain_them_and_are_sound() -> None:
     rng = np.random.default_rng(5)
-    found = verifier().around(30, seed=2)
-    assert sum(each.states for each in found) == 30
+    found = verifier().around(10, seed=2)
+    assert sum(each.states for each in found) == 10
     assert sum(each.proved for each in found) > 5
     for each in found:
         assert each.proved + each.violated <= each.states

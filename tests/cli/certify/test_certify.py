@@ -72,7 +72,6 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> RunDir:
     monkeypatch.chdir(home)
-    monkeypatch.setattr("stlc.controller.evaluation.deployment.LATENCY_SECONDS", 0.05)
     capsys.readouterr()
     return RunDir.newest()
 
@@ -422,6 +421,7 @@ def test_wrong_claims_on_traces(
     assert "error[U101]" in capsys.readouterr().err
 
 
+@pytest.mark.apart
 def test_bounds_on_traces_need_no_torch(traces: list[str]) -> None:
     program = (
         "import sys; from stlc.cli.framework.app import main\n"

@@ -373,6 +373,7 @@ def test_a_specification_with_errors(capsys: pytest.CaptureFixture[str]) -> None
     assert "E101" in err
 
 
+@pytest.mark.apart
 def test_torch_is_not_imported() -> None:
     saved(bad_drive())
     code = (

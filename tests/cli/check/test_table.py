@@ -161,6 +161,7 @@ def test_a_file_that_is_called_like_a_pattern() -> None:
     assert check("[1].csv", "-q") == 1
 
 
+@pytest.mark.apart
 def test_torch_is_not_imported() -> None:
     some()
     code = (

@@ -436,6 +436,7 @@ def test_ctrl_c_prints_one_json_document(boundary, capsys):
     assert (json.loads(out)["exit_code"], err) == (130, "")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("closed", ["stdin", "stdout", "stderr"])
 def test_closed_streams_are_no_bug(closed, tmp_path):
     (tmp_path / "s.stl").write_text("signal a\nrequire low: always a < 2\n")

@@ -113,7 +113,7 @@ def test_windows_side_by_side_are_those_of_loops(pick: Pick, window: Sliding, se
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
 
 
-@pytest.mark.parametrize("batch", [1, 40, 1000])
+@pytest.mark.parametrize("batch", [1, 40, pytest.param(1000, marks=pytest.mark.apart)])
 @pytest.mark.parametrize("width", [3, 40, 200])
 @BOTH
 def test_every_size_goes_the_same_way(pick: Pick, width: int, batch: int) -> None:

@@ -83,7 +83,7 @@ def robustness(text: str, env: dict[str, np.ndarray]) -> float:
 
 
 @pytest.mark.parametrize("region", CONVEX.values(), ids=CONVEX)
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(now=places, then=places, obstacle=st.tuples(places, places))
 def test_convex_regions_are_exact(region, now, then, obstacle) -> None:
     env = columns(now, then, obstacle)
