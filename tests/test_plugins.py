@@ -108,6 +108,7 @@ def test_names_of_packages_are_found_without_an_import(group: str) -> None:
     assert name not in registry
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("toy")
 def test_a_method_of_a_package_trains_and_its_run_is_opened_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -124,6 +124,7 @@ def test_guards_and_scenarios_begin_alike_and_end_otherwise(run: RunDir, tmp_pat
     assert acted["none"] == 0.0
 
 
+@pytest.mark.apart
 def test_a_margin_is_measured_under_each_scenario(run: RunDir, tmp_path: Path) -> None:
     some = ["--scenarios", "as it is,mismatch-20", "--guards", "full,full+0.1,full+auto"]
     assert bench(run, tmp_path, *some) == 0

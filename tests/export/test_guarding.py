@@ -16,7 +16,10 @@ from stlc.export.programs import Guarding
 from stlc.runtime.prefixes import PrefixGrid
 
 
-@pytest.mark.parametrize("at_once", [programs.AT_ONCE, 40], ids=["whole", "in pieces"])
+@pytest.mark.parametrize(
+    "at_once",
+    [pytest.param(programs.AT_ONCE, id="whole", marks=pytest.mark.apart), pytest.param(40, id="in pieces")],
+)
 def test_every_rule_of_the_backup(at_once: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = run_of("traffic", "car", tmp_path)
     monkeypatch.setattr(programs, "AT_ONCE", at_once)

@@ -121,6 +121,7 @@ def test_a_graph_takes_any_number_of_agents() -> None:
         np.testing.assert_allclose(found["rho"], run.task.judge(x, plans).rho, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.apart
 def test_changed_copies_are_judged_where_the_plan_of_some_agent_fails() -> None:
     run, _ = exported("traffic", "car")
     outputs = deciding(run.task, run.network)

@@ -65,6 +65,7 @@ def test_copies_of_many_environments_continue_their_episodes() -> None:
     agree(pickle.loads(pickled), pickle.loads(pickled), 40)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("world", [False, True])
 def test_a_pickle_opens_in_another_process(world: bool, tmp_path: Path) -> None:
     env = stlc.gym.make(SPECS / "traffic.stl", world=world)

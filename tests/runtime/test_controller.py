@@ -252,6 +252,7 @@ def test_numpy_and_onnxruntime_are_enough() -> None:
     assert torch == "no torch"
 
 
+@pytest.mark.apart
 def test_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     (block,) = [part.split("```")[0] for part in text.split("```python\n")[1:] if "stlc.runtime" in part]

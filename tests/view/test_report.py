@@ -102,6 +102,7 @@ def test_units_of_robustness_are_those_of_the_specification(trained):
     assert read_contents(trained).units == {}
 
 
+@pytest.mark.apart
 def test_a_deployed_run(deployed):
     html = write_report(deployed).read_text(encoding="utf-8")
     page = Page(html)

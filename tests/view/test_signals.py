@@ -149,6 +149,7 @@ def test_a_trace_without_decisions_has_no_strip(recording, margins, choices):
     assert not shown["x [m]"].patches
 
 
+@pytest.mark.apart
 def test_great_values_are_drawn(recording, margins, choices):
     data = {name: values.copy() for name, values in recording.data.items()}
     for values in data.values():
@@ -158,6 +159,7 @@ def test_great_values_are_drawn(recording, margins, choices):
     assert draw_signals(replace(recording, data=data), margins, choices).svg().startswith("<svg")
 
 
+@pytest.mark.apart
 def test_robustness_that_is_nowhere_defined_still_draws(recording, choices):
     rho = np.full((recording.traces, recording.samples), np.nan)
     rho[0, :5] = np.inf

@@ -59,6 +59,7 @@ def test_a_least_share_decides_the_exit_code(run: str, least: str, code: int) ->
     assert main(["verify", run, "--boxes", "3", "--fail-under", least]) == code
 
 
+@pytest.mark.apart
 def test_boxes_around_random_states(run: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", run, "--boxes", "1", "--states", "3", "--json"]) == 1
     result = json.loads(capsys.readouterr().out)["result"]

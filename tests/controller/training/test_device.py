@@ -57,7 +57,10 @@ def _trained(trainer: Trainer) -> list[float]:
 @pytest.mark.filterwarnings("ignore:.*copying from a non-meta parameter")
 @pytest.mark.parametrize(
     ("spec", "system"),
-    [("traffic", "car"), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in OTHERS)],
+    [
+        pytest.param("traffic", "car", marks=pytest.mark.apart),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in OTHERS),
+    ],
 )
 def test_training_elsewhere_gives_the_same(spec: str, system: str, tmp_path: Path) -> None:
     text = parse(read_source(ROOT / "specs" / f"{spec}.stl"))

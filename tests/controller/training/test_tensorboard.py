@@ -70,6 +70,7 @@ def test_without_a_writer_nothing_begins(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert main([*words[:2], "--log", "diary"]) == 2
 
 
+@pytest.mark.apart
 def test_a_training_leaves_events(tmp_path: Path) -> None:
     pytest.importorskip("tensorboardX")
     words = ["train", str(ROOT / "specs/traffic.stl"), "--log", "tensorboard", "--runs", str(tmp_path)]

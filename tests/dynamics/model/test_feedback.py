@@ -273,6 +273,7 @@ def test_exports_say_what_actuators_get(tmp_path: Path) -> None:
     np.testing.assert_allclose(commands, run.task.system.commanded(x, first)[:, 0].numpy(), atol=1e-9)
 
 
+@pytest.mark.apart
 def test_a_controller_without_a_feedback_gives_its_plan(tmp_path: Path) -> None:
     (tmp_path / "pole.yaml").write_text(POLE.replace("policy: {feedback: {weights: {a: 4}}}", ""))
     (tmp_path / "s.stl").write_text(SPEC)
