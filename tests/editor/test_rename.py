@@ -98,12 +98,12 @@ def test_requirements_may_be_called_as_signals(write):
 
 @pytest.mark.parametrize("path", DATA, ids=lambda path: path.stem)
 def test_the_formulas_stay_whatever_is_renamed(path):
-    """Every definition, constant, region, enum and argument of the six benchmarks, one after the other."""
+    """Definitions, constants, regions, enums and arguments of the six benchmarks, one after the other."""
     text = path.read_text(encoding="utf-8")
     document = analyse(Source("untitled:1", text), Systems())
     before = formulas(text)
     assert before
-    for one in document.names.occurrences[::2]:
+    for one in document.names.occurrences[::4]:
         if one.declares and one.symbol.kind != "signal" and can_rename(document, one.span.start):
             changed = edited(text, rename(document, one.span.start, "another_name"))
             assert changed != text

@@ -16,6 +16,7 @@ PATH = ROOT / "examples" / "gym_loop.py"
 SPEC = str(ROOT / "specs" / "traffic.stl")
 
 
+@pytest.mark.apart
 def test_the_program_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     _, folder = exported("traffic", "car")
     monkeypatch.setattr(sys, "argv", [str(PATH), str(folder), SPEC, "--episodes", "2", "--guard", "paper"])
