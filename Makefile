@@ -8,7 +8,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help:
 	@echo 'make demo        train, simulate, check and report the traffic benchmark, from nothing'
 	@echo 'make test        lint, format, types and tests: what has to be green'
-	@echo 'make test-apart  tests that start programs of their own, and those of the rivals in the tables'
+	@echo 'make test-apart  tests that start programs of their own, of the tables, and longer variants of tests'
 	@echo 'make docs        write anew what documents take from the code: commands, codes, files'
 	@echo 'make site        build the documentation site into docs/_build; warnings are errors'
 	@echo 'make format      lay the code out and fix what can be fixed'
