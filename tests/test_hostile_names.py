@@ -102,6 +102,7 @@ def seen(name: str) -> str:
 # --------------------------------------------------------------- a text and its trees
 
 
+@pytest.mark.apart
 def test_a_tree_has_as_many_nodes_and_every_name(judged: list[str], said: Said) -> None:
     _, tree = said("compile", "h.stl", "--show", "ast")
     assert len(re.findall(r"^ *Require ", tree, re.M)) == len(judged)
@@ -178,6 +179,7 @@ def test_a_name_with_control_characters_is_refused(name: str, folder: Path, said
 # -------------------------------------------------------------------------- verdicts
 
 
+@pytest.mark.apart
 def test_a_verdict_has_a_line_for_each(judged: list[str], said: Said) -> None:
     code, text = said("check", "h.stl", "h.npz")
     assert code == 1

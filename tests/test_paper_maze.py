@@ -7,6 +7,8 @@ import pytest
 from helpers import paper
 from helpers.paper import Array
 
+pytestmark = pytest.mark.apart
+
 DT, WIDTH, V_MAX, H, LEVEL, R = 0.2, 5.0, 5.0, 0.5, 2.5, 0.4
 
 

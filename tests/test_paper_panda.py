@@ -9,6 +9,8 @@ import pytest
 from helpers import paper
 from helpers.paper import Array
 
+pytestmark = pytest.mark.apart
+
 LOW = np.radians([-166, -101, -166, -176, -166, -1, -166])
 HIGH = np.radians([166, 101, 166, -4, 166, 215, 166])
 POST = np.array([0.3, 0.3, 0.5])

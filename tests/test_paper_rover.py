@@ -13,6 +13,8 @@ from helpers.paper import Array
 
 from stlc.dynamics.model.system import System
 
+pytestmark = pytest.mark.apart
+
 ROOT = Path(__file__).parents[1]
 
 DT, NEAR = 0.2, 0.8

@@ -8,6 +8,8 @@ import torch
 from helpers import paper
 from helpers.paper import Array
 
+pytestmark = pytest.mark.apart
+
 LIMITS = ((2, 0.5), (4, 0.3), (5, 0.5))  # column and bound: heading, sway, turn rate
 
 

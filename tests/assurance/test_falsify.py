@@ -276,6 +276,7 @@ def test_a_failure_is_a_file_that_replays(capsys):
         assert main(words) == 2
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("fall")
 def test_a_counterexample_whose_plant_fails_now(capsys):
     command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
@@ -318,6 +319,7 @@ def test_an_edited_counterexample_is_none(changed, capsys):
     assert "is not a counterexample" in capsys.readouterr().err
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("fall")
 def test_a_plant_that_does_not_repeat_itself_is_told(capsys):
     """The file of the counterexample has the robustness of its trace."""

@@ -18,6 +18,8 @@ from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import Task
 from stlc.dynamics.model.system import System
 
+pytestmark = pytest.mark.apart
+
 ROOT = Path(__file__).parents[2]
 
 

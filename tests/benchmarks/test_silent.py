@@ -17,6 +17,8 @@ from benchmarks.scenes import SHAPES, situations
 from benchmarks.tables.silent import mistaken
 from stlc.monitor.verdict import Monitor
 
+pytestmark = pytest.mark.apart
+
 DT = 0.5
 HEAD = "signal x, y\nsignal go : bool\n"
 WINDOW = st.one_of(

@@ -80,6 +80,7 @@ def test_gusts_that_push_the_cart_out_are_found_and_replayed(capsys, tmp_path):
     assert "the same, bit for bit" in capsys.readouterr().out
 
 
+@pytest.mark.apart
 def test_a_replay_names_the_run_that_was_searched(capsys, tmp_path, monkeypatch):
     """Another run that is made during the search is `latest` afterwards."""
     load = DriveSimulator.__init__

@@ -18,6 +18,8 @@ from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.inputs import signal_values
 from stlc.dynamics.model.system import System
 
+pytestmark = pytest.mark.apart
+
 ROOT = Path(__file__).parent.parent.parent
 Doubles = NDArray[np.float64]
 Rate = Callable[[Doubles], Doubles]

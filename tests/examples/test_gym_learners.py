@@ -24,6 +24,7 @@ def test_ppo_in_one_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     assert all("satisfied" in line for line in lines)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("method", ["ppo", "sac"])
 def test_stable_baselines3(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -40,6 +40,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return __import__("ros2_callback")
 
 
+@pytest.mark.apart
 def test_the_program_runs_in_simulated_time(controller: Path) -> None:
     command = [sys.executable, str(PATH), str(controller), "--seconds", "1.5"]
     done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)

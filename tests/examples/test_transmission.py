@@ -13,6 +13,8 @@ import pytest
 
 from stlc.cli.framework.app import main
 
+pytestmark = pytest.mark.apart
+
 SPEC = Path(__file__).parents[2] / "examples/tasks/transmission.stl"
 GEARS = ("first", "second", "third", "fourth")
 RATIOS = (2.4, 1.45, 1.0, 0.68)

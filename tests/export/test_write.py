@@ -73,6 +73,7 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: b
     torch.testing.assert_close(got[:, 4 + rules :].view_as(wanted.plan), wanted.plan, rtol=0.0, atol=1e-4)
 
 
+@pytest.mark.apart
 @compiled
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
 @pytest.mark.parametrize(

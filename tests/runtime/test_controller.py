@@ -291,6 +291,7 @@ def _damage(folder: Path, rng: random.Random) -> None:
     facts.write_text(json.dumps(read))
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("count", [5, pytest.param(600, marks=pytest.mark.slow)])
 def test_a_damaged_export_ends_in_a_diagnostic(count: int, tmp_path: Path) -> None:
     whole = exported("traffic", "car")[1]

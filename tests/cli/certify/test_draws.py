@@ -135,6 +135,7 @@ def test_a_changed_file_is_named(home, capsys):
     assert "answer does not follow from the counts" in capsys.readouterr().out
 
 
+@pytest.mark.apart
 def test_fixed_seeds_are_bounded_exactly_whatever_the_jobs(capsys):
     one = certified(capsys, *TANK, "--seeds", "0..19", "--share", ".4", "--require", "calm")
     two = certified(capsys, *TANK, "--seeds", "0..19", "--share", ".4", "--require", "calm", "--jobs", "2")
@@ -157,6 +158,7 @@ def test_the_text_lists_failures_and_how_to_see_them_again(capsys):
     assert "ValueError: too full" in capsys.readouterr().out
 
 
+@pytest.mark.apart
 def test_simulations_out_of_scope_are_left_out(home, capsys):
     (home / "partly.stl").write_text(SPEC + "assume low: level <= 0.5 m\n")
     result = certified(capsys, "partly.stl", "--plant", "tank.yaml", "--seeds", "75..94", "--share", ".5")
