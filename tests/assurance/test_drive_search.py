@@ -157,7 +157,8 @@ def test_states_of_wrong_decisions_and_some_before_them() -> None:
     assert set(every_fourth[:EARLIER].tolist()) == {8.0, 12.0, 16.0}
 
 
-@pytest.mark.parametrize("guard", ["none", pytest.param("full", marks=pytest.mark.apart)])
+@pytest.mark.apart
+@pytest.mark.parametrize("guard", ["none", "full"])
 def test_a_counterexample_of_a_drive_is_replayed_checked_and_plotted(
     cart: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], guard: str
 ) -> None:

@@ -196,6 +196,7 @@ def test_a_trace_holds_them_or_they_are_given() -> None:
     assert any("--set r=" in line for line in finding.help)
 
 
+@pytest.mark.apart
 def test_trains_deploys_and_checks_a_family(tmp_path: Path) -> None:
     task = task_of()
     run_dir = open_folder(task, TrainConfig(), Launch(root=tmp_path, name="family"))

@@ -169,6 +169,7 @@ def test_what_cannot_be_is_said() -> None:
         stlc.gym.make_vec(path, 0)
 
 
+@pytest.mark.apart
 @pytest.mark.filterwarnings("ignore:.*(infinity|render|Box).*:UserWarning")
 def test_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     blocks = (ROOT / "docs" / "gym.md").read_text(encoding="utf-8").split("```python\n")[1:]

@@ -152,6 +152,7 @@ def test_what_only_the_unit_makes_too_large(items: str) -> None:
     assert [finding.code for finding in caught.value.diagnostics] == ["E005"]
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("line", ["require r{0}: u{0} > 0", "signal w{0}\nrequire r{0}: v{0} > 0"])
 def test_twice_as_many_errors_take_twice_the_work(line: str) -> None:
     def found(count: int) -> int:

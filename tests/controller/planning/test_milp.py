@@ -150,6 +150,7 @@ _wanted = st.builds("{} {} and eventually[0 s, 3 s] {}".format, _windows, _wishe
 EULER = "integrator: euler, substeps: 1"
 
 
+@pytest.mark.apart
 @example(EULER, "a", "ind(p <= 0)", "q", "eventually[0 s, 3 s] q >= 1", 1.0)
 @example(EULER, "a", "if p > 0 then 0 else 1", "q", "eventually[0 s, 3 s] q >= 1", 1.0)
 @example(EULER, "ind(q <= 0)", "a", "p", "always[0 s, 3 s] q >= 0 and eventually[0 s, 3 s] p >= 2", 0.0)

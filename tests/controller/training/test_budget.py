@@ -268,6 +268,7 @@ def test_the_schedule_on_record_repeats_a_budget(car_task: Task, tmp_path: Path)
     assert [row["lr"] for row in first.rows()] == [row["lr"] for row in again.rows()]
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("ticking")
 @pytest.mark.parametrize("stopped_at", [4, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_budget_that_was_interrupted_is_repeated_too(
@@ -325,6 +326,7 @@ def test_a_budget_that_was_killed_before_its_first_checkpoint_is_planned_anew(
     assert _same(folder, again)
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("ticking")
 def test_a_run_that_goes_on_past_its_end_is_repeated_too(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=50, drives=0, steps=60, seed=3, batch=16, threads=1)

@@ -81,6 +81,7 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(
     assert [row["step"] for row in first.rows()] == [row["step"] for row in whole.run.dir.rows()]
 
 
+@pytest.mark.apart
 def test_a_run_that_ends_at_a_look_repeats_it(car_task: Task, tmp_path: Path) -> None:
     """The checkpoint of step 50 is older than the row of the look there, written or not."""
     config = TrainConfig(held_out=50, drives=0, method="gradient", steps=52, seed=3, batch=16)

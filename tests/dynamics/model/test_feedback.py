@@ -242,6 +242,7 @@ SPEC = (
 )
 
 
+@pytest.mark.apart
 def test_exports_say_what_actuators_get(tmp_path: Path) -> None:
     (tmp_path / "pole.yaml").write_text(POLE + "backup: {bins: 3, T0: [1, 2]}\n")
     (tmp_path / "s.stl").write_text(SPEC)

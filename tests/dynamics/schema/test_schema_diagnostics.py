@@ -196,6 +196,7 @@ def test_several_errors_come_in_the_order_of_the_file() -> None:
     assert places == sorted(places)
 
 
+@pytest.mark.apart
 def test_twice_as_many_findings_take_twice_the_work() -> None:
     def found(count: int) -> int:
         text = GOOD + "\n".join(f"k{number}: {number}" for number in range(count))

@@ -40,7 +40,9 @@ def monitor_of(names: list[str]) -> Monitor:
     return Monitor(HEAD + body, dt=0.1, horizon=0.6)
 
 
-@pytest.mark.parametrize(("tolerance", "at"), [(1e-6, None), (0.0, "all")])
+@pytest.mark.parametrize(
+    ("tolerance", "at"), [pytest.param(1e-6, None, marks=pytest.mark.apart), (0.0, "all")]
+)
 def test_every_requirement_is_as_it_is_alone(tolerance: float, at) -> None:
     whole, how = signals(1), How(at=at, tolerance=tolerance)
     together = monitor_of(list(REQUIREMENTS)).online(how)
