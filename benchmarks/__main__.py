@@ -22,7 +22,7 @@ PROGRAM = Program(
     package="benchmarks.tables",
     order=(
         *("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step", "robustness"),
-        *("gym", "falsify", "searches", "certificates", "uncertain", "verify", "ainncs"),
+        *("tasks", "gym", "falsify", "searches", "certificates", "uncertain", "verify", "ainncs"),
     ),
     drives=True,
 )

@@ -29,6 +29,7 @@ from benchmarks.tables import (
     family,
     latency,
     paper,
+    tasks,
     uncertain,
     verify,
 )
@@ -80,6 +81,7 @@ ROWS: dict[str, dict[str, type]] = {
     "certificates": {"rows": certificates.Row},
     "verify": {"rows": verify.Row},
     "ainncs": {"rows": ainncs.Row},
+    "tasks": {"rows": tasks.TaskRow},
 }
 """Name of a table -> key in its result -> record of a row."""
 
