@@ -127,7 +127,7 @@ def judged(task: ControlTask, trace: Path) -> Verdicts:
 
 def end_of(trace: Path) -> float:
     """Return the last time in a trace file (.npz), in seconds."""
-    with np.load(trace) as arrays:
+    with np.load(trace, allow_pickle=False) as arrays:
         return float(arrays["t"][-1])
 
 

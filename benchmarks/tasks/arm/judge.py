@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 q1, q2, w1, w2, phase = (np.atleast_2d(d[name]) for name in ("q1", "q2", "w1", "w2", "phase"))
 part = np.round(np.atleast_2d(d["part"])).astype(int)
 e = 1e-6

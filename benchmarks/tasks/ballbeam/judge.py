@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 x, v, tilt = (np.atleast_2d(d[name]) for name in ("x", "v", "tilt"))
 e = 1e-6
 

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 s, v, door = (np.atleast_2d(d[name]) for name in ("s", "v", "door"))
 e = 1e-6
 at = {stop: abs(s - stop) <= 1 + e for stop in (150, 340, 520)}

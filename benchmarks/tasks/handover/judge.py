@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 ax, ay, bx, by = (np.atleast_2d(d[name]) for name in ("ax", "ay", "bx", "by"))
 part = np.round(np.atleast_2d(d["part"])).astype(int)
 speed = np.hypot(np.atleast_2d(d["avx"]), np.atleast_2d(d["avy"]))

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 t1, t2, on, starts, used = (np.atleast_2d(d[name]) for name in ("t1", "t2", "on", "starts", "used"))
 on = on > 0.5
 e = 1e-6

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 soc, charge, diesel, bill, fuel = (np.atleast_2d(d[n]) for n in ("soc", "charge", "diesel", "bill", "fuel"))
 e = 1e-6
 t = np.arange(soc.shape[1]) / 4

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 h1, h2, h3, h4 = (np.atleast_2d(d[name]) for name in ("h1", "h2", "h3", "h4"))
 e = 1e-6
 first = (abs(h1 - 15) <= 0.5 + e) & (abs(h2 - 12) <= 0.5 + e)

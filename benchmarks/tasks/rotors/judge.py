@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 x, z, tilt, vx, vz = (np.atleast_2d(d[name]) for name in ("x", "z", "tilt", "vx", "vz"))
 e = 1e-6
 there = (np.hypot(x - 5, z - 2) <= 0.3 + e) & (np.hypot(vx, vz) <= 0.5 + e)

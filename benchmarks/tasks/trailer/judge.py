@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-d = np.load(sys.argv[1])
+d = np.load(sys.argv[1], allow_pickle=False)
 x, y, heading, trailer, v = (np.atleast_2d(d[name]) for name in ("x", "y", "heading", "trailer", "v"))
 e = 1e-6
 WALLS = ((-3, 1.6, 6, 4), (-3, -4, 6, -1.6), (-3, -1.6, -1, 1.6))
