@@ -28,7 +28,9 @@ PARTS = ("plans", "controller", "policy")
 GUARDS = ("none", "paper", "full")
 AGENTS = 10
 """Agents in one world, at most."""
-TEXT = """Written by `python -m benchmarks tasks` from `benchmarks/results/tasks.json`: tasks as written, one
+TEXT = """### Plans, drives and policies
+
+Written by `python -m benchmarks tasks` from `benchmarks/results/tasks.json`: tasks as written, one
 command each. `plans`: `stlc plan` from {starts} random starts, {seconds:g} s of search each. `controller`:
 `stlc simulate --method search` with {decision:g} ms a decision. `policy`: `stlc train` for
 {train_seconds:g} s of processor time, then `stlc simulate` with each guard. `obey` counts the plans or drives
