@@ -18,7 +18,7 @@ def comfortable(t: np.ndarray, first: int, last: int) -> np.ndarray:
 
 def lasts(state: np.ndarray, samples: int) -> np.ndarray:
     """Rows in which each change to `state` until 13 h is followed by `samples` samples of it."""
-    rows, when = np.nonzero(state[:, 1:157] & ~state[:, :156])
+    rows, when = np.nonzero(state[:, 1:157] & ~state[:, :-1][:, :156])
     ok = np.ones(len(state), bool)
     for row, k in zip(rows, when + 1, strict=True):
         ok[row] &= state[row, k : k + samples + 1].all() and k + samples < state.shape[1]
