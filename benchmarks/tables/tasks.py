@@ -34,9 +34,9 @@ Written by `python -m benchmarks tasks` from `benchmarks/results/tasks.json`: ta
 command each. `plans`: `stlc plan` from {starts} random starts, {seconds:g} s of search each. `controller`:
 `stlc simulate --method search` with {decision:g} ms a decision. `policy`: `stlc train` for
 {train_seconds:g} s of processor time, then `stlc simulate` with each guard. `obey` counts the plans or drives
-that the task's own judge accepts, seed by seed; times are milliseconds of a plan or decision (of plans,
-`99 %` is the longest). The last column names the rules that were violated and how many obeyed them, or the
-reason for which there is no figure.
+that the task's own judge accepts, seed by seed. Milliseconds: processor time of a plan (`99 %`: the longest),
+elapsed time of a decision. The last column names the rules that were violated and how many obeyed them, or
+the reason for which there is no figure.
 """
 _OUTPUT = Output()
 
@@ -119,7 +119,7 @@ class Outcome:
         what: `plans`, `controller`, or `policy` and its guard.
         obeyed: number of plans or drives that obey all rules; None if there is no verdict.
         count: number of plans or drives; 0 if there are none.
-        median_ms: median time of a plan or decision.
+        median_ms: median processor time of a plan, or elapsed time of a decision.
         p99_ms: 99th percentile of the times of decisions, or the longest time of a plan.
         said: what stlc itself said.
         cause: rules that were violated, or the reason why there is no verdict.
