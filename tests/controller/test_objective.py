@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.mission_strategies import missions, nested, requirement
+from hypothesis import given, reject, settings
+from hypothesis import strategies as st
 
 from stlc import native
+from stlc.compile.ir import typed
+from stlc.compile.ir.discretize import Grid
+from stlc.compile.pipeline import compile_resolved, resolve_for
 from stlc.compile.semantics.switch import Hard, Tanh
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.objective import VIOLATION, Objective, guided_objective, loss, paper_objective
+from stlc.diagnostics import SpecError
 from stlc.dynamics.declaration.load import parse_system
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
@@ -100,3 +111,98 @@ def test_plans_that_fail_a_formula_of_the_past_are_told_how_to_satisfy_it(
         assert failing.any()
         if "historically (" not in formula:  # what failed before the first step is beyond all plans
             assert (slope[failing].sum((1, 2)) < 0).all(), "to push harder helps"
+
+
+PLANE = """
+stlc: 1
+name: plane
+time: {dt: 0.1 s, horizon: 5 steps}
+state: {x: {range: [-2, 3]}, y: {range: [-2, 3]}, z: {range: [-2, 3]}}
+control: {u: {unit: s^-1, range: [-9, 9]}, w: {unit: s^-1, range: [-9, 9]}}
+flow: {x: u, y: w, z: u - w}
+init: {mixture: [{draw: {x: "uniform(-2, 3)", y: "uniform(-2, 3)", z: "uniform(-2, 3)"}}]}
+"""
+
+
+def compiled_for_plane(formulas: Sequence[typed.Formula]) -> Task:
+    """The task of several requirements, for a plane whose signals move as its controls say."""
+    path = Path("plane.yaml")
+    system = System(parse_system(Source(str(path), PLANE), path, {}))
+    text = "state signal x, y, z\nrequire r: always[0, T] x > -99"
+    spec = resolve_for(parse(Source("plane.stl", text)), system.interface(), None, "train")
+    rules = tuple(replace(requirement(formula), name=f"r{i}") for i, formula in enumerate(formulas))
+    try:
+        return Task(compile_resolved(replace(spec, requirements=rules), Grid(Fraction(1, 10), 5)), system)
+    except SpecError as error:
+        refused = {finding.code for finding in error.diagnostics}
+        assert refused <= {"E306", "E307", "E309", "E310", "E312"}, refused
+        reject()
+
+
+@settings(max_examples=12)
+@given(st.lists(missions | nested, min_size=1, max_size=2), st.integers(0, 2**32 - 1))
+def test_losses_are_finite_whatever_clock_statuses_and_timers_say(
+    formulas: list[typed.Formula], seed: int
+) -> None:
+    check_losses(formulas, seed, native=False)
+
+
+@pytest.mark.slow
+@settings(max_examples=500)
+@given(st.lists(missions | nested, min_size=1, max_size=2), st.integers(0, 2**32 - 1))
+def test_the_same_of_five_hundred_specifications_in_c_too(formulas: list[typed.Formula], seed: int) -> None:
+    check_losses(formulas, seed, native=True)
+
+
+def check_losses(formulas: list[typed.Formula], seed: int, *, native: bool) -> None:
+    """Losses and their gradients are finite in states that missions reach, and in any others."""
+    task = compiled_for_plane(formulas)
+    if not native:
+        vars(task).update(native=None, gradient=None)
+    generator = torch.Generator().manual_seed(seed)
+    rand = partial(torch.rand, generator=generator, dtype=torch.float64)
+    x = task.sample(8, generator=generator, dtype=torch.float64)
+    reached = [x]
+    for _ in range(9):
+        moved = task.rollout(x, 18 * rand(8, 5, 2) - 9)
+        x = moved[:, int(rand(()) * 5) + 1]
+        reached.append(x)
+    x0 = torch.cat(reached)
+    drawn = x0.clone()
+    for timer in task.compiled.timers:
+        low, high = timer.low, timer.high
+        drawn[:, task.system.names.index(timer.name)] = (low + (high - low) * rand(len(drawn))).round()
+    x0 = torch.cat((x0, drawn))
+    u = 18 * rand(len(x0), 5, 2) - 9
+    for objective in (paper_objective(task), guided_objective(0.1, slope=5.0, performance_weight=0.3)):
+        u = u.detach().requires_grad_()
+        value = loss(task, objective, x0, u)
+        assert torch.isfinite(value).all()
+        if value.requires_grad:
+            (slope,) = torch.autograd.grad(value.sum(), u)
+            assert torch.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_a_missed_deadline_drops_out_of_the_loss_and_leaves_the_other_requirements(native: bool) -> None:
+    path = Path("plane.yaml")
+    system = System(parse_system(Source(str(path), PLANE), path, {}))
+    late = "require a: eventually@[0 s, 4 s] ((always[0 s, 0.2 s] x > 0.8) and x < 2)"
+    near = "require b: always[0, T] y > 1"
+    both, alone, lost = (
+        Task.of(parse(Source("s.stl", f"state signal x, y, z\n{rules}")), system)
+        for rules in (f"{late}\n{near}", near, late)
+    )
+    if not native:
+        vars(both).update(native=None, gradient=None)
+    x0 = both.sample(20, seed=0, dtype=torch.float64)
+    x0[:, both.system.names.index("clock")] = 41.0  # open still, and no plan reaches back
+    u = torch.full((20, 5, 2), -1.0, dtype=torch.float64, requires_grad=True)
+    assert (both.judge(x0, u).requirements[:, 0] == -torch.inf).all()
+    paper = replace(paper_objective(both), performance_weight=0.0)
+    for objective in (paper, guided_objective(0.1, slope=5.0, performance_weight=0.0)):
+        value = loss(both, objective, x0, u)
+        assert torch.allclose(value, loss(alone, objective, x0[:, :3], u))
+        assert value.mean() > 0.5
+        assert torch.isfinite(torch.autograd.grad(value.sum(), u)[0]).all()
+        assert (loss(lost, objective, x0, u) == 0.0).all(), "no plan is better than another"

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +25,6 @@ from torch import Tensor
 from stlc.compile.analysis.ranges import bounds
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.semantics.switch import Hard
@@ -32,7 +32,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.exploration import EFFORTS, Exploration
-from stlc.controller.training.objective import Objective, native_rolled
+from stlc.controller.training.objective import Objective, rolled, without_lost
 from stlc.diagnostics import Diagnostic, Label, RunError, StlcError, SystemFileError
 from stlc.dynamics.model.system import System
 from stlc.native import never
@@ -140,12 +140,10 @@ def _robustness(step: TrainingStep) -> StlcError | None:
     The values of all requirements are checked before the gradients, since one infinite value makes the
     gradients of all requirements infinite or NaN.
     """
-    checks = [
-        _differentiated(step, lambda u, i=index: _each(step, u)[0][:, i])  # type: ignore[misc]
-        for index in range(len(step.task.rules))
-    ]
+    rules = step.task.rules
+    checks = [_differentiated(step, partial(_pursued, step, index)) for index in range(len(rules))]
     for what, bad_of, way in _WRONG:
-        for rule, check in zip(step.task.rules, checks, strict=True):
+        for rule, check in zip(rules, checks, strict=True):
             row = _first(bad_of(*check))
             if row is not None:
                 return RunError(
@@ -169,7 +167,7 @@ def _cost(step: TrainingStep) -> StlcError | None:
         task = Task(step.task.compiled, System(alone))
 
         def cost(u: Tensor, task: Task = task) -> Tensor:
-            each, columns = _each(step, u)
+            each, columns = rolled(step.task, step.objective, step.x0, u)
             return task.system.performance(
                 columns, torch.ones(len(u)).to(u), step.task.graph.overall(each), u
             )
@@ -188,17 +186,10 @@ def _cost(step: TrainingStep) -> StlcError | None:
     return None
 
 
-def _each(step: TrainingStep, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Robustness of the plans `u` per requirement (B, R), and states name -> (T+1, B).
-
-    Both are differentiable with respect to `u`, in the same way as in training.
-    """
-    native = native_rolled(step.task, step.objective, step.x0, u)
-    if native is not None:
-        return native
-    columns = step.task.system.rollout_columns(step.x0, u, step.objective.switch)
-    smoothing = step.objective.smoothing
-    return step.task.graph.per_requirement_columns(columns, ops=TORCH, smoothing=smoothing), columns
+def _pursued(step: TrainingStep, index: int, u: Tensor) -> Tensor:
+    """Robustness of the plans `u` for requirement number `index`, (B,); +inf where it is lost."""
+    each, _ = rolled(step.task, step.objective, step.x0, u)
+    return without_lost(step.task, each)[:, index]
 
 
 def _differentiated(step: TrainingStep, value_of: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

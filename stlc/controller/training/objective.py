@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.switch import StraightThrough, Switch, Tanh
 from stlc.controller.problem.task import satisfied
 
@@ -93,8 +95,11 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
         Loss per plan, (B,), differentiable; the performance terms count only for plans that satisfy the
         specification.
     """
-    rho, columns = _rolled(task, objective, x0, u)
-    exact = rho if objective.smoothing is None else task.graph.columns(columns, ops=TORCH)
+    each, columns = rolled(task, objective, x0, u)
+    rho = task.graph.overall(without_lost(task, each), objective.smoothing)
+    exact = rho
+    if objective.smoothing is not None:
+        exact = task.graph.overall(without_lost(task, task.graph.per_requirement_columns(columns, ops=TORCH)))
     good = satisfied(exact.detach())
     cost = task.performance(columns, rho, u)
     gated = torch.where(good, cost, torch.zeros_like(cost))
@@ -113,28 +118,31 @@ def _shortfall(objective: Objective, rho: Tensor) -> Tensor:
     return penalty + objective.violation * hinge(0.0) if objective.violation else penalty
 
 
-def native_rolled(
-    task: Task, objective: Objective, x0: Tensor, u: Tensor
-) -> tuple[Tensor, Mapping[str, Tensor]] | None:
-    """Compute the robustness per requirement, (B, R), and the states, name -> (T+1, B), in C.
+def without_lost(task: Task, each: Tensor) -> Tensor:
+    """Robustness per requirement, (B, R), with +inf in place of -inf where a requirement is lost.
 
-    Both are differentiable with respect to `u`. Returns None if there is no native kernel for the task or the
-    device, or if the objective uses smooth robustness.
+    A requirement is lost in a state from which its clock, status and timers alone falsify it, whatever a plan
+    does: a deadline that is over, for example. Its robustness is -inf on every plan, so that it says nothing
+    about plans, and would hide the other requirements in their minimum. The robustness of a requirement that
+    reads no such state is -inf only if its numbers overflow, and stays so.
+    """
+    lost = each.detach() == -torch.inf
+    for index in lost.any(0).nonzero()[:, 0].tolist():
+        parts = nodes(task.rules[index].formula)
+        lost[:, index] &= any(isinstance(part, ir.Predicate) and part.guard for part in parts)
+    return each.masked_fill(lost, torch.inf)
+
+
+def rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
+    """Compute the robustness per requirement, (B, R), and the states, name -> (T+1, B).
+
+    Both are differentiable with respect to `u`. They are computed in C if there is a native kernel for the
+    task and the device, and the objective uses exact robustness; else in torch.
     """
     switch = objective.switch
     if objective.smoothing is None and isinstance(switch, StraightThrough) and x0.device.type == "cpu":
         native = task.gradient
-        return None if native is None else native(x0, u, slope=switch.slope)
-    return None
-
-
-def _rolled(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-    """Compute the robustness, (B,), and the states, name -> (T+1, B), in C if possible, else in torch.
-
-    Both are differentiable with respect to `u`.
-    """
-    native = native_rolled(task, objective, x0, u)
-    if native is not None:
-        return task.graph.overall(native[0]), native[1]
-    columns = task.system.rollout_columns(x0, u, objective.switch)
-    return task.graph.columns(columns, ops=TORCH, smoothing=objective.smoothing), columns
+        if native is not None:
+            return native(x0, u, slope=switch.slope)
+    columns = task.system.rollout_columns(x0, u, switch)
+    return task.graph.per_requirement_columns(columns, ops=TORCH, smoothing=objective.smoothing), columns
