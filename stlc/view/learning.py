@@ -1,6 +1,6 @@
-"""Verdict on a training run: how many feasible starts the policy solves, and advice.
+"""Verdict on a training run: how many drives obey, why the others fail, and advice.
 
-A start (initial state) counts as feasible if a satisfying plan from it is known. The module makes numbers and
+A drive is the closed-loop run of one agent from a start of the mission. The module makes numbers and
 sentences only, no pictures. The terminal, the JSON output and the report all show this verdict.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -25,10 +26,16 @@ from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_t
 from stlc.view.words import seconds as duration
 from stlc.view.words import share
 
-Level: TypeAlias = Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
+Level: TypeAlias = Literal[
+    "infeasible", "no plan known", "not driven", "undertrained", "partly trained", "trained"
+]
 
-UNDERTRAINED, TRAINED = 0.5, 0.95
-"""Shares of feasible starts that the policy solves: undertrained below the first, trained from the second."""
+UNDERTRAINED, TRAINED = 0.5, 0.9
+"""Shares of drives that obey: undertrained below the first, trained from the second."""
+SOLVED = 0.95
+"""Share of feasible starts that a policy solves which a learning curve is extrapolated to."""
+LISTED = 3
+"""Maximum number of violated requirements that are listed."""
 MUCH_INFEASIBLE = 0.5
 """Share of starts without a known plan from which on infeasibility is reported first."""
 LEAST_ROUNDS = 5
@@ -48,7 +55,7 @@ class Curve:
     Attributes:
         state: `short`: there were too few search rounds for an extrapolation; `flat`: twice as many steps
             would change little; `rising`: more steps would help.
-        times: factor by which the number of steps must grow so that the policy solves the share `TRAINED` of
+        times: factor by which the number of steps must grow so that the policy solves the share `SOLVED` of
             the feasible starts. The factor assumes that the slope of the curve stays the same. Since curves
             flatten, the forecast is a range from this factor to its square. None if the factor exceeds
             `MOST_TIMES`, or if the curve is not rising.
@@ -63,10 +70,11 @@ class Learning:
     """Verdict on a training run: how well the policy has learned, and what to do next.
 
     Attributes:
-        level: `trained`, `partly trained`, `undertrained`, `no plan known` or `infeasible`.
+        level: `trained`, `partly trained` or `undertrained`, by the share of drives that obey; `not driven`
+            if there were none; `no plan known` or `infeasible` without a satisfying plan from any start.
         share: share of the feasible starts that the policy solves. A start is feasible if a satisfying plan
             from it is known. None if no start is feasible.
-        sentence: level and share as a sentence.
+        sentence: share of drives that obey, and share of starts with a satisfying plan, as a sentence.
         advice: sentences of advice.
         command: the command to run next.
         worst: the worst requirement and the region where it fails, as a sentence; "" if none fails.
@@ -91,6 +99,9 @@ class Learning:
         }
 
 
+EMPTY: Mapping[str, Any] = MappingProxyType({})
+
+
 @dataclass(frozen=True, slots=True)
 class Commands:
     """Command lines for one run that a verdict may recommend.
@@ -99,26 +110,46 @@ class Commands:
         train_on: resumes the training run. The option `--budget` is still missing; the caller appends it.
         simulate: simulates the policy under the recommended guard.
         report: writes the report.
+        afresh: trains for the same specification and system; options may be appended.
+        search: simulates a planner as controller of the same system; options may be appended.
     """
 
     train_on: str
     simulate: str
     report: str
+    afresh: str = "stlc train SPEC"
+    search: str = "stlc simulate SPEC --method search"
 
     @classmethod
-    def of(cls, run: str, *, newest: bool = False, start: str = "stlc", guard: str = PAPER.name) -> Commands:
+    def of(
+        cls,
+        run: str,
+        record: Mapping[str, Any] = EMPTY,
+        *,
+        newest: bool = False,
+        start: str = "stlc",
+    ) -> Commands:
         """Return the commands for the run named `run`.
 
         Args:
             run: name of the run.
+            record: content of its `run.json`.
             newest: whether it is the newest run. The command `simulate` then omits its name.
             start: program that the training command begins with.
-            guard: name of the recommended guard.
         """
         run = shell((operand(run),))
-        option = named_guard(guard).option
+        option = named_guard(recommended(record)).option
         simulate = " ".join(filter(None, ("stlc simulate", "" if newest else run, option)))
-        return cls(f"{start} train --resume {run}", simulate, f"stlc report {run}")
+        spec = shell((operand(str(record.get("spec_path") or "SPEC")),))
+        system = shell(("--system", str(record["system_path"]))) if record.get("system_path") else ""
+        given = " ".join(filter(None, (spec, system)))
+        return cls(
+            f"{start} train --resume {run}",
+            simulate,
+            f"stlc report {run}",
+            f"{start} train {given}",
+            f"stlc simulate {given} --method search",
+        )
 
 
 def recommended(record: Mapping[str, Any]) -> str:
@@ -169,13 +200,22 @@ def driven_lines(result: Mapping[str, Any]) -> list[str]:
 def _driven_line(each: Mapping[str, Any]) -> str:
     """Line on the closed-loop runs (drives) under one guard; `each` contains their results.
 
-    Example: `51 of 60 drives satisfied (85.0 %, 95 % interval 73.9 to 91.9 %) with the full guard`.
+    Example: "0 of 20 drives obeyed without a guard: `set_down` (30 s); 95 % interval 0.0 to 16.1 %". A number
+    of drives is given with a requirement that not all failed drives violate.
     """
     low, high = each["interval"]
+    failed, violated = each["drives"] - each["satisfied"], each.get("violated") or ()
+    names = []
+    for found in violated[:LISTED]:
+        time = "" if found["seconds"] is None else duration(found["seconds"])
+        many = "" if found["drives"] == failed else f"{found['drives']:,} drives"
+        told = ", ".join(filter(None, (many, time)))
+        names.append(f"`{found['requirement']}`" + (f" ({told})" if told else ""))
+    more = f" and {len(violated) - LISTED} more" if len(violated) > LISTED else ""
+    listed = f": {', '.join(names)}{more}" if names else ""
     safe = "" if each.get("safe") is None else f", {share(each['safe'])} safe"
-    part = f"{share(each['share'])}, 95 % interval {100 * low:.1f} to {share(high)}"
-    guard = named_guard(each["guard"]).beside
-    return f"{each['satisfied']:,} of {each['drives']:,} drives satisfied ({part}) {guard}{safe}"
+    count = f"{each['satisfied']:,} of {each['drives']:,} drives obeyed {named_guard(each['guard']).beside}"
+    return f"{count}{listed}; 95 % interval {100 * low:.1f} to {share(high)}{safe}"
 
 
 def _changed_line(each: Mapping[str, Any]) -> str:
@@ -185,7 +225,7 @@ def _changed_line(each: Mapping[str, Any]) -> str:
         return f"{noun} changes no verdict"
     return (
         f"{noun} changes the verdicts of {changed:,} of {each['drives']:,} drives: "
-        f"{each['gained']:,} satisfied only with it, {each['lost']:,} only without"
+        f"{each['gained']:,} obey only with it, {each['lost']:,} only without"
     )
 
 
@@ -235,18 +275,8 @@ def learning_of(
     """
     accuracy, feasible = float(result["accuracy"]), float(result["feasible"])
     if feasible <= 0.0:
-        if result.get("proved"):
-            level: Level = "infeasible"
-            sentence = "no plan satisfies the specification: bounds of what the controls can do prove it"
-            more = "more training cannot help"
-        else:
-            level = "no plan known"
-            sentence = "neither the policy nor search found a satisfying plan for any start"
-            more = "more training hardly helps where there is no plan"
-        advice = f"a looser specification, a longer horizon, or another initial set: {more}"
-        return Learning(level, None, sentence, (advice,), commands.report)
-    part = min(accuracy / feasible, 1.0)
-    level = "trained" if part >= TRAINED else "partly trained" if part >= UNDERTRAINED else "undertrained"
+        return _without_plan(commands, proved=bool(result.get("proved")))
+    part, drives = min(accuracy / feasible, 1.0), _best_drives(result)
     searched, held_out = int(result.get("searched") or 0), int(result.get("held_out") or 0)
     sampled = 0 < searched < held_out
     estimate = f", by an estimate from {searched:,} of the {held_out:,} starts" if sampled else ""
@@ -255,18 +285,99 @@ def learning_of(
         f"plan is known for {share(feasible)}{estimate}"
     )
     worst, hard = _worst(result, where), _hard_starts(feasible, sampled=sampled)
+    learnt = min(
+        [accuracy, *[float(row["accuracy"]) for row in rows[-1:] if row.get("accuracy") is not None]]
+    )
+    longer = _longer(forecast(rows, learnt, feasible), float(result.get("seconds") or 0.0), commands)
+    if drives is None:
+        advice = (longer[0], *hard) if part < SOLVED else hard
+        return Learning("not driven", part, sentence, advice, commands.simulate, worst)
+    obeyed = float(drives["share"])
+    level: Level = (
+        "trained" if obeyed >= TRAINED else "partly trained" if obeyed >= UNDERTRAINED else "undertrained"
+    )
+    count = f"{drives['satisfied']:,} of {drives['drives']:,} drives obeyed"
+    sentence = f"{count} {named_guard(drives['guard']).beside}; {sentence}"
     if level == "trained":
         return Learning(level, part, sentence, hard, commands.simulate, worst)
-    longer, command = _longer(
-        forecast(rows, accuracy, feasible), float(result.get("seconds") or 0.0), commands
+    told, command = _told(drives, result["closed_loop"], commands)
+    if not command:
+        told, command = f"{told}; {longer[0]}" if told else longer[0], longer[1] or commands.search
+    planner = f"a planner as controller, which needs no training: `{commands.search}`"
+    others = hard if commands.search in told else (*hard, planner)
+    command = commands.simulate if level == "partly trained" else command
+    return Learning(level, part, sentence, (told, *others), command, worst)
+
+
+def _without_plan(commands: Commands, *, proved: bool) -> Learning:
+    """The verdict on a training run if no satisfying plan is known from any start."""
+    level: Level = "infeasible" if proved else "no plan known"
+    sentence = "neither the policy nor search found a satisfying plan for any start"
+    more = "more training hardly helps where there is no plan"
+    if proved:
+        sentence = "no plan satisfies the specification: bounds of what the controls can do prove it"
+        more = "more training cannot help"
+    advice = f"a looser specification, a longer horizon, or another initial set: {more}"
+    return Learning(level, None, sentence, (advice,), commands.report)
+
+
+def _best_drives(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Results of the drives under the recommended guard, or the guard that does best; None without drives."""
+    found = result.get("closed_loop")
+    guards = found.get("guards") if isinstance(found, Mapping) else None
+    if not isinstance(found, Mapping) or not guards:
+        return None
+    best: Mapping[str, Any] = max(
+        guards, key=lambda each: (each["guard"] == found.get("recommended"), each["share"])
     )
-    if level == "partly trained":
-        return Learning(level, part, sentence, (longer, *hard), commands.simulate, worst)
-    guard = (
-        f"`{commands.simulate}` shows what the guard adds: it replaces rejected plans by better ones that it "
-        "finds, and leaves the policy unchanged"
-    )
-    return Learning(level, part, sentence, (longer, *hard, guard), command or commands.report, worst)
+    return best
+
+
+def _told(drives: Mapping[str, Any], found: Mapping[str, Any], commands: Commands) -> tuple[str, str]:
+    """Return the most frequent cause of failed drives with a remedy, and the command for it.
+
+    The command is "" if longer training is the remedy. Both are "" if no cause was determined.
+
+    Args:
+        drives: results under one guard.
+        found: results of all drives.
+        commands: commands that may be recommended.
+    """
+    causes = {name: count for name, count in (drives.get("causes") or {}).items() if name in _CAUSES}
+    if not causes:
+        return "", ""
+    cause, text = max(causes, key=causes.__getitem__), ""
+    violated = drives.get("violated") or [{"requirement": "it", "due": None}]
+    name, due = f"`{violated[0]['requirement']}`", violated[0].get("due")
+    reach, whole = found.get("plan_seconds"), found.get("seconds")
+    command = ""
+    match cause:
+        case "reach" if reach and whole and whole > reach:
+            late = f"{name} is due at {duration(due)}" if due else f"{name} asks for more"
+            command = f"{commands.search} --set time.horizon={whole:g}s"
+            text = f"plans end after {duration(reach)}, {late}: `--set time.horizon={whole:g}s` plans further"
+        case "event":
+            command = f"{commands.afresh} --falsify"
+            text = f"states after such events are trained on by `{command}`"
+        case "rules":
+            command = commands.report
+            text = f"the specification of the plans should ask for {name} too"
+        case "precision" | "start" | "reach":
+            command = commands.search
+            text = f"ask for less of {name}, allow more time or control, or search for longer: `{command}`"
+    of = f"{causes[cause]:,} of {sum(causes.values()):,} failed drives that were examined"
+    return f"in {of}, {_CAUSES[cause]}" + (f"; {text}" if text else ""), command
+
+
+_CAUSES: Mapping[str, str] = {
+    "start": "no satisfying plan is known from the start",
+    "event": "a satisfying plan was followed until the world did what no plan foresees",
+    "reach": "a satisfying plan was followed until its continuation failed, as nothing unforeseen happened",
+    "precision": "the best known plans miss by little",
+    "policy": "a satisfying plan is known that the policy did not propose",
+    "rules": "the plans satisfied their specification to the end, and the rules of the drives ask for more",
+}
+"""Cause of a failed drive (see `stlc.controller.evaluation.causes.Cause`) -> the same in words."""
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:
@@ -294,7 +405,7 @@ def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float
     (growth, _), covariance = np.polyfit(doublings, odds, 1, cov=True)
     if growth - math.sqrt(covariance[0, 0]) < FLAT:
         return Curve("flat")
-    times = 2.0 ** min((_log_odds(TRAINED) - _log_odds(accuracy / feasible)) / growth, 60.0)
+    times = 2.0 ** min((_log_odds(SOLVED) - _log_odds(accuracy / feasible)) / growth, 60.0)
     return Curve("rising", times if times <= MOST_TIMES else None)
 
 
@@ -314,7 +425,7 @@ def _longer(curve: Curve, seconds: float, commands: Commands) -> tuple[str, str]
             late = min(times * times, MOST_TIMES)
             command = f"{commands.train_on} --budget {budget_text(max((late - 1.0) * seconds, 10.0))}"
             about = f"{duration(_rough(times * seconds))} to {duration(_rough(late * seconds))}"
-            text = f"a longer budget: the curve is rising, and points to {share(TRAINED, 0)} of what is known"
+            text = f"a longer budget: the curve is rising, and points to {share(SOLVED, 0)} of what is known"
             return f"{text} to be feasible after {about} in all (a rough figure): `{command}`", command
         case "rising", _:
             text = "a much longer budget: the curve is rising, but too slowly for a forecast of the time"

@@ -39,7 +39,7 @@ from stlc.view.html import (
     with_code,
     yaml_html,
 )
-from stlc.view.learning import Commands, clause, driven_lines, learning_on_record, recommended
+from stlc.view.learning import Commands, clause, driven_lines, learning_on_record
 from stlc.view.player import player_section, script
 from stlc.view.recorded import map_section, recorded_section
 from stlc.view.words import (
@@ -160,7 +160,7 @@ def _beside(result: Mapping[str, Any]) -> str:
 def _advice(contents: RunContents) -> Html | None:
     """Advice on further training; None if the policy is trained."""
     where = clause(contents.held_out, contents.signature)
-    commands = Commands.of(shlex.quote(contents.run.shown), guard=recommended(contents.record))
+    commands = Commands.of(shlex.quote(contents.run.shown), contents.record)
     learning = learning_on_record(contents.record, contents.rows, commands, where)
     if learning is None or not learning.advice:
         return None

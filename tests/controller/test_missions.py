@@ -14,11 +14,11 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
-from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
+from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
-from stlc.controller.training.samplers import GLIMPSES, POOL, ROUNDS, Draws, Missions, mission_steps, visited
+from stlc.controller.training.samplers import GLIMPSES, POOL, ROUNDS, Draws, Missions, mission_steps
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
@@ -171,16 +171,6 @@ def test_only_memory_needs_missions(system: System) -> None:
     plain = task_of("spec p\nstate signal x [m]\nrequire a: always[0, T] x < 4 m", system)
     trainer = Trainer(plain, resolve_config(plain, TrainConfig(batch=8)), steps=2, device=CPU)
     assert isinstance(trainer.supply, Draws)
-
-
-def test_held_out_states_are_visited_ones(task: Task) -> None:
-    policy = BestOfKPolicy(task, PlanNetwork(task, hidden=(8,), plans=2))
-    states = visited(task, policy, 500, seed=3)
-    assert states.shape == (500, len(task.system.names))
-    assert states.dtype == torch.float64
-    assert bool(task.alive(states).all())
-    assert torch.equal(states, visited(task, policy, 500, seed=3))
-    assert len(states[:, task.system.names.index("clock")].unique()) > 3
 
 
 def test_kernel_and_torch_agree_on_memory(task: Task) -> None:

@@ -18,13 +18,23 @@ from stlc.view.learning import (
     learning_of_run,
 )
 
-COMMANDS = Commands.of("7", newest=True)
+COMMANDS = Commands.of("7", {"spec_path": "s.stl"}, newest=True)
 WHERE = "fails in 63 % of the starts with sign = stop (40 % of its failures)"
 
 
 def result(accuracy: float, feasible: float, seconds: float = 30.0) -> dict[str, object]:
     shares = {"stop_sign": min(1.0, accuracy + 0.02), "red_light": 1.0}
     return {"accuracy": accuracy, "feasible": feasible, "requirements": shares, "seconds": seconds}
+
+
+def driven(
+    satisfied: int, causes: dict[str, int] | None = None, due: float | None = None
+) -> dict[str, object]:
+    """Closed-loop results of 20 drives without a guard, of 35 s, with plans of 10 s."""
+    violated = [{"requirement": "stop_sign", "drives": 20 - satisfied, "seconds": 30.0, "due": due}]
+    share = {"guard": "none", "drives": 20, "satisfied": satisfied, "share": satisfied / 20}
+    guard = {**share, "interval": [0.0, 1.0], "violated": violated, "causes": causes or {}}
+    return {"closed_loop": {"guards": [guard], "recommended": "none", "seconds": 35.0, "plan_seconds": 10.0}}
 
 
 def rows(accuracy: float, feasible: float, growth: float, count: int = 20) -> list[dict[str, float]]:
@@ -38,37 +48,64 @@ def rows(accuracy: float, feasible: float, growth: float, count: int = 20) -> li
     return found
 
 
-def test_at_three_percent_it_is_undertrained_and_training_goes_on() -> None:
-    learning = learning_of(result(0.027, 0.93), rows(0.027, 0.93, 2.0), COMMANDS, WHERE)
+def test_what_hardly_obeys_is_undertrained_and_training_goes_on_while_the_curve_rises() -> None:
+    found = result(0.027, 0.93) | driven(0, {"policy": 5, "start": 1})
+    learning = learning_of(found, rows(0.027, 0.93, 2.0), COMMANDS, WHERE)
     assert learning.level == "undertrained"
     assert learning.share == pytest.approx(0.029, abs=1e-3)
+    assert learning.sentence.startswith("0 of 20 drives obeyed without a guard; the policy's plan")
     assert "from 2.7 % of the starts" in learning.sentence
     assert "known for 93.0 %" in learning.sentence
-    longer, guard = learning.advice
+    longer, planner = learning.advice
+    assert longer.startswith("in 5 of 6 failed drives that were examined, a satisfying plan is known")
     assert "the curve is rising" in longer
-    assert "--budget" in longer
     assert learning.worst == f"the worst requirement is stop_sign, 4.7 % satisfied: it {WHERE}"
-    assert "stlc simulate --backup" in guard
+    assert "`stlc simulate s.stl --method search`" in planner
     assert learning.command.startswith("stlc train --resume 7 --budget ")
     assert learning.command in longer
 
 
-def test_at_half_it_is_partly_trained_and_may_be_driven() -> None:
-    learning = learning_of(result(0.5, 0.9), rows(0.5, 0.9, 1.0), COMMANDS, WHERE)
+def test_half_of_the_drives_are_partly_trained_and_may_be_driven() -> None:
+    learning = learning_of(result(0.5, 0.9) | driven(10), rows(0.5, 0.9, 1.0), COMMANDS, WHERE)
     assert learning.level == "partly trained"
     assert learning.command == "stlc simulate --backup"
     assert "points to 95 % of what is known to be feasible after 3 min 20 s to" in learning.advice[0]
-    assert not any("guard" in advice for advice in learning.advice)
 
 
-def test_at_97_percent_nothing_is_advised() -> None:
-    learning = learning_of(result(0.97, 0.975), rows(0.97, 0.975, 0.5), COMMANDS, WHERE)
-    assert (learning.level, learning.advice) == ("trained", ())
-    assert learning.command == "stlc simulate --backup"
+def test_only_drives_make_a_policy_trained() -> None:
+    for satisfied, level in ((20, "trained"), (18, "trained"), (17, "partly trained"), (0, "undertrained")):
+        assert learning_of(result(1.0, 1.0) | driven(satisfied), [], COMMANDS).level == level
+    learning = learning_of(result(0.97, 0.975) | driven(20), rows(0.97, 0.975, 0.5), COMMANDS, WHERE)
+    assert learning.advice == ()
+    alone = learning_of(result(1.0, 1.0), [], COMMANDS)
+    assert (alone.level, alone.advice) == ("not driven", ())
+    late = {"closed_loop": {"guards": [], "recommended": None}}
+    assert learning_of(result(1.0, 1.0) | late, [], COMMANDS).level == "not driven"
 
 
-def test_a_policy_that_reaches_all_that_is_possible_is_trained_however_little_that_is() -> None:
-    learning = learning_of(result(0.35, 0.36), rows(0.35, 0.36, 0.1), COMMANDS)
+@pytest.mark.parametrize(
+    ("cause", "due", "text", "command"),
+    [
+        ("reach", 30.0, "plans end after 10 s, `stop_sign` is due at 30 s", "search --set time.horizon=35s"),
+        ("reach", None, "plans end after 10 s, `stop_sign` asks for more", "search --set time.horizon=35s"),
+        ("event", None, "the world did what no plan foresees", "stlc train s.stl --falsify"),
+        ("start", None, "no satisfying plan is known from the start; ask for less of `stop_sign`", "search"),
+        ("precision", None, "the best known plans miss by little", "stlc simulate s.stl --method search"),
+        ("rules", None, "should ask for `stop_sign` too", "stlc report 7"),
+    ],
+)
+def test_the_advice_follows_from_the_cause_that_was_measured(
+    cause: str, due: float | None, text: str, command: str
+) -> None:
+    learning = learning_of(result(1.0, 1.0) | driven(2, {cause: 4, "policy": 1}, due), [], COMMANDS)
+    assert learning.level == "undertrained"
+    assert learning.advice[0].startswith("in 4 of 5 failed drives that were examined, ")
+    assert text in learning.advice[0]
+    assert learning.command.endswith(command)
+
+
+def test_where_few_starts_have_a_plan_it_is_said() -> None:
+    learning = learning_of(result(0.35, 0.36) | driven(19), rows(0.35, 0.36, 0.1), COMMANDS)
     assert learning.level == "trained"
     (hard,) = learning.advice
     assert hard.startswith("for 64.0 % of the starts search found no satisfying plan either")
@@ -95,9 +132,9 @@ def test_where_nothing_is_possible_training_is_not_the_advice() -> None:
 
 
 def test_a_flat_curve_is_not_answered_with_more_time() -> None:
-    learning = learning_of(result(0.03, 0.9), rows(0.03, 0.9, 0.0), COMMANDS)
+    learning = learning_of(result(0.03, 0.9) | driven(1), rows(0.03, 0.9, 0.0), COMMANDS)
     assert "promises little, the curve is flat" in learning.advice[0]
-    assert learning.command == "stlc report 7"
+    assert learning.command == "stlc simulate s.stl --method search"
 
 
 def test_nothing_is_foretold_from_a_short_curve_or_for_ever() -> None:

@@ -24,7 +24,7 @@ def report(
     """
     from stlc.rundir import RunDir
     from stlc.view.contents import simulation_of
-    from stlc.view.learning import Commands, driven_lines, learning_of_run, recommended
+    from stlc.view.learning import Commands, driven_lines, learning_of_run
     from stlc.view.report import write_report
     from stlc.view.words import satisfied_sentence
 
@@ -35,7 +35,7 @@ def report(
     world = simulation.get("world")
     path = f"{folder.shown}/report.html"
     record = folder.record()
-    learning = learning_of_run(folder, Commands.of(folder.shown, guard=recommended(record)))
+    learning = learning_of_run(folder, Commands.of(folder.shown, record))
     result: WrittenReport = {"run": folder.shown, "report": path}
     if learning is not None:
         result["verdict"] = verdict_record(learning)

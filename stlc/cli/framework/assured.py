@@ -310,6 +310,15 @@ class Verified(TypedDict):
     modes: list[VerifiedMode]
 
 
+class ViolatedRequirement(TypedDict):
+    """Requirement that drives violate; see `stlc.controller.evaluation.closed_loop.Violated`."""
+
+    requirement: str
+    drives: int
+    seconds: Num | None
+    due: Num | None
+
+
 class GuardResult(TypedDict):
     """Drives under one guard after a training; see `stlc.controller.evaluation.closed_loop.Share`."""
 
@@ -322,6 +331,8 @@ class GuardResult(TypedDict):
     compared: int
     gained: int
     lost: int
+    violated: list[ViolatedRequirement]
+    causes: dict[str, int]
 
 
 class ClosedLoopRecord(TypedDict):
@@ -334,6 +345,8 @@ class ClosedLoopRecord(TypedDict):
     left_out: list[ComparedGuard]
     seed: int
     steps: int
+    seconds: Num
+    plan_seconds: Num
     judge: str | None
     why: str
 

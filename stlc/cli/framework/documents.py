@@ -431,7 +431,7 @@ class PlottedTrace(TypedDict):
 
 
 class TrainingVerdict(TypedDict):
-    level: Literal["infeasible", "no plan known", "undertrained", "partly trained", "trained"]
+    level: Literal["infeasible", "no plan known", "not driven", "undertrained", "partly trained", "trained"]
     share_of_feasible: float | None
     sentence: str
     advice: list[str]

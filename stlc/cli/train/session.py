@@ -19,7 +19,7 @@ from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
 from stlc.rundir import LATEST, RUNS
 from stlc.stopping import age, leaving
-from stlc.view.learning import Commands, learning_of_run, recommended
+from stlc.view.learning import Commands, learning_of_run
 
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
@@ -204,8 +204,8 @@ def _commands(folder: RunDir, ranks: int = 1) -> Commands:
     newest = (RUNS / LATEST).resolve() == folder.path.resolve()
     usual = folder.path.resolve().parent.parent == RUNS.resolve()
     start = "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
-    guard = recommended(folder.record())
-    return Commands.of(folder.name if usual else folder.shown, newest=newest, start=start, guard=guard)
+    name = folder.name if usual else folder.shown
+    return Commands.of(name, folder.record(), newest=newest, start=start)
 
 
 def _screen(outcome: TrainingOutcome, result: TrainedRun, spark: str, pictures: bool) -> list[str]:

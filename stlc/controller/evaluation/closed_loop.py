@@ -11,12 +11,14 @@ simulated only if some runs fail under the cheaper ones. The remaining time is s
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stlc.compile.analysis.deadlines import unreached
 from stlc.controller.deployment.simulator import (
     DeploymentRecording,
     Recorder,
@@ -24,6 +26,7 @@ from stlc.controller.deployment.simulator import (
     SimulationStep,
     simulate,
 )
+from stlc.controller.evaluation.causes import Cause, causes
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.rules import (
@@ -31,7 +34,7 @@ from stlc.controller.evaluation.rules import (
     RunVerdicts,
     judge_runs_by_plans,
     rules_of,
-    verdict_on_runs,
+    runs_by_rules,
 )
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
@@ -42,8 +45,6 @@ from stlc.diagnostics import StlcError
 from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from stlc.controller.training.run import Run
 
 SEED = 1 << 40
@@ -56,8 +57,44 @@ NEAR = 0.02
 """Largest difference in share at which the cheaper of two guards is recommended."""
 LEAST = 20
 """Minimum number of common initial states from which guards are compared, and one is recommended."""
+EXPLAINED = 12
+"""Number of failed runs under each guard whose cause is determined."""
 FEWER = 4
 """Factor by which the number of agents is reduced if a seed takes too long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """Verdict on one run.
+
+    Attributes:
+        obeyed: whether it satisfies the mission.
+        safe: whether it satisfies the requirements tagged `@safety`; None if there are none.
+        broken: requirement that it violates -> time of the violation in seconds; None if not determined.
+        cause: why it fails; None if it does not, or if this was not determined.
+    """
+
+    obeyed: bool
+    safe: bool | None = None
+    broken: Mapping[str, float | None] = field(default_factory=dict)
+    cause: Cause | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Violated:
+    """Requirement that runs violate.
+
+    Attributes:
+        requirement: its name.
+        drives: number of runs that violate it.
+        seconds: median time of the violations; None if no time was determined.
+        due: mission time at which it is due, in seconds, if plans from the start end before; else None.
+    """
+
+    requirement: str
+    drives: int
+    seconds: float | None
+    due: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +109,8 @@ class Share:
         safe: number of runs that satisfy the requirements tagged `@safety`; None if there are none.
         gained: number of runs that satisfy the mission, and without a guard do not.
         lost: number of runs that violate the mission, and without a guard do not.
+        violated: the requirements that runs violate, the one that most runs violate first.
+        causes: cause -> number of failed runs that have it, of those whose cause was determined.
     """
 
     guard: str
@@ -80,6 +119,8 @@ class Share:
     safe: int | None
     gained: int = 0
     lost: int = 0
+    violated: tuple[Violated, ...] = ()
+    causes: Mapping[Cause, int] = field(default_factory=dict)
 
     @property
     def share(self) -> float:
@@ -104,6 +145,8 @@ class Share:
             "compared": self.runs if GUARDS.get(self.guard).intervenes else 0,
             "gained": self.gained,
             "lost": self.lost,
+            "violated": [asdict(each) for each in self.violated],
+            "causes": dict(self.causes),
         }
 
 
@@ -115,6 +158,8 @@ class ClosedLoop:
         shares: results of the compared guards from the same initial states, one entry per guard, the cheapest
             guard first; empty if no run was completed.
         steps: length of a run in steps.
+        seconds: the same in seconds.
+        plan_seconds: length of a plan in seconds.
         judge: name of the specification that judges the runs; None if the specification of the plans judges
             them.
         why: message of the error that prevented every run; empty if there was none.
@@ -124,6 +169,8 @@ class ClosedLoop:
 
     shares: tuple[Share, ...]
     steps: int
+    seconds: float = 0.0
+    plan_seconds: float = 0.0
     judge: str | None = None
     why: str = ""
     left_out: tuple[str, ...] = ()
@@ -153,6 +200,8 @@ class ClosedLoop:
             "left_out": list(self.left_out),
             "seed": SEED,
             "steps": self.steps,
+            "seconds": self.seconds,
+            "plan_seconds": self.plan_seconds,
             "judge": self.judge,
             "why": self.why,
         }
@@ -168,49 +217,51 @@ class _Known:
 
     Attributes:
         agents: number of agents per seed in further simulations.
-        found: verdicts on each run, by (seed, agent): whether the run satisfies the mission, and whether it
-            satisfies the safety requirements (None if there are none).
+        found: verdicts on the runs, by (seed, agent).
         seeds: number of simulated seeds.
         cost: measured seconds per seed; 0 before the first seed.
         given_up: True if the guard is not simulated any more, because a seed takes too long.
     """
 
     agents: int
-    found: dict[tuple[int, int], tuple[bool, bool | None]] = field(default_factory=dict)
+    found: dict[tuple[int, int], Driven] = field(default_factory=dict)
     seeds: int = 0
     cost: float = 0.0
     given_up: bool = False
 
     @property
     def share(self) -> float:
-        return sum(good for good, _ in self.found.values()) / max(1, len(self.found))
+        return sum(drive.obeyed for drive in self.found.values()) / max(1, len(self.found))
 
     @property
     def interval(self) -> tuple[float, float]:
         return wilson(self.share, len(self.found)) if self.found else (0.0, 1.0)
 
 
-def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES) -> ClosedLoop:
+def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, *, extra: float = 0.0) -> ClosedLoop:
     """Simulate a policy in the world of its system, without and with guards, within the time limit.
 
     Args:
         run: trained run.
         left: function that returns the remaining seconds; simulation stops once they are 0.
         most: maximum number of runs of each guard.
+        extra: seconds among the remaining ones that are only for the first `LEAST` runs of each guard.
 
     Returns:
         Results of the completed runs. If the world fails, or the rules (specification of closed-loop runs) do
         not fit the system, `shares` is empty, and `why` contains the message.
     """
-    test = run.task.system.decl.test
+    system = run.task.system
+    steps, dt = system.decl.test.steps, system.dt
+    nothing = ClosedLoop((), steps, steps * dt, system.horizon * dt)
     try:
         rules = rules_of(run)
-        trial = _Trial(run, rules, left, most, SEED)
+        trial = _Trial(run, rules, left, most, SEED, extra)
         trial.simulate()
     except StlcError as error:
-        return ClosedLoop((), test.steps, why=error.diagnostics[0].message)
+        return replace(nothing, why=error.diagnostics[0].message)
     judge, shares = None if rules is None else rules.name, trial.shares()
-    return ClosedLoop(shares, test.steps, judge, left_out=trial.left_out(shares))
+    return replace(nothing, shares=shares, judge=judge, left_out=trial.left_out(shares))
 
 
 def fresh_share(run: Run, guard: str, runs: int) -> Share:
@@ -223,18 +274,25 @@ def fresh_share(run: Run, guard: str, runs: int) -> Share:
     trial = _Trial(run, rules_of(run), lambda: 1e9, runs, 0)
     agents = trial.test.agents
     seeds = tuple(range(-(-runs // agents)))
-    good, safe = trial._judged(trial._simulated(guard, seeds, agents, share=1.0))
-    return Share(guard, len(good), int(good.sum()), None if safe is None else int(safe.sum()))
+    judged = trial._judged(trial._simulated(guard, seeds, agents, share=1.0))
+    safe = None if judged.safe is None else int(judged.safe.sum())
+    return Share(guard, len(judged.viable), int(judged.obeyed.sum()), safe)
 
 
 class _Trial:
     """Closed-loop simulation of one policy under all guards, in progress."""
 
     def __init__(
-        self, run: Run, rules: Rules | None, left: Callable[[], float], most: int, seed: int
+        self,
+        run: Run,
+        rules: Rules | None,
+        left: Callable[[], float],
+        most: int,
+        seed: int,
+        extra: float = 0.0,
     ) -> None:
         self.task, self.policy, self.rules, self.left = run.task, run.policy, rules, left
-        self.most, self.seed = most, seed
+        self.most, self.seed, self.extra = most, seed, extra
         self.make = world_type(self.task.system.decl)
         self.test = self.task.system.decl.test
         self.known: Mapping[str, _Known] = {mode: _Known(self.test.agents) for mode in COMPARED}
@@ -264,7 +322,7 @@ class _Trial:
         most = max(known.seeds for known in simulated.values())
         for mode, known in simulated.items():
             if known.seeds < most:
-                count = min(most - known.seeds, known.seeds, self._seeds_in_time([known]))
+                count = min(most - known.seeds, known.seeds, self._seeds_in_time([known], self.left()))
                 known.given_up = count < 1
                 return None if known.given_up else (mode, count)
         best = max(known.share for known in simulated.values())
@@ -274,14 +332,17 @@ class _Trial:
             if known.interval[1] >= best
         )
         first, known = next(iter(simulated.items()))
-        room = -(-(self.most - len(known.found)) // known.agents)
-        count = min(most, room, self._seeds_in_time([*simulated.values()]))
+        enough = len(known.found) >= LEAST
+        wanted = self.most if enough else min(LEAST, self.most)
+        room = -(-(wanted - len(known.found)) // known.agents)
+        left = self.left() - self.extra * enough
+        count = min(most, room, self._seeds_in_time([*simulated.values()], left))
         return (first, count) if wide and count >= 1 else None
 
-    def _seeds_in_time(self, guards: Sequence[_Known]) -> int:
-        """Number of further seeds under each of `guards` for which the remaining time suffices."""
+    def _seeds_in_time(self, guards: Sequence[_Known], left: float) -> int:
+        """Number of further seeds under each of `guards` for which `left` seconds suffice."""
         cost = sum(known.cost for known in guards)
-        return int(0.6 * self.left() / cost) if cost else 1
+        return int(0.6 * left / cost) if cost else 1
 
     def _more(self, mode: str, count: int) -> None:
         """Simulate `count` further seeds under the guard `mode` and store their results.
@@ -300,10 +361,19 @@ class _Trial:
             known.given_up = bool(known.seeds) or known.agents == 1 or self.left() <= 0.0
             known.agents = max(1, known.agents // FEWER)
             return
-        good, safe = self._judged(recording)
-        for row in range(len(good)):
+        runs = self._judged(recording)
+        safe, broken = runs.safe, {each.row: each for each in runs.broken}
+        told = [each for each in runs.broken if any(time is not None for time in each.rules.values())]
+        room = max(0, EXPLAINED - sum(drive.cause is not None for drive in known.found.values()))
+        why = causes(self.task, recording, told[:room], lambda: self.left() <= 0.0)
+        for row, obeyed in enumerate(runs.obeyed.tolist()):
             where, agent = divmod(row, agents)
-            known.found[seeds[where], agent] = bool(good[row]), None if safe is None else bool(safe[row])
+            known.found[seeds[where], agent] = Driven(
+                obeyed,
+                None if safe is None else bool(safe[row]),
+                broken[row].rules if row in broken else {},
+                why.get(row),
+            )
         known.cost = (whole - self.left()) / count
         known.seeds += count
 
@@ -329,22 +399,12 @@ class _Trial:
         assert recording is not None
         return recording
 
-    def _judged(self, recording: DeploymentRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Return two masks of runs, (rows,) each: those that satisfy the mission, and those that are safe.
-
-        A run is safe if it satisfies the requirements of the mission that are tagged `@safety`. If there are
-        none, the second mask is None.
-        """
-        rows = len(recording.states)
-        if self.rules is None:
-            executed = judge_executed(self.task, recording, viable=np.ones(rows, dtype=bool))
-            runs = judge_runs_by_plans(executed, self.task.system.dt)
-            return runs.obeyed, runs.safe
-        verdict = verdict_on_runs(self.rules, self.task, recording)
-        found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
-        names = tuple(rule.name for rule in verdict.subject.compiled.safety)
-        runs = RunVerdicts(found, (), np.ones(rows, dtype=bool), names)
-        return runs.obeyed, runs.safe
+    def _judged(self, recording: DeploymentRecording) -> RunVerdicts:
+        """Judge recorded runs by the rules, or by the specification of the plans if there are none."""
+        if self.rules is not None:
+            return runs_by_rules(self.rules, self.task, recording)
+        executed = judge_executed(self.task, recording, viable=np.ones(len(recording.states), dtype=bool))
+        return judge_runs_by_plans(executed, self.task.system.dt)
 
     def shares(self) -> tuple[Share, ...]:
         """Counts of the runs under each compared guard, from their common initial states, cheapest first.
@@ -360,8 +420,11 @@ class _Trial:
         free = compared[GUARDS.default].found if GUARDS.default in compared else {}
         shares = []
         for mode, known in compared.items():
-            safe = [known.found[start][1] for start in starts]
-            pairs = [(known.found[start][0], free.get(start, known.found[start])[0]) for start in starts]
+            drives = [known.found[start] for start in starts]
+            pairs = [
+                (known.found[start].obeyed, free.get(start, known.found[start]).obeyed) for start in starts
+            ]
+            safe = [drive.safe for drive in drives]
             shares.append(
                 Share(
                     mode,
@@ -370,9 +433,22 @@ class _Trial:
                     safe=None if None in safe else sum(map(bool, safe)),
                     gained=sum(good and not alone for good, alone in pairs),
                     lost=sum(alone and not good for good, alone in pairs),
+                    violated=self._violated(drives),
+                    causes=Counter(drive.cause for drive in drives if drive.cause is not None),
                 )
             )
         return tuple(shares)
+
+    def _violated(self, drives: Sequence[Driven]) -> tuple[Violated, ...]:
+        """The requirements that `drives` violate, the one that most of them violate first."""
+        counts = Counter(name for drive in drives for name in drive.broken)
+        due = {each.requirement: each.seconds for each in unreached(self.task.compiled)}
+        found = []
+        for name, count in counts.most_common():
+            times = [drive.broken[name] for drive in drives if name in drive.broken]
+            known = [time for time in times if time is not None]
+            found.append(Violated(name, count, float(np.median(known)) if known else None, due.get(name)))
+        return tuple(found)
 
     def left_out(self, shares: Sequence[Share]) -> tuple[str, ...]:
         """Guards that are not among `shares` although they are cheaper than a guard without a failure."""

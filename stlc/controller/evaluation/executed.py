@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.problem.task import Task
 
+MOST_TIMED = 200
+"""Maximum number of trajectories for which the time of a violation is determined, per requirement."""
 Mask = NDArray[np.bool_]
 Margins: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Least and greatest robustness over all continuations of what is recorded."""
@@ -51,6 +53,8 @@ class Executed:
             the window follow the true dynamics. They may still differ from the model. None if events were not
             recorded.
         viable: (rows,), whether the trajectory is safe, or a safe plan from its first state is known.
+        decided: requirement -> sample from which on it certainly does not hold at its first failing start,
+            whatever follows, (rows,); NaN where it does not fail, or where this was not determined.
     """
 
     rules: Mapping[str, Mask]
@@ -59,6 +63,7 @@ class Executed:
     consistent: Mask
     viable: Mask
     eventless: Mask | None = None
+    decided: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def agents(self, names: Sequence[str]) -> Mask:
         """Mask of the agents for which all requirements in `names` hold at all start instants, (rows,)."""
@@ -98,7 +103,7 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
         found = search_safe(task, torch.from_numpy(recording.states[:, 0])).numpy()
     eventless = None if recording.eventless is None else _throughout(recording.eventless, task, starts)
     consistent = _throughout(model_consistent(task, recording), task, starts)
-    executed = Executed(rules, fails, safety, consistent, found, eventless)
+    executed = Executed(rules, fails, safety, consistent, found, eventless, _decided(task, recording, fails))
     return replace(executed, viable=found | executed.agents(safety))
 
 
@@ -131,10 +136,53 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
 
 def _margins_of_rules(task: Task, recording: DeploymentRecording) -> dict[str, Margins]:
     """Bounds on the robustness of each requirement at the start instants of `Executed`."""
-    columns = dict(
-        zip(task.system.names, np.moveaxis(recording.states, -1, 0).transpose(0, 2, 1), strict=True)
-    )
+    columns = _columns(task, recording)
     return {rule.name: _margins(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
+
+
+def _columns(task: Task, recording: DeploymentRecording) -> dict[str, NDArray[np.float64]]:
+    """State -> samples, (time, rows)."""
+    return dict(zip(task.system.names, recording.states.transpose(2, 1, 0), strict=True))
+
+
+def _decided(
+    task: Task, recording: DeploymentRecording, fails: Mapping[str, Mask]
+) -> dict[str, NDArray[np.float64]]:
+    """Samples from which on requirements certainly do not hold; see `Executed.decided`.
+
+    `fails`: requirement -> mask, (starts, rows). The first `MOST_TIMED` failing rows of each are determined.
+    """
+    columns, last, found = _columns(task, recording), recording.steps, {}
+    for rule in task.rules:
+        failing, written = fails[rule.name], whole_run_rule(rule, task)
+        rows = np.flatnonzero(failing.any(0))[:MOST_TIMED]
+        samples = found[rule.name] = np.full(failing.shape[1], np.nan)
+        starts = failing[:, rows].argmax(0) if len(rows) else rows
+        for start in np.unique(starts):
+            those = rows[starts == start]
+            high = min(last, start + max(task.horizon, rule.reach)) if written.windowed else last
+            window = {name: each[start : high + 1, those] for name, each in columns.items()}
+            samples[those] = start + _since(written, window, 0, high - start)
+    return found
+
+
+def _since(
+    rule: CompiledRequirement, columns: Mapping[str, NDArray[np.float64]], low: int, high: int
+) -> NDArray[np.int64]:
+    """First sample up to which each trajectory violates a requirement whatever follows, (rows,).
+
+    It lies between `low` and `high`. `columns`: state -> samples, (time, rows).
+    """
+    samples, rows = next(iter(columns.values())).shape
+    if low == high or not rows:
+        return np.full(rows, low)
+    middle = (low + high) // 2
+    begun = {name: each[: middle + 1] for name, each in columns.items()}
+    early = _margin(rule, begun, 1, "upper", stop=samples)[0] < -TOLERANCE
+    found = np.zeros(rows, dtype=np.int64)
+    for part, bounds in ((early, (low, middle)), (~early, (middle + 1, high))):
+        found[part] = _since(rule, {name: each[:, part] for name, each in columns.items()}, *bounds)
+    return found
 
 
 def _margins(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], horizon: int) -> Margins:
@@ -160,10 +208,17 @@ def _margins(rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], hor
 
 
 def _margin(
-    rule: CompiledRequirement, columns: Mapping[str, NDArray[Any]], count: int, end: Boundary = "truncate"
+    rule: CompiledRequirement,
+    columns: Mapping[str, NDArray[Any]],
+    count: int,
+    end: Boundary = "truncate",
+    stop: int | None = None,
 ) -> NDArray[np.float64]:
-    """Robustness at the first `count` samples, (count, rows); -inf where it is no number."""
-    (margin,) = evaluate([rule.formula], columns, ops=NUMPY, count=count, end=end)
+    """Robustness at the first `count` samples, (count, rows); -inf where it is no number.
+
+    `end` and `stop` are explained in `stlc.compile.backends.array.graph.evaluate`.
+    """
+    (margin,) = evaluate([rule.formula], columns, ops=NUMPY, count=count, end=end, stop=stop)
     whole = np.broadcast_to(margin, (count, next(iter(columns.values())).shape[1]))
     return np.where(np.isnan(whole), -np.inf, whole)
 

@@ -16,7 +16,7 @@ from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.training.exploration import EFFORTS, Exploration
-from stlc.controller.training.samplers import mission_steps, visited
+from stlc.controller.training.samplers import mission_steps
 from stlc.files import write_atomic
 from stlc.native import never
 
@@ -100,11 +100,11 @@ def score(
 ) -> Score:
     """Judge a policy on held-out states (initial states that the training does not use).
 
-    If the specification has timers, the held-out states also come from later instants of simulated missions.
-    If the policy's plans fail from some states, a search looks for satisfying plans from at most
-    `MOST_SEARCHED` of these states, chosen at random. The search starts from the policy's plan. If it finds
-    none, a second search ignores the policy, because the feasible share should hardly depend on how well the
-    policy is trained. The second search is made only with native code, as it is slow in torch.
+    The states are starts of missions: what else a mission reaches depends on the policy itself. If the
+    policy's plans fail from some states, a search looks for satisfying plans from at most `MOST_SEARCHED` of
+    these states, chosen at random. The search starts from the policy's plan. If it finds none, a second
+    search ignores the policy, because the feasible share should hardly depend on how well the policy is
+    trained. The second search is made only with native code, as it is slow in torch.
 
     Args:
         task: specification and system.
@@ -116,10 +116,7 @@ def score(
             of states counts as not searched, except the first batch, which always counts as searched.
         report: function that receives the progress as a short text.
     """
-    if task.compiled.timers:
-        states = visited(task, policy, n, seed, enough)
-    else:
-        states = task.sample(n, seed=seed, dtype=torch.float64)
+    states = task.sample(n, seed=seed, dtype=torch.float64)
     states, plans, rho, each = _judged(policy, states, enough, report)
     n, good = len(states), satisfied(rho)
     shares = satisfied(each).double().mean(0)
@@ -187,8 +184,8 @@ def _judged(
 def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
     """Search for satisfying plans from a few failing states by exploration, and update `known`.
 
-    Exploration builds plans step by step, by extending partial plans; it does not use the policy. States at
-    the start of a mission come first. The search ends early once `enough` returns True.
+    Exploration builds plans step by step, by extending partial plans; it does not use the policy. The search
+    ends early once `enough` returns True.
 
     Args:
         task: specification and system.
@@ -197,9 +194,7 @@ def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough:
         known: mask of the states with a known satisfying plan, (n,); changed in place.
         enough: function that returns True to end the search.
     """
-    clocks = [task.system.names.index(timer.name) for timer in task.system.timers if timer.kind == "clock"]
-    age = states[failing][:, clocks].sum(1)
-    first = failing[age.argsort(stable=True)[:EXPLORED]]
+    first = failing[:EXPLORED]
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 2)
     found = Exploration(task).solved(states[first], EFFORTS[1], generator, ENOUGH, enough)
     known[first] = (states[first][:, None] == found.states[None]).all(2).any(1)

@@ -18,6 +18,7 @@ import torch
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.controller.evaluation.executed import MOST_TIMED
 from stlc.controller.guard.feasibility import safety_task, solvable
 from stlc.controller.training.run import INDEX, read_library, save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
 
 JUDGE = "judge"
 _INDEX = f"{JUDGE}/{INDEX}"
-MOST_TIMED = 200
-"""Maximum number of violations per guard whose time is located, which takes some milliseconds each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,18 +262,24 @@ def judge_runs(
     Raises:
         SpecError: the rules use names that the system does not have.
     """
+    runs = runs_by_rules(rules, task, recording)
+    safety, able = frozenset(runs.safety), viable.copy()
+    broken = tuple(
+        replace(each, lost=_lost(each, safety, task, recording, bool(viable[each.row])))
+        for each in runs.broken
+    )
+    for each in broken:
+        able[each.row] = not each.excused
+    return replace(runs, broken=broken, viable=able | runs.obeyed)
+
+
+def runs_by_rules(rules: Rules, task: Task, recording: DeploymentRecording) -> RunVerdicts:
+    """Judge every closed-loop run as `judge_runs` does, but do not search for plans: all runs are viable."""
     verdict = verdict_on_runs(rules, task, recording)
     found = {judgement.name: np.array(judgement.statuses) for judgement in verdict}
     safety = frozenset(rule.name for rule in verdict.subject.compiled.safety)
-    broken = tuple(
-        replace(each, lost=_lost(each, safety, task, recording, bool(viable[each.row])))
-        for each in _broken(verdict, found)
-    )
-    viable = viable.copy()
-    for each in broken:
-        viable[each.row] = not each.excused
     kept = tuple(name for name in found if name in safety)
-    return RunVerdicts(found, broken, viable | obeying(found, len(viable)), kept)
+    return RunVerdicts(found, tuple(_broken(verdict, found)), np.ones(verdict.traces, dtype=bool), kept)
 
 
 def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) -> Verdict:
@@ -346,7 +351,7 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
 
     A row is one run. A start is a sample of the run at which a requirement is evaluated. A run obeys a
     requirement if the requirement certainly holds at every start, of which there is one at least. The run
-    breaks the requirement at the first start at which it certainly fails.
+    breaks the requirement at the sample that decides that it fails at a start.
 
     Args:
         executed: verdicts on the runs by the specification of the plans.
@@ -362,17 +367,20 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
         for name, held in executed.rules.items()
     }
     names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(viable))}
-    first = {name: failed.argmax(0) * dt for name, failed in fails.items() if len(failed)}
     broken = (
         Broken(
             row,
-            {name: float(first[name][row]) for name in each},
+            {name: _seconds(executed.decided[name][row], dt) for name in each},
             None if viable[row] else Lost("start", 0.0),
         )
         for row, each in names.items()
         if each
     )
     return RunVerdicts(rules, tuple(broken), viable | obeying(rules, len(viable)), executed.safety)
+
+
+def _seconds(sample: float, dt: float) -> float | None:
+    return None if np.isnan(sample) else float(sample) * dt
 
 
 def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator[Broken]:

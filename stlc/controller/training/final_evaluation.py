@@ -25,6 +25,11 @@ VERDICT_OVER = 0.04
 """Share of a budget by which the evaluation may exceed it before the feasibility search is stopped."""
 SIMULATION_SHARE = 0.15
 """Time for closed-loop simulations after training without budget, as a share of the training time."""
+FIRST_DRIVES, FIRST_SHARE = 20.0, 1.0 / 3.0
+"""Time for the first closed-loop simulations, which guards are compared by: seconds, and share of the budget.
+
+Both are upper limits. The time beyond that of the other simulations is not part of the budget.
+"""
 VERDICT_LEAST, VERDICT_SHARE = 20.0, 0.2
 """Time for the evaluation of a run without budget: seconds, and share of the duration of its steps."""
 
@@ -116,12 +121,14 @@ class FinalEvaluation:
             return None
         self.report("evaluation, closed-loop runs")
         time, started = self.time, self.time.now()
+        whole = time.seconds if time.allowed else started - time.started
         if time.allowed:
-            end = time.started + (1.0 + VERDICT_OVER) * time.seconds
-            end = max(end, started + 0.5 * simulation_reserve(time.seconds))
+            end = time.started + (1.0 + VERDICT_OVER) * whole
+            end = max(end, started + 0.5 * simulation_reserve(whole))
         else:
-            end = started + SIMULATION_SHARE * (started - time.started)
-        return closed_loop(run, lambda: end - time.now(), self.config.drives)
+            end = started + SIMULATION_SHARE * whole
+        last = max(end, started + min(FIRST_DRIVES, FIRST_SHARE * whole))
+        return closed_loop(run, lambda: last - time.now(), self.config.drives, extra=last - end)
 
     def _out_of_time(self) -> bool:
         """True once the time for the evaluation on held-out states is over."""

@@ -20,16 +20,13 @@ import torch
 from torch import Tensor
 
 from stlc.controller.problem.task import satisfied
-from stlc.native import never
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from torch import Tensor
 
-    from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import PlanVerdicts, Task
-    from stlc.native import Stop
 
 BLOCK = 8192
 
@@ -224,32 +221,6 @@ def mission_steps(task: Task) -> int:
     if recurring is None:
         return named + task.horizon
     return named + ROUNDS * max(task.horizon, recurring)
-
-
-@torch.no_grad()
-def visited(task: Task, policy: Policy, n: int, seed: int, enough: Stop = never) -> Tensor:
-    """States visited by missions that are simulated with the policy, in random order, (n, dim) float64.
-
-    The simulation ends early once `enough` returns True. If fewer than `n` states were visited, initial
-    states are added.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    stride = max(task.horizon // 10, 1)
-    legs = mission_steps(task) // stride + 1
-    x = task.sample(max(64, 2 * n // legs), generator=generator, dtype=torch.float64)
-    seen = [x]
-    for _ in range(legs):
-        if enough():
-            break
-        _, judged = policy.plan_judged(x)
-        x = torch.stack([judged.columns[name][stride] for name in task.system.names], 1)
-        x = x[task.alive(x)]
-        seen.append(x)
-    states = torch.cat(seen)
-    while len(states) < n:
-        fresh = task.sample(n - len(states), generator=generator, dtype=torch.float64)
-        states = torch.cat((states, fresh))
-    return states[torch.randperm(len(states), generator=generator)[:n]]
 
 
 CAPACITY = 20_000

@@ -16,7 +16,9 @@ from stlc.controller.evaluation.closed_loop import (
     NEAR,
     SEED,
     ClosedLoop,
+    Driven,
     Share,
+    Violated,
     _Trial,
     closed_loop,
 )
@@ -128,7 +130,7 @@ def test_the_cheapest_guard_that_does_as_well_is_recommended(drawn: tuple[int, t
 def trial_of(run: Run, found: dict[str, dict[tuple[int, int], bool]]) -> _Trial:
     trial = _Trial(run, None, lambda: 0.0, DRIVES, SEED)
     for mode, drives in found.items():
-        trial.known[mode].found.update({start: (good, None) for start, good in drives.items()})  # type: ignore[index]
+        trial.known[mode].found.update({start: Driven(good) for start, good in drives.items()})  # type: ignore[index]
     return trial
 
 
@@ -167,14 +169,18 @@ def test_what_was_driven_from_few_common_starts_is_left_out(run: Run) -> None:
 
 
 def test_what_is_said_of_drives() -> None:
-    shares = (Share("none", 60, 40, 50), Share("paper", 60, 59, 60, gained=20, lost=1))
+    violated = Violated("b", 20, 30.25, 30.0), Violated("a", 3, None)
+    shares = (
+        Share("none", 60, 40, 50, violated=violated),
+        Share("paper", 60, 59, 60, gained=20, lost=1, violated=(Violated("a", 1, 2.0),)),
+    )
     result = {"closed_loop": ClosedLoop(shares, 10).summary()}
     assert driven_lines(result) == [
-        "59 of 60 drives satisfied (98.3 %, 95 % interval 91.1 to 99.7 %) with the paper's guard, "
-        "100.0 % safe",
-        "40 of 60 drives satisfied (66.7 %, 95 % interval 54.1 to 77.3 %) without a guard, 83.3 % safe",
-        "the paper's guard changes the verdicts of 21 of 60 drives: "
-        "20 satisfied only with it, 1 only without",
+        "59 of 60 drives obeyed with the paper's guard: `a` (2 s); "
+        "95 % interval 91.1 to 99.7 %, 100.0 % safe",
+        "40 of 60 drives obeyed without a guard: `b` (30.2 s), `a` (3 drives); "
+        "95 % interval 54.1 to 77.3 %, 83.3 % safe",
+        "the paper's guard changes the verdicts of 21 of 60 drives: 20 obey only with it, 1 only without",
         "recommended after these drives: the paper's guard (`stlc simulate --backup`)",
     ]
     assert recommended({"result": result}) == "paper"
@@ -193,8 +199,9 @@ def test_what_is_said_of_drives() -> None:
     ("guard", "words"), [("none", ""), ("paper", " --backup"), ("full", " --guard full")]
 )
 def test_the_next_command_has_the_guard_that_is_recommended(guard: str, words: str) -> None:
-    assert Commands.of("x", newest=True, guard=guard).simulate == f"stlc simulate{words}"
-    assert Commands.of("x", guard=guard).simulate == f"stlc simulate x{words}"
+    record = {"result": {"closed_loop": {"recommended": guard}}}
+    assert Commands.of("x", record, newest=True).simulate == f"stlc simulate{words}"
+    assert Commands.of("x", record).simulate == f"stlc simulate x{words}"
 
 
 def test_drives_have_a_share_of_the_budget() -> None:

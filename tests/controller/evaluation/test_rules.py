@@ -280,11 +280,12 @@ def text_of(home: Path, text: str):  # type: ignore[no-untyped-def]
 
 def test_without_rules_every_start_counts() -> None:
     def executed(held: np.ndarray, fails: np.ndarray, able: np.ndarray) -> Executed:
-        return Executed({"a": held}, {"a": fails}, (), np.ones((1, 2), dtype=bool), able)
+        decided = {"a": np.array([3.0, np.nan])}
+        return Executed({"a": held}, {"a": fails}, (), np.ones((1, 2), dtype=bool), able, decided=decided)
 
     held = np.array([[True, True], [True, False], [False, False]])
     drives = judge_runs_by_plans(executed(held, ~held, viable(2, 1)), 0.5)
-    assert [each.rules for each in drives.broken] == [{"a": 1.0}, {"a": 0.5}]
+    assert [each.rules for each in drives.broken] == [{"a": 1.5}, {"a": None}]
     assert drives.viable.tolist() == [True, False]
     for none in (held[:0], np.zeros((1, 2), dtype=bool)):  # no start, and no verdict
         drives = judge_runs_by_plans(executed(none, none, viable(2)), 0.5)
