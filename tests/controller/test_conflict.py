@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from stlc.controller.problem.task import Task
-from stlc.controller.training.diagnose import conflict, refuted
+from stlc.controller.training.conflict import conflict, refuted
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
@@ -56,3 +56,4 @@ def test_only_what_is_proved_is_said_to_have_no_plan(tmp_path: Path) -> None:
     said = conflict(task(tmp_path, "require never: eventually[0, T] (x > 6 m and x < 5 m)"))
     assert said.message == "no plan was found that satisfies `never`"
     assert "no proof" in said.note[0]
+    assert said.note[-1] == "the best plans from 64 starts violate `never` from 64"

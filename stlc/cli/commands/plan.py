@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stlc.cli.framework.documents import record
 from stlc.cli.framework.options import (
     MOST_SEED,
     FailUnderOption,
@@ -21,7 +22,7 @@ from stlc.cli.framework.options import (
     require_separate,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
-from stlc.cli.framework.plan_documents import Plans, PlanTubes
+from stlc.cli.framework.plan_documents import MissedRequirement, PlannerAdvice, Plans, PlanTubes
 from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
 from stlc.registry import PLANNERS
@@ -132,12 +133,13 @@ def plan(
         interrupted(result)
         if not len(result.rho):
             raise SystemExit(signals[0])
-    record = _record(task, result, choice, output)
+    with PULSE.doing("trying other planners"):
+        document = _record(task, result, choice, output, stopped=bool(signals))
     if model is not None:
-        record["tube"] = _bounded(model, result, tube, following(task, from_))
-    good = record["tube"]["guaranteed"] if model is not None else record["satisfied"]
-    missed = good / record["starts"] < (1.0 if fail_under is None else fail_under)
-    return Answer(record, lambda: emit("\n".join(_lines(record))), signals[0] if signals else int(missed))
+        document["tube"] = _bounded(model, result, tube, following(task, from_))
+    good = document["tube"]["guaranteed"] if model is not None else document["satisfied"]
+    short = good / document["starts"] < (1.0 if fail_under is None else fail_under)
+    return Answer(document, lambda: emit("\n".join(_lines(document))), signals[0] if signals else int(short))
 
 
 def _target(text: str) -> float:
@@ -151,8 +153,14 @@ def _target(text: str) -> float:
     return found
 
 
-def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path) -> Plans:
+def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path, *, stopped: bool) -> Plans:
+    """Record of the result. If the search was not `stopped`, other planners are tried where it failed."""
+    from stlc.controller.planning.missed import better_planner, missed
+
     rho, spent = result.rho, result.seconds
+    bad = ~result.satisfied & ~result.infeasible
+    states = result.states[bad]
+    better = None if stopped else better_planner(task, states, choice.name, float(spent[bad].sum()))
     return {
         "spec": task.compiled.name,
         "system": task.system.decl.name,
@@ -168,6 +176,8 @@ def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path)
         },
         "seconds": {"mean": float(spent.mean()), "median": float(spent.median()), "most": float(spent.max())},
         "evaluations": float(result.evaluations.double().mean()),
+        "missed": [record(MissedRequirement, each) for each in missed(task, states, result.plans[bad])],
+        "better": None if better is None else record(PlannerAdvice, better),
         "trace": str(output),
     }
 
@@ -202,12 +212,38 @@ def _bounded(model: TubeModel, result: PlanResult, scenario: str | None, start: 
 
 def _lines(plans: Plans) -> list[str]:
     """Lines of text that show the result of `stlc plan`."""
-    return [*_found_lines(plans), *_tube_lines(plans), f"trace {plans['trace']}"]
+    return [*_found_lines(plans), *_missed_lines(plans), *_tube_lines(plans), f"trace {plans['trace']}"]
+
+
+def _bound(value: float) -> str:
+    """Text of a bound on a robustness; in words if it is infinite."""
+    from stlc.view.words import number
+
+    return number(value) if math.isfinite(value) else "no bound"
+
+
+def _missed_lines(plans: Plans) -> list[str]:
+    """Lines that name the requirements that the best plans violate, and a planner that does better."""
+    from stlc.view.words import number
+    from stlc.view.words import seconds as duration
+
+    lines = []
+    for each in plans["missed"]:
+        most = float(each["robustness"])
+        by = "no plan can satisfy it any more" if most == -math.inf else f"by {number(-most)} or more"
+        many = f", in {each['starts']:,} of {plans['starts']:,} best plans" if plans["starts"] > 1 else ""
+        lines.append(f"  `{each['requirement']}` is violated{many}: {by}")
+    if better := plans["better"]:
+        found = (
+            f"{better['satisfied']:,} of {better['starts']:,} tried starts" if plans["starts"] > 1 else "it"
+        )
+        lines.append(f"  `--method {better['method']}` solves {found} in {duration(better['seconds'])}")
+    return lines
 
 
 def _tube_lines(plans: Plans) -> list[str]:
     """Lines with the bounds of `--tube`; none without it."""
-    from stlc.view.words import listing, number
+    from stlc.view.words import listing
 
     found = plans.get("tube")
     if found is None:
@@ -224,7 +260,7 @@ def _tube_lines(plans: Plans) -> list[str]:
         lines.append(f"  taken as exact, as conditions or limits read them: {exact}")
     width = max(map(len, found["requirements"]))
     for name, each in found["requirements"].items():
-        low, high = (number(float(each[end])) for end in ("low", "high"))
+        low, high = (_bound(float(each[end])) for end in ("low", "high"))
         count = f"   {each['guaranteed']:,} guaranteed" if many > 1 else ""
         lines.append(f"  {name:<{width}}  {low} to {high}{count}")
     return lines
@@ -237,7 +273,10 @@ def _found_lines(plans: Plans) -> list[str]:
     from stlc.view.words import share as percent
 
     count, good, spent = plans["starts"], plans["satisfied"], plans["seconds"]
-    least, middle, greatest = (number(float(value)) for value in plans["robustness"].values())  # type: ignore[arg-type]
+    least, middle, greatest = (
+        "none" if math.isinf(float(value)) else number(float(value))  # type: ignore[arg-type]
+        for value in plans["robustness"].values()
+    )
     judged = f"{plans['evaluations']:,.0f} plans judged"
     if count == 1:
         verdict = f"the plan {'satisfies' if good else 'violates'} it, robustness {least}"

@@ -43,6 +43,23 @@ class PlanTubes(TypedDict):
     requirements: dict[str, GuaranteedRobustness]
 
 
+class MissedRequirement(TypedDict):
+    """Requirement that best plans violate; see `stlc.controller.planning.missed.Missed`."""
+
+    requirement: str
+    starts: int
+    robustness: float | str
+
+
+class PlannerAdvice(TypedDict):
+    """Planner that does better; see `stlc.controller.planning.missed.BetterPlanner`."""
+
+    method: str
+    satisfied: int
+    starts: int
+    seconds: float
+
+
 class Plans(TypedDict):
     """Result of `stlc plan`."""
 
@@ -56,5 +73,7 @@ class Plans(TypedDict):
     robustness: PlanRobustness
     seconds: PlanSeconds
     evaluations: float
+    missed: list[MissedRequirement]
+    better: PlannerAdvice | None
     tube: NotRequired[PlanTubes]
     trace: str

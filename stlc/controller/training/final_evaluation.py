@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from stlc.controller.evaluation.closed_loop import ClosedLoop, closed_loop
 from stlc.controller.evaluation.held_out import Score, score, silent
 from stlc.controller.training.budget import simulation_reserve, verdict_reserve
-from stlc.controller.training.diagnose import conflict, refuted
+from stlc.controller.training.conflict import conflict, refuted
 from stlc.controller.training.run import Run
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from stlc.controller.problem.load import require_controls
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
 from stlc.controller.training.checkpoint import Checkpoint, load_checkpoint, never_saved, restoring
 from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
-from stlc.controller.training.diagnose import check_mirror, refuted
+from stlc.controller.training.conflict import refuted
+from stlc.controller.training.diagnose import check_mirror
 from stlc.controller.training.failures import SHARE
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.run import Run, RunWriter, load_config, spec_hash, system_hash, task_of_run

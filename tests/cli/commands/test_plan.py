@@ -104,3 +104,31 @@ def test_the_policy_of_another_specification(
     assert planned("--method", "policy") == 2
     assert "is a policy for ship_safe and ship_safe, not for traffic" in capsys.readouterr().err
     assert not Path("plan.npz").exists()
+
+
+def test_the_requirement_that_fails_is_named_and_no_bound_is_infinite(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("point.yaml").write_text(
+        "stlc: 1\nname: point\ntime: {dt: 1 s, horizon: 8 steps}\nstate: {x: {unit: m, range: [0, 10]}}\n"
+        "control: {v: {unit: m/s, range: [-1, 1]}}\nflow: {x: v}\n"
+        'init: {mixture: [{draw: {x: "uniform(4, 5)"}}]}\n'
+    )
+    rules = "require near: always[0, T] x < 20 m\nrequire far: eventually[0, T] x > 14 m\n"
+    Path("s.stl").write_text(f'spec s\nsystem "point.yaml"\nstate signal x [m]\n{rules}')
+    options = ["plan", "s.stl", "--evaluations", "50"]
+    assert main([*options, "--starts", "3"]) == 1
+    said = capsys.readouterr().out
+    assert "`far` is violated, in 3 of 3 best plans: by " in said
+    assert "`near`" not in said
+    assert main([*options, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)["result"]
+    assert [each["requirement"] for each in found["missed"]] == ["far"]
+    assert found["better"] is None
+    over = "require a: eventually@[0 s, 4 s] ((always[0 s, 2 s] x > 0.8 m) and x < 2 m)\n"
+    Path("s.stl").write_text(f'spec s\nsystem "point.yaml"\nstate signal x [m]\n{over}')
+    assert main([*options, "--from", "x=4 m, clock=5"]) == 1
+    said = capsys.readouterr().out
+    assert "`a` is violated: no plan can satisfy it any more" in said
+    assert "inf" not in said
