@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from stlc.controller.evaluation.deployment import Deployment
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.guard.margins import MarginRequest
+    from stlc.controller.policies.policy import Policy
     from stlc.controller.training.config import PlannerChoice
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.deployment import ScenarioDecl
@@ -126,7 +127,7 @@ def simulate(
             "--method",
             "-m",
             metavar="PLANNER",
-            help="A planner instead of a trained policy, for a specification: "
+            help="A planner, for a specification, or beside the policy of a run: "
             f"{', '.join(PLANNERS.installed)}, or FILE.py.",
         ),
     ] = None,
@@ -156,18 +157,18 @@ def simulate(
 ) -> Answer[SimulateResult]:
     """Deploy a trained policy in the world of its system.
 
-    RUN is by default the newest run. With --method, RUN is a specification, and a planner controls the system
-    without training. With --backup, the backup policy of Meng and Fan (2023) guards the policy. For
-    comparison, the same seeds are simulated without it, too. Trace, scene and figures are written to the
-    run's folder. A drive is the closed-loop run of one agent with one seed. Drives are judged by the
-    specification that the system file names (key `judge` of its section `test`). Means over seeds have 95 %
-    intervals (Student's t). Every system has the scenarios mismatch, disturb and noise. A number sets their
-    strength in percent, as in mismatch-20. --scenario disturbed runs all of them. With --plant, RUN is a
-    specification and FILE a plant file (docs/plants.md): a black box is simulated in processes of its own, at
-    --from or at a random point for each seed, and each trace is judged. The command measures: its exit code
-    is 0 whatever the drives satisfy, or with --fail-under 1 if fewer do; and 1 if a plant gives no trace.
-    The animation and the report take longer than short simulations: --no-pictures does without, and `stlc
-    report` draws them later.
+    RUN is by default the newest run. With --method, a planner controls the system: without training, if RUN
+    is a specification, else beside the policy of the run, in the same table. With --backup, the backup policy
+    of Meng and Fan (2023) guards the policy. For comparison, the same seeds are simulated without it, too.
+    Trace, scene and figures are written to the run's folder. A drive is the closed-loop run of one agent with
+    one seed. Drives are judged by the specification that the system file names (key `judge` of its section
+    `test`). Means over seeds have 95 % intervals (Student's t). Every system has the scenarios mismatch,
+    disturb and noise. A number sets their strength in percent, as in mismatch-20. --scenario disturbed runs
+    all of them. With --plant, RUN is a specification and FILE a plant file (docs/plants.md): a black box is
+    simulated in processes of its own, at --from or at a random point for each seed, and each trace is judged.
+    The command measures: its exit code is 0 whatever the drives satisfy, or with --fail-under 1 if fewer do;
+    and 1 if a plant gives no trace. The animation and the report take longer than short simulations:
+    --no-pictures does without, and `stlc report` draws them later.
     """
     require_separate([("--record", record), ("--robustness", margins)], (run, plant, system))
     if plant is not None:
@@ -192,7 +193,12 @@ def simulate(
     _require_writable(record, margins)
     require_claim(certify, fail_under)
     overrides = parse_overrides(set_)
-    run = _run_of(run, _planner(method, option, budget, system), system, overrides, runs)
+    planner = _planner(method, option, budget, system)
+    beside = planner is not None and Path(run).suffix != ".stl" and not Path(run).is_file()
+    if beside:
+        _refuse_given({"--system": system}, "is for a specification, and a run has its own")
+    if planner is not None and not beside:
+        run = _planner_run(run, planner, system, overrides, runs)
     opened = Run.open(run, root=runs, overrides=overrides)
     if GUARDS.get(chosen).intervenes:
         require_controls(opened.task, "a guard")
@@ -207,7 +213,8 @@ def simulate(
         limit = parse_limit(time_limit)
         setting = replace(setting, limit=limit, paper_limit=limit)
     requested = parse_margins(margin or ())
-    order = _Order(opened, chosen, setting, record, live, margins, overrides, requested, certify)
+    shown = planner if beside else None
+    order = _Order(opened, chosen, setting, record, live, margins, overrides, requested, certify, shown)
     several = _several(opened, scenario)
     document = _all(order, several) if several else _deployed(order, scenario)
     if not json:  # before the pictures, so that they do not affect the measurements
@@ -265,20 +272,14 @@ def _planner(
     return None
 
 
-def _run_of(
-    run: str, choice: PlannerChoice | None, system: str | None, overrides: Mapping[str, str], runs: Path
+def _planner_run(
+    spec: str, choice: PlannerChoice, system: str | None, overrides: Mapping[str, str], runs: Path
 ) -> str:
-    """Return the name of the run to simulate.
-
-    Without a planner (`choice` is None) it is `run` itself. With a planner, `run` is a specification; a
-    folder for it is created below `runs`, and its name is returned.
-    """
-    if choice is None:
-        return run
+    """Create the folder of a run whose policy is a planner, below `runs`, and return its path."""
     from stlc.controller.problem.load import load_task
     from stlc.controller.training.launch import Launch, open_planner
 
-    task = load_task(run, system, overrides)
+    task = load_task(spec, system, overrides)
     launch = Launch(root=runs, overrides=overrides, command=sys.argv[1:])
     return str(open_planner(task, choice, seed=0, launch=launch).path)
 
@@ -302,7 +303,7 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Options of a simulation, as parsed from the command line."""
+    """Options of a simulation, as parsed from the command line; `beside` is a planner beside the policy."""
 
     run: Run
     guard: str
@@ -313,6 +314,7 @@ class _Order:
     overrides: Mapping[str, str]
     requested: MarginRequest
     certify: float | None = None
+    beside: PlannerChoice | None = None
 
 
 def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simulation:
@@ -326,6 +328,7 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
     from stlc.controller.guard.kind import named_guard
+    from stlc.controller.methods.plan import planner_policy
     from stlc.controller.training.run import Run
 
     run, found = order.run, {}
@@ -339,12 +342,17 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
         guarded = mode == order.guard
         watching = Watching(title, order.live, order.margins if writes and guarded else None)
         try:
-            found[mode] = _deploy(run, order, mode, watching, rules)
+            found[mode] = _deploy(run, run.policy, order, mode, watching, rules)
         except RunError as error:
             if guarded:
                 raise
             show_diagnostics(error.diagnostics)  # only the comparison fails: the guarded run continues
-    return _save(run, order, found, rules)
+    planners = {}
+    if order.beside is not None:
+        policy, title = planner_policy(run.task, order.beside), f"planner {order.beside.name}"
+        watching = Watching(f"{run.task.compiled.name} · {title}", order.live, None)
+        planners[order.beside.name] = _deploy(run, policy, order, order.guard, watching, rules)
+    return _save(run, order, found, rules, planners)
 
 
 def _printed(*, json: bool, margins: str | None) -> Callable[[str], None]:
@@ -438,8 +446,10 @@ def _guard(backup: bool | None, guard: str | None) -> str:
     return guard
 
 
-def _deploy(run: Run, order: _Order, mode: str, watching: Watching, rules: Rules | None) -> Deployment:
-    """Simulate the policy of `run` with the guard `mode`, and return the results.
+def _deploy(
+    run: Run, policy: Policy, order: _Order, mode: str, watching: Watching, rules: Rules | None
+) -> Deployment:
+    """Simulate a policy in the world of `run` with the guard `mode`, and return the results.
 
     `order` contains the options of the simulation, and `watching` those of the progress display. The
     closed-loop runs are judged by `rules`. If the simulation fails or Ctrl-C ends it, the steps simulated
@@ -450,7 +460,7 @@ def _deploy(run: Run, order: _Order, mode: str, watching: Watching, rules: Rules
 
     try:
         with PULSE.doing(f"simulating, {mode}"), watching.of(run.task, order.setting) as watch:
-            return deploy(run.task, run.policy, order.setting, mode, watch=watch, rules=rules)
+            return deploy(run.task, policy, order.setting, mode, watch=watch, rules=rules)
     except InterruptedDeploymentError as error:
         if error.recording is not None:
             paths = save_trace_of(run, error.recording, order.setting, order.record, rules=rules)
@@ -458,10 +468,17 @@ def _deploy(run: Run, order: _Order, mode: str, watching: Watching, rules: Rules
         raise (error.__cause__ or error) from None
 
 
-def _save(run: Run, order: _Order, found: Mapping[str, Deployment], rules: Rules | None) -> Simulation:
+def _save(
+    run: Run,
+    order: _Order,
+    found: Mapping[str, Deployment],
+    rules: Rules | None,
+    planners: Mapping[str, Deployment],
+) -> Simulation:
     """Write the traces, the scene (data of the animation) and the record of a simulation; return the record.
 
     `found` maps each kind of guard to its results. The trace of the last kind is saved as the main trace.
+    `planners` maps a planner beside the policy to its results, of which no trace is saved.
     """
     from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded
@@ -490,7 +507,7 @@ def _save(run: Run, order: _Order, found: Mapping[str, Deployment], rules: Rules
         "trace": f"{run.dir.shown}/trace.npz",
         "overrides": dict(order.overrides),
     }
-    made: Any = as_json(found, order.setting, facts)
+    made: Any = as_json(found, order.setting, facts, planners)
     if order.certify is not None:
         for name, each in found.items():
             assurance = _assured(run, each, rules, order.certify)

@@ -537,12 +537,23 @@ class JudgedRuns(TypedDict):
     broken: list[BrokenRun]
 
 
+class SearchUseRecord(TypedDict):
+    """Use of the budget by searches; see `stlc.controller.planning.planner.SearchUse`."""
+
+    budget: Num
+    searches: int
+    median: Num
+    p99: Num
+    early: Num
+
+
 class GuardedRuns(TypedDict):
     metrics: dict[str, MetricValues]
     units: dict[str, str]
     decisions: dict[str, Num]
     unsafe: NotRequired[list[UnsafeStart]]
     latency: DecisionLatencyRecord
+    search: NotRequired[SearchUseRecord]
     drives: NotRequired[JudgedRuns]
     assurance: NotRequired[Assurance]
 
@@ -608,6 +619,7 @@ class Simulation(TypedDict):
     overrides: NotRequired[dict[str, str]]
     interval: str
     guards: dict[str, GuardedRuns]
+    planners: NotRequired[dict[str, GuardedRuns]]
     animation: NotRequired[str]
     report: NotRequired[str]
     errors: NotRequired[ModelErrors]

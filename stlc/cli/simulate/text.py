@@ -10,7 +10,7 @@ from stlc.escape import operand, shell, visible
 from stlc.view.words import listing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 Record: TypeAlias = "Mapping[str, Any]"
 
@@ -47,9 +47,11 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
         yield f"  the guard asks for a margin: {spared}"
     yield ""
     yield from _drives(document)
-    header = ("", *(named_guard(name).title for name in guards))
-    shares = _shares(guards, safe=bool(document.get("safety", True))) if windows else ()
-    yield table([*_counts(guards), *_progress(guards), *_times(guards), *shares], header=header)
+    planners = document.get("planners", {})
+    header = ("", *(named_guard(name).title for name in guards), *(f"planner {name}" for name in planners))
+    columns = {**guards, **planners}
+    shares = _shares(columns, safe=bool(document.get("safety", True))) if windows else ()
+    yield table([*_counts(columns), *_progress(columns), *_times(columns), *shares], header=header)
     for name, guard in guards.items():
         if named_guard(name).intervenes:
             yield f"  guard acted in {_acted(guard['decisions'])}"
@@ -219,10 +221,21 @@ def _progress(guards: Record) -> Iterator[tuple[str, ...]]:
 
 
 def _times(guards: Record) -> Iterator[tuple[str, ...]]:
+    """Table rows with the times of decisions, and of the searches of a planner, which have a budget."""
     from stlc.view.words import seconds
 
     for label, name in (("decision, median", "median"), ("decision, 99 %", "p99")):
         yield (label, *(seconds(guard["latency"][name]) for guard in guards.values()))
+    uses = [guard.get("search") for guard in guards.values()]
+    rows: dict[str, Callable[[Record], str]] = {
+        "search, budget": lambda use: seconds(use["budget"]),
+        "search, median": lambda use: seconds(use["median"]),
+        "search, 99 %": lambda use: seconds(use["p99"]),
+        "unused, median": lambda use: _part(max(0.0, 1.0 - use["median"] / use["budget"])),
+        "ended early": lambda use: _part(use["early"]),
+    }
+    for label, text in rows.items() if any(uses) else ():
+        yield (label, *("" if use is None else text(use) for use in uses))
 
 
 def _number(metric: Record, unit: str, digits: int) -> str:

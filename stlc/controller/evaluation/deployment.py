@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import Guard
+from stlc.controller.planning.planner import PlannerPolicy, SearchUse
 from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class Deployment:
         latency: time of one decision.
         unsafe: the agents with an unsafe trajectory.
         runs: verdicts on the closed-loop runs.
+        search: use of the budget by the searches of a policy that plans; None for any other policy.
     """
 
     guard: str
@@ -80,6 +82,7 @@ class Deployment:
     latency: DecisionLatency
     unsafe: tuple[Unsafe, ...]
     runs: RunVerdicts
+    search: SearchUse | None = None
 
 
 class InterruptedDeploymentError(Exception):
@@ -119,7 +122,11 @@ def deploy(
         simulate(guarded, make, setting, recorder, watch)
         recording = recorder.recording()
         assert recording is not None
-        return judged(guarded, recording, setting.ceiling, rules)
+        search = policy.take_use() if isinstance(policy, PlannerPolicy) else None
+        found = replace(judged(guarded, recording, setting.ceiling, rules), search=search)
+        if isinstance(policy, PlannerPolicy):
+            policy.take_use()  # searches of the measured latency are none of the simulation
+        return found
     except BaseException as error:
         raise InterruptedDeploymentError(recorder.recording()) from error
 
@@ -217,9 +224,19 @@ def latency(guard: Guard, recording: DeploymentRecording) -> DecisionLatency:
 
 
 def as_json(
-    deployments: Mapping[str, Deployment], setting: Setting, facts: Mapping[str, Any]
+    deployments: Mapping[str, Deployment],
+    setting: Setting,
+    facts: Mapping[str, Any],
+    planners: Mapping[str, Deployment] | None = None,
 ) -> dict[str, Any]:
-    """Content of `eval/simulate.json`; `facts`: further entries at its top level."""
+    """Content of `eval/simulate.json`.
+
+    Args:
+        deployments: name of a guard -> results.
+        setting: setting of the simulation.
+        facts: further entries at the top level.
+        planners: name of a planner that was simulated beside the policy -> results.
+    """
     return {
         **facts,
         "seeds": list(setting.seeds),
@@ -231,18 +248,22 @@ def as_json(
         "ceiling": setting.ceiling,
         "margin": dict(setting.margin),
         "interval": "95 %, Student's t over the deployment seeds",
-        "guards": {
-            name: {
-                "metrics": {key: metric.summary() for key, metric in found.metrics.items()},
-                "drives": runs_json(found.runs, setting.seeds, setting.agents),
-                "units": dict(found.recording.units),
-                "decisions": dict(found.decisions),
-                "unsafe": [
-                    {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.viable}
-                    for each in found.unsafe
-                ],
-                "latency": asdict(found.latency),
-            }
-            for name, found in deployments.items()
-        },
+        "guards": {name: _record(found, setting) for name, found in deployments.items()},
+        **({"planners": {k: _record(found, setting) for k, found in planners.items()}} if planners else {}),
+    }
+
+
+def _record(found: Deployment, setting: Setting) -> dict[str, Any]:
+    """The results of one guard or planner as a JSON object."""
+    return {
+        "metrics": {key: metric.summary() for key, metric in found.metrics.items()},
+        "drives": runs_json(found.runs, setting.seeds, setting.agents),
+        "units": dict(found.recording.units),
+        "decisions": dict(found.decisions),
+        "unsafe": [
+            {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.viable}
+            for each in found.unsafe
+        ],
+        "latency": asdict(found.latency),
+        **({} if found.search is None else {"search": asdict(found.search)}),
     }

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from stlc.controller.methods import Method
 from stlc.controller.planning.planner import PlanBudget, Planner, PlannerPolicy, planner_named
-from stlc.controller.training.config import ResolvedConfig, base_config
+from stlc.controller.training.config import PlannerChoice, ResolvedConfig, base_config
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.registry import PLANNERS
 
@@ -70,9 +70,14 @@ class PlanMethod(Method):
         except (ValueError, AttributeError, RecursionError) as error:
             message = f"the options of the planner of `{run.shown}` are damaged"
             raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
-        planner = planner_of(config.planner, given)
-        budget = PlanBudget(config.seconds, config.evaluations or None)
-        return PlannerPolicy(task, planner, budget, seed=config.seed)
+        choice = PlannerChoice(config.planner, given, config.seconds, config.evaluations or None)
+        return planner_policy(task, choice, seed=config.seed)
+
+
+def planner_policy(task: Task, choice: PlannerChoice, *, seed: int = 0) -> PlannerPolicy:
+    """Return the planner `choice` as a policy for `task`. Raises UsageError (U101), see `planner_of`."""
+    budget = PlanBudget(choice.seconds, choice.evaluations)
+    return PlannerPolicy(task, planner_of(choice.name, choice.options), budget, seed=seed)
 
 
 def planner_of(name: str, options: Mapping[str, str]) -> Planner:

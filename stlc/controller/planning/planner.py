@@ -361,6 +361,25 @@ def plan(
     return search.result
 
 
+@dataclass(frozen=True, slots=True)
+class SearchUse:
+    """Use of the budget by the searches of a policy that plans, one search for each decision.
+
+    Attributes:
+        budget: allowed processor time of a search, in seconds.
+        searches: number of searches.
+        median: median of the processor time, in seconds.
+        p99: 99 % quantile of the processor time, in seconds.
+        early: share of the searches that ended before the budget was spent, as the plan was good enough.
+    """
+
+    budget: float
+    searches: int
+    median: float
+    p99: float
+    early: float
+
+
 class PlannerPolicy(Policy):
     """Policy that lets a planner search for a plan from each state, within the planner's budget."""
 
@@ -369,12 +388,27 @@ class PlannerPolicy(Policy):
         self._planner, self._budget, self._seed = planner, budget, seed
         self._prepared = task, prepared(planner, task)
         self._short: tuple[Task, Solver] | None = None
+        self._spent: list[Tensor] = []
+        self._reached: list[Tensor] = []
+
+    def take_use(self) -> SearchUse | None:
+        """Use of the budget since the last call, by the policy and its copies; None without a search."""
+        if not self._spent:
+            return None
+        spent, reached = torch.cat(self._spent), torch.cat(self._reached)
+        self._spent.clear()
+        self._reached.clear()
+        middle, most = spent.quantile(torch.tensor([0.5, 0.99], dtype=spent.dtype)).tolist()
+        return SearchUse(self._budget.seconds, len(spent), middle, most, float(reached.double().mean()))
 
     def candidates(self, x0: Tensor) -> Tensor:
         """The best plan found from each state: (B, n) -> (B, 1, T, m)."""
         if self._prepared[0] is not self.task:
             self._prepared = self.task, prepared(self._planner, self.task)
-        return self._searched(x0, self._prepared[1], self._budget)
+        search = self._searched(x0, self._prepared[1], self._budget)
+        self._spent.append(search.seconds)
+        self._reached.append(search.rho >= self._budget.target - TOLERANCE)
+        return search.plans.to(x0.dtype)[:, None]
 
     def continuation(self, x0: Tensor) -> Tensor:
         """Plans found by a short local search from each state: (B, n) -> (B, T, m).
@@ -383,10 +417,10 @@ class PlannerPolicy(Policy):
         """
         if self._short is None or self._short[0] is not self.task:
             self._short = self.task, prepared(planner_named("search", tries=SHORT), self.task)
-        return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT))[:, 0]
+        return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT)).plans.to(x0.dtype)
 
-    def _searched(self, x0: Tensor, solver: Solver, budget: PlanBudget) -> Tensor:
+    def _searched(self, x0: Tensor, solver: Solver, budget: PlanBudget) -> PlanSearch:
         search = PlanSearch(self.task, x0, budget, seed=self._seed)
         with torch.enable_grad():
             solver(search)
-        return search.plans.to(x0.dtype)[:, None]
+        return search

@@ -458,3 +458,42 @@ def test_a_guard_of_two_files_is_known_everywhere(there: RunDir, tmp_path: Path)
     assert "did you mean `braking`?" in done.stderr
     assert "exported controllers do not contain the guard `braking`" in told["export"]
     assert told["table"].strip() == "table braking with margin"
+
+
+def test_a_planner_stands_beside_the_policy_and_says_what_it_left_of_its_budget(
+    there: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    beside = ["simulate", "latest", "--method", "search", "--budget", "5ms", "--guard", "paper", *SMALL]
+    assert main(beside) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (header,) = (line for line in lines if "no guard" in line and "paper's guard" in line)
+    assert header.rstrip().endswith("planner search")
+    for label in ("satisfied", "decision, median"):
+        (row,) = (line for line in lines if line.startswith(f"  {label} "))
+        assert len(re.split(r" {2,}", row.strip())) == 4
+    (row,) = (line for line in lines if line.startswith("  search, budget"))
+    assert row.split() == ["search,", "budget", "5", "ms"]
+    assert any(line.startswith("  ended early") for line in lines)
+    assert main([*beside, "--json"]) == 0
+    whole = json.loads(capsys.readouterr().out)
+    assert misfits(whole, load_schema("simulate/1")) == []
+    document = whole["result"]
+    assert set(document["guards"]) == {"none", "paper"}
+    use = document["planners"]["search"]["search"]
+    assert (use["budget"], use["searches"]) == (0.005, 2 * 4 * 6)
+    assert "search" not in document["guards"]["none"]
+    assert main([*beside, "--system", "car.yaml"]) == 2
+
+
+def test_a_planner_alone_is_guarded_and_certified(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = str(ROOT / "specs/traffic.stl")
+    alone = ["--method", "search", "--budget", "2ms", "--guard", "paper", "--certify", "0.5", *SMALL]
+    assert main(["simulate", spec, "--system", str(Path.cwd() / "car.yaml"), *alone]) in (0, 1, 4)
+    captured = capsys.readouterr()
+    assert "drives" in captured.out
+    run = RunDir.newest()
+    assert run.path != there.path
+    found = run.read_json("eval/simulate.json")["guards"]
+    assert {"search", "assurance"} <= set(found["paper"]) & set(found["none"])
+    few = ["--share", "0.1", "--max-drives", "4", "--agents", "2", "--steps", "6", "--guard", "paper"]
+    assert main(["certify", run.shown, *few]) in (0, 1, 4)

@@ -170,6 +170,25 @@ def test_a_planner_is_a_policy(car_task: Task) -> None:
     assert policy.continuation(x0.repeat(50, 1)).shape == (300, car_task.system.horizon, 1)
 
 
+def test_a_planner_says_what_it_left_of_its_budget(car_task: Task) -> None:
+    x0 = car_task.sample(6, seed=4)
+    easy = PlannerPolicy(car_task, planner_named("search"), PlanBudget(5.0, target=-1e6))
+    assert easy.take_use() is None
+    easy.for_task(car_task).plan(x0)
+    easy.continuation(x0)  # no decision
+    use = easy.take_use()
+    assert use is not None
+    assert (use.budget, use.searches, use.early) == (5.0, 6, 1.0)
+    assert 0.0 < use.median <= use.p99 < 5.0
+    assert easy.take_use() is None, "each search counts once"
+    hard = PlannerPolicy(car_task, planner_named("search"), PlanBudget(0.01, target=1e6))
+    hard.plan(x0)
+    use = hard.take_use()
+    assert use is not None
+    assert (use.searches, use.early) == (6, 0.0)
+    assert use.median >= 0.01
+
+
 def test_progress_is_reported(car_task: Task) -> None:
     seen: list[int] = []
     x0 = car_task.sample(3, seed=0)
