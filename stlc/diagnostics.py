@@ -227,6 +227,7 @@ CODES: dict[str, str] = {
     "W313": "a comparison that a declared range decides",
     "W314": "a bare number beside a unit for which another is common",
     "W315": "a requirement in a comment",
+    "W316": "a requirement that is due later than plans reach",
     "W319": "a comment for stlc that it does not understand",
     "E305": "an interval without a sample",
     "W305": "a recording that was read in part",

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from stlc.compile.analysis.deadlines import beyond_plans
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir import typed
@@ -159,7 +160,8 @@ def lint(
     try:
         resolved = resolve(spec, interface=None if within is None else within.interface, sink=warnings)
         if within is not None:
-            warnings = list(compile_resolved(resolved, within.grid, within.purpose).warnings)
+            compiled = compile_resolved(resolved, within.grid, within.purpose)
+            warnings = [*compiled.warnings, *(beyond_plans(compiled) if plans else ())]
     except SpecError as error:
         warnings += error.diagnostics
     found = not_allowed(finding for finding in warnings if selection.wants(finding.code))

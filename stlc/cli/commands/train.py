@@ -258,8 +258,10 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
 
     `overrides` gives new values of constants and of fields of the system file.
     """
+    from stlc.compile.analysis.deadlines import beyond_plans
     from stlc.controller.problem.load import load_task, require_controls
     from stlc.dynamics.model.feedback import unstable
+    from stlc.grammar.allow import not_allowed
 
     if not specs:
         example = "stlc train specs/traffic.stl --system car.yaml"
@@ -272,7 +274,8 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
         found=lambda path: say(f"system {path}"),
     )
     require_controls(task)
-    show_diagnostics([*task.compiled.warnings, *unstable(task.plain.decl)])
+    late = not_allowed(beyond_plans(task.compiled))
+    show_diagnostics([*task.compiled.warnings, *late, *unstable(task.plain.decl)])
     return task
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
 from stlc.compile.ir.traverse import nodes
+from stlc.diagnostics import Diagnostic
+from stlc.units import time_text
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import Compiled
@@ -46,6 +48,28 @@ def unreached(compiled: Compiled) -> tuple[Unreached, ...]:
         if late is not None:
             found.append(late)
     return tuple(found)
+
+
+def beyond_plans(compiled: Compiled) -> Iterator[Diagnostic]:
+    """Yield W316 for requirements that are due later than a plan reaches, and that nothing bridges.
+
+    A mission with an end is bridged: its plans may reach to the end. A mission without an end, and what is
+    due again and again, is planned for window by window.
+    """
+    ends = compiled.mission is not None and compiled.recurring is None
+    reach = time_text((compiled.grid.dt or 0) * (compiled.grid.horizon or 0))
+    for late in unreached(compiled):
+        if ends and not late.recurs:
+            continue
+        due = time_text(late.seconds)
+        when = f"within {due}, again and again" if late.recurs else f"at {due}"
+        yield Diagnostic(
+            "W316",
+            f"`{late.requirement}` is due {when}, and plans end after {reach}",
+            late.span,
+            label="no plan from the start sees this",
+            help=(f"a horizon of {due} or more, `--set time.horizon=…`, or an earlier deadline",),
+        )
 
 
 def _late(rule: typed.Requirement, grid: Grid) -> Iterator[Unreached]:

@@ -72,10 +72,8 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
     better = None if enough() else better_planner(task, first.states, "search", PLANNING)
     if better is None:
         return said
-    found = (
-        f"`stlc plan --method {better.method}` finds plans, and `stlc simulate` takes it as controller too"
-    )
-    return replace(said, help=(found, *said.help))
+    text = f"`--method {better.method}` finds plans: in `stlc plan`, and as controller in `stlc simulate`"
+    return replace(said, help=(text, *said.help))
 
 
 def refuted(task: Task) -> bool:
