@@ -44,7 +44,9 @@ def unreached(compiled: Compiled) -> tuple[Unreached, ...]:
     """
     found = []
     for rule in compiled.requirements:
-        late = max(_late(rule.typed, compiled.grid), key=lambda each: each.seconds, default=None)
+        late = max(
+            _late(rule.typed, compiled.grid), key=lambda each: (each.seconds, each.recurs), default=None
+        )
         if late is not None:
             found.append(late)
     return tuple(found)
@@ -53,23 +55,36 @@ def unreached(compiled: Compiled) -> tuple[Unreached, ...]:
 def beyond_plans(compiled: Compiled) -> Iterator[Diagnostic]:
     """Yield W316 for requirements that are due later than a plan reaches, and that nothing bridges.
 
-    A mission with an end is bridged: its plans may reach to the end. A mission without an end, and what is
-    due again and again, is planned for window by window.
+    What is due once is bridged: plans may reach to the end of a mission, and a guidance cost drives them
+    towards later goals. So is `always@[a, end] once[0, c] p`. Anything else that is due again and again is
+    planned for window by window.
     """
-    ends = compiled.mission is not None and compiled.recurring is None
+    guided = {node.span for rule in compiled.requirements for node in _guided(rule.typed.formula)}
     reach = time_text((compiled.grid.dt or 0) * (compiled.grid.horizon or 0))
     for late in unreached(compiled):
-        if ends and not late.recurs:
-            continue
-        due = time_text(late.seconds)
-        when = f"within {due}, again and again" if late.recurs else f"at {due}"
-        yield Diagnostic(
-            "W316",
-            f"`{late.requirement}` is due {when}, and plans end after {reach}",
-            late.span,
-            label="no plan from the start sees this",
-            help=(f"a horizon of {due} or more, `--set time.horizon=…`, or an earlier deadline",),
-        )
+        if late.recurs and late.span not in guided:
+            due = time_text(late.seconds)
+            yield Diagnostic(
+                "W316",
+                f"`{late.requirement}` is due within {due}, again and again, and plans end after {reach}",
+                late.span,
+                label="no plan sees this from where it begins",
+                help=(f"a horizon of {due} or more, `--set time.horizon=…`, or an earlier deadline",),
+            )
+
+
+def _guided(formula: typed.Formula) -> Iterator[typed.Formula]:
+    """Yield the operators `once[0, c]` towards which the compiler guides plans again and again.
+
+    They stand in `always@[a, end] once[0, c] p`, or in a conjunction in the place of `once`.
+    """
+    match formula:
+        case typed.Logic(_, "and", items):
+            for item in items:
+                yield from _guided(item)
+        case typed.Temporal(_, "always", interval, body) if interval.clock == "start" and interval.hi is None:
+            parts = body.items if isinstance(body, typed.Logic) and body.op == "and" else (body,)
+            yield from (part for part in parts if isinstance(part, typed.Temporal) and part.op == "once")
 
 
 def _late(rule: typed.Requirement, grid: Grid) -> Iterator[Unreached]:
