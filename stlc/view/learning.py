@@ -355,7 +355,7 @@ def _told(drives: Mapping[str, Any], found: Mapping[str, Any], commands: Command
         case "reach" if reach and whole and whole > reach:
             late = f"{name} is due at {duration(due)}" if due else f"{name} asks for more"
             command = f"{commands.search} --set time.horizon={whole:g}s"
-            text = f"plans end after {duration(reach)}, {late}: `--set time.horizon={whole:g}s` plans further"
+            text = f"plans end after {duration(reach)}, {late}: `{command}` plans to the end of the drive"
         case "event":
             command = f"{commands.afresh} --falsify"
             text = f"states after such events are trained on by `{command}`"
@@ -372,7 +372,7 @@ def _told(drives: Mapping[str, Any], found: Mapping[str, Any], commands: Command
 _CAUSES: Mapping[str, str] = {
     "start": "no satisfying plan is known from the start",
     "event": "a satisfying plan was followed until the world did what no plan foresees",
-    "reach": "a satisfying plan was followed until its continuation failed, as nothing unforeseen happened",
+    "reach": "a satisfying plan was followed until none was known, although nothing unforeseen happened",
     "precision": "the best known plans miss by little",
     "policy": "a satisfying plan is known that the policy did not propose",
     "rules": "the plans satisfied their specification to the end, and the rules of the drives ask for more",
