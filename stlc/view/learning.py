@@ -352,17 +352,17 @@ def _told(drives: Mapping[str, Any], found: Mapping[str, Any], commands: Command
     reach, whole = found.get("plan_seconds"), found.get("seconds")
     command = ""
     match cause:
-        case "reach" if reach and whole and whole > reach:
+        case "later" if reach and whole and whole > reach:
             late = f"{name} is due at {duration(due)}" if due else f"{name} asks for more"
             command = f"{commands.search} --set time.horizon={whole:g}s"
             text = f"plans end after {duration(reach)}, {late}: `{command}` plans to the end of the drive"
-        case "event":
+        case "told":
             command = f"{commands.afresh} --falsify"
             text = f"states after such events are trained on by `{command}`"
         case "rules":
             command = commands.report
             text = f"the specification of the plans should ask for {name} too"
-        case "precision" | "start" | "reach":
+        case "near" | "start" | "later":
             command = commands.search
             text = f"ask for less of {name}, allow more time or control, or search for longer: `{command}`"
     of = f"{causes[cause]:,} of {sum(causes.values()):,} failed drives that were examined"
@@ -371,10 +371,10 @@ def _told(drives: Mapping[str, Any], found: Mapping[str, Any], commands: Command
 
 _CAUSES: Mapping[str, str] = {
     "start": "no satisfying plan is known from the start",
-    "event": "a satisfying plan was followed until the world did what no plan foresees",
-    "reach": "a satisfying plan was followed until none was known, although nothing unforeseen happened",
-    "precision": "the best known plans miss by little",
-    "policy": "a satisfying plan is known that the policy did not propose",
+    "told": "a satisfying plan was followed until the world did what no plan foresees",
+    "later": "a satisfying plan was followed until none was known, although nothing unforeseen happened",
+    "near": "the best known plans miss by little",
+    "missed": "a satisfying plan is known that the policy did not propose",
     "rules": "the plans satisfied their specification to the end, and the rules of the drives ask for more",
 }
 """Cause of a failed drive (see `stlc.controller.evaluation.causes.Cause`) -> the same in words."""

@@ -49,7 +49,7 @@ def rows(accuracy: float, feasible: float, growth: float, count: int = 20) -> li
 
 
 def test_what_hardly_obeys_is_undertrained_and_training_goes_on_while_the_curve_rises() -> None:
-    found = result(0.027, 0.93) | driven(0, {"policy": 5, "start": 1})
+    found = result(0.027, 0.93) | driven(0, {"missed": 5, "start": 1})
     learning = learning_of(found, rows(0.027, 0.93, 2.0), COMMANDS, WHERE)
     assert learning.level == "undertrained"
     assert learning.share == pytest.approx(0.029, abs=1e-3)
@@ -86,18 +86,18 @@ def test_only_drives_make_a_policy_trained() -> None:
 @pytest.mark.parametrize(
     ("cause", "due", "text", "command"),
     [
-        ("reach", 30.0, "plans end after 10 s, `stop_sign` is due at 30 s", "search --set time.horizon=35s"),
-        ("reach", None, "plans end after 10 s, `stop_sign` asks for more", "search --set time.horizon=35s"),
-        ("event", None, "the world did what no plan foresees", "stlc train s.stl --falsify"),
+        ("later", 30.0, "plans end after 10 s, `stop_sign` is due at 30 s", "search --set time.horizon=35s"),
+        ("later", None, "plans end after 10 s, `stop_sign` asks for more", "search --set time.horizon=35s"),
+        ("told", None, "the world did what no plan foresees", "stlc train s.stl --falsify"),
         ("start", None, "no satisfying plan is known from the start; ask for less of `stop_sign`", "search"),
-        ("precision", None, "the best known plans miss by little", "stlc simulate s.stl --method search"),
+        ("near", None, "the best known plans miss by little", "stlc simulate s.stl --method search"),
         ("rules", None, "should ask for `stop_sign` too", "stlc report 7"),
     ],
 )
 def test_the_advice_follows_from_the_cause_that_was_measured(
     cause: str, due: float | None, text: str, command: str
 ) -> None:
-    learning = learning_of(result(1.0, 1.0) | driven(2, {cause: 4, "policy": 1}, due), [], COMMANDS)
+    learning = learning_of(result(1.0, 1.0) | driven(2, {cause: 4, "missed": 1}, due), [], COMMANDS)
     assert learning.level == "undertrained"
     assert learning.advice[0].startswith("in 4 of 5 failed drives that were examined, ")
     assert text in learning.advice[0]

@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
     from stlc.native import Stop
 
-Cause: TypeAlias = Literal["start", "event", "reach", "precision", "policy", "rules"]
-"""Cause of a failed drive.
+Cause: TypeAlias = Literal["start", "told", "later", "missed", "near", "rules"]
+"""Cause of a failed drive; the first four are those of `stlc.controller.evaluation.rules.Lost`.
 
 - `start`: no satisfying plan is known from the start of the mission.
-- `event`: a satisfying plan was followed, until the world did what its model does not foresee.
-- `reach`: a satisfying plan was followed, until one step later none was known, although the world did what
+- `told`: a satisfying plan was followed, until the world did what its model does not foresee.
+- `later`: a satisfying plan was followed, until one step later none was known, although the world did what
   the model foresees: plans end too early to see what comes.
-- `precision`: the best known plans miss the specification by little (`NEAR`).
-- `policy`: a satisfying plan is known, and none was followed.
+- `missed`: a satisfying plan is known, and none was followed.
+- `near`: the best known plans miss the specification by little (`NEAR`).
 - `rules`: plans that satisfied their specification were followed to the end; the rules of the drives ask for
   more.
 """
@@ -110,11 +110,11 @@ def _causes(
         if start > last and foreseen[row, : last + 1].all():
             found[row] = "rules"
         elif start and not foreseen[row, start - 1]:
-            found[row] = "event"
+            found[row] = "told"
         elif best >= -TOLERANCE:
-            found[row] = "policy"
+            found[row] = "missed"
         elif max(best, own) > -little:
-            found[row] = "precision"
+            found[row] = "near"
         else:
-            found[row] = "reach" if start else "start"
+            found[row] = "later" if start else "start"
     return found
