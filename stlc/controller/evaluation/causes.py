@@ -58,7 +58,7 @@ def causes(
         enough: condition that ends the searches early.
 
     Returns:
-        Row of a drive -> cause.
+        Row of a drive -> cause; drives for which the search was ended too early are left out.
     """
     safety = {rule.name for rule in task.compiled.safety}
     foreseen = model_consistent(task, recording)
@@ -106,6 +106,8 @@ def _causes(
     rho = solve(asked, states, passes=PASSES, tries=TRIES, stop=enough).rho.tolist()
     found: dict[int, Cause] = {}
     for row, start, last, best in zip(rows, since, lasts, rho, strict=True):
+        if enough() and not np.isfinite(best):  # not searched for
+            continue
         own = float(recording.policy_rho[row, start : last + 1].max(initial=-np.inf))
         if start > last and foreseen[row, : last + 1].all():
             found[row] = "rules"

@@ -362,6 +362,7 @@ class _Trial:
             known.agents = max(1, known.agents // FEWER)
             return
         runs = self._judged(recording)
+        known.cost = (whole - self.left()) / count
         safe, broken = runs.safe, {each.row: each for each in runs.broken}
         told = [each for each in runs.broken if any(time is not None for time in each.rules.values())]
         room = max(0, EXPLAINED - sum(drive.cause is not None for drive in known.found.values()))
@@ -374,7 +375,6 @@ class _Trial:
                 broken[row].rules if row in broken else {},
                 why.get(row),
             )
-        known.cost = (whole - self.left()) / count
         known.seeds += count
 
     def _simulated(self, mode: str, seeds: Sequence[int], agents: int, share: float) -> DeploymentRecording:

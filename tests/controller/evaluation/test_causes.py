@@ -77,3 +77,8 @@ def test_rules_that_ask_for_more_than_the_plans_are_the_cause(tmp_path: Path) ->
     task, recording, runs = driven(tmp_path, "require here: always[0, T] x < 3 m", "calm")
     assert runs.broken == ()
     assert causes(task, recording, [Broken(1, {"more": 2.0})], never) == {1: "rules"}
+
+
+def test_a_search_that_is_ended_too_early_names_no_cause(tmp_path: Path) -> None:
+    task, recording, runs = driven(tmp_path, "require there: eventually@[0 s, 2 s] x > 1 m", "calm")
+    assert causes(task, recording, runs.broken, lambda: True) == {}
