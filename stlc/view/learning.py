@@ -276,7 +276,7 @@ def learning_of(
     accuracy, feasible = float(result["accuracy"]), float(result["feasible"])
     if feasible <= 0.0:
         return _without_plan(commands, proved=bool(result.get("proved")))
-    part, drives = min(accuracy / feasible, 1.0), _best_drives(result)
+    part, drives = min(accuracy / feasible, 1.0), best_drives(result)
     searched, held_out = int(result.get("searched") or 0), int(result.get("held_out") or 0)
     sampled = 0 < searched < held_out
     estimate = f", by an estimate from {searched:,} of the {held_out:,} starts" if sampled else ""
@@ -321,7 +321,7 @@ def _without_plan(commands: Commands, *, proved: bool) -> Learning:
     return Learning(level, None, sentence, (advice,), commands.report)
 
 
-def _best_drives(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def best_drives(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Results of the drives under the recommended guard, or the guard that does best; None without drives."""
     found = result.get("closed_loop")
     guards = found.get("guards") if isinstance(found, Mapping) else None

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 from stlc.cli.framework.documents import TrainedJob, TrainedRuns
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.escape import operand
+from stlc.view.learning import best_drives
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.jobs import Job, JobResult
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
 
-HEADER = ("seed", "accuracy", "95 % interval", "known feasible", "share", "worst requirement", "time", "run")
+HEADER = ("seed", "drives", "accuracy", "95 % interval", "known feasible", "worst requirement", "time", "run")
 ENDED = 70
 """Exit code of a process killed by a signal."""
 
@@ -180,14 +181,16 @@ def _cells(record: TrainedJob) -> tuple[str, ...]:
     shares, feasible = record["requirements"], record["feasible"]
     worst = min(shares, key=shares.__getitem__)
     return (
-        *(seed, f"{record['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]", f"{feasible:.4f}"),
-        *(_share(record["accuracy"], feasible), f"{worst} {shares[worst]:.4f}"),
+        *(seed, _drives(record), f"{record['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]"),
+        *(f"{feasible:.4f}", f"{worst} {shares[worst]:.4f}"),
         *(f"{record['seconds']:.0f} s", record["run"]),
     )
 
 
-def _share(accuracy: float, feasible: float) -> str:
-    return f"{100 * accuracy / feasible:.1f} %" if feasible else ""
+def _drives(record: TrainedJob) -> str:
+    """The drives that obey under the recommended guard, or under that with which most do."""
+    best = best_drives(record)
+    return "" if best is None else f"{best['satisfied']:,} of {best['drives']:,}, {best['guard']}"
 
 
 def _mean(records: Sequence[TrainedJob]) -> list[tuple[str, ...]]:
@@ -198,4 +201,4 @@ def _mean(records: Sequence[TrainedJob]) -> list[tuple[str, ...]]:
     accuracies = [record["accuracy"] for record in finished]
     spread = f"{min(accuracies):.4f} to {max(accuracies):.4f}"
     accuracy, feasible = fmean(accuracies), fmean(record["feasible"] for record in finished)
-    return [("mean", f"{accuracy:.4f}", spread, f"{feasible:.4f}", _share(accuracy, feasible))]
+    return [("mean", "", f"{accuracy:.4f}", spread, f"{feasible:.4f}")]

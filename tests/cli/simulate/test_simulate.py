@@ -460,8 +460,9 @@ def test_a_guard_of_two_files_is_known_everywhere(there: RunDir, tmp_path: Path)
     assert told["table"].strip() == "table braking with margin"
 
 
+@pytest.mark.usefixtures("there")
 def test_a_planner_stands_beside_the_policy_and_says_what_it_left_of_its_budget(
-    there: RunDir, capsys: pytest.CaptureFixture[str]
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     beside = ["simulate", "latest", "--method", "search", "--budget", "5ms", "--guard", "paper", *SMALL]
     assert main(beside) == 0

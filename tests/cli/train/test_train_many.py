@@ -29,6 +29,13 @@ def returned(job: Job, seed: int, code: int) -> JobResult:
         "held_out": 100,
         "requirements": {"stop": 0.96, "go": 0.99},
         "feasible": 0.97,
+        "closed_loop": {
+            "recommended": "full",
+            "guards": [
+                {"guard": "none", "drives": 20, "satisfied": 20, "share": 1.0},
+                {"guard": "full", "drives": 20, "satisfied": 17 + seed, "share": 0.85 + 0.05 * seed},
+            ],
+        },
     }
     return JobResult(job, 0, {"result": result}, "", 1)
 
@@ -74,8 +81,9 @@ def test_the_table_has_a_line_for_each_and_the_mean_of_those_that_ended_well(
     assert main(["train", SPEC, "--seeds", "0..2", "--jobs", "3", "--steps", "2"]) == code
     told = capsys.readouterr()
     header, *lines = told.out.splitlines()
-    assert header.split()[:2] == ["seed", "accuracy"]
-    assert lines[0].split()[:5] == ["0", "0.9500", "[0.9400,", "0.9800]", "0.9700"]
+    assert header.split()[:3] == ["seed", "drives", "accuracy"]
+    drives = ["0", "17", "of", "20,", "full"]
+    assert lines[0].split()[:9] == [*drives, "0.9500", "[0.9400,", "0.9800]", "0.9700"]
     assert lines[1].split() == ["1", "exit", "code", str(ended)]
     assert lines[3].split()[:5] == ["mean", "0.9600", "0.9500", "to", "0.9700"]
     assert f"seed 1 broke off with exit code {ended}\nerror[R401]: training diverged" in told.err
