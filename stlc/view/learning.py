@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
@@ -343,41 +343,47 @@ def _told(drives: Mapping[str, Any], found: Mapping[str, Any], commands: Command
         found: results of all drives.
         commands: commands that may be recommended.
     """
-    causes = {name: count for name, count in (drives.get("causes") or {}).items() if name in _CAUSES}
-    if not causes:
+    causes: Mapping[str, int] = drives.get("causes") or {}
+    cause = max(causes, key=causes.__getitem__, default="")
+    if cause not in _CAUSES:
         return "", ""
-    cause, text = max(causes, key=causes.__getitem__), ""
-    violated = drives.get("violated") or [{"requirement": "it", "due": None}]
-    name, due = f"`{violated[0]['requirement']}`", violated[0].get("due")
-    reach, whole = found.get("plan_seconds"), found.get("seconds")
-    command = ""
-    match cause:
-        case "later" if reach and whole and whole > reach:
-            late = f"{name} is due at {duration(due)}" if due else f"{name} asks for more"
-            command = f"{commands.search} --set time.horizon={whole:g}s"
-            text = f"plans end after {duration(reach)}, {late}: `{command}` plans to the end of the drive"
-        case "told":
-            command = f"{commands.afresh} --falsify"
-            text = f"states after such events are trained on by `{command}`"
-        case "rules":
-            command = commands.report
-            text = f"the specification of the plans should ask for {name} too"
-        case "near" | "start" | "later":
-            command = commands.search
-            text = f"ask for less of {name}, allow more time or control, or search for longer: `{command}`"
+    said, remedy, command = _CAUSES[cause]
+    if cause == "later" and (found.get("plan_seconds") or 0.0) >= (found.get("seconds") or 0.0):
+        remedy, command = _ASK, "{search}"  # plans reach to the end already
+    first = (drives.get("violated") or [{"requirement": "it"}])[0]
+    due = f"is due at {duration(first['due'])}" if first.get("due") else "asks for more"
+    facts = {"name": f"`{first['requirement']}`", "due": due, "whole": f"{found.get('seconds') or 0:g}s"}
+    command = command.format(**asdict(commands), **facts)
+    remedy = remedy.format(command=command, reach=duration(found.get("plan_seconds")), **facts)
     of = f"{causes[cause]:,} of {sum(causes.values()):,} failed drives that were examined"
-    return f"in {of}, {_CAUSES[cause]}" + (f"; {text}" if text else ""), command
+    return f"in {of}, {said}{remedy}", command
 
 
-_CAUSES: Mapping[str, str] = {
-    "start": "no satisfying plan is known from the start",
-    "told": "a satisfying plan was followed until the world did what no plan foresees",
-    "later": "a satisfying plan was followed until none was known, although nothing unforeseen happened",
-    "near": "the best known plans miss by little",
-    "missed": "a satisfying plan is known that the policy did not propose",
-    "rules": "the plans satisfied their specification to the end, and the rules of the drives ask for more",
+_ASK = "; ask for less of {name}, allow more time or control, or search for longer: `{command}`"
+_CAUSES: Mapping[str, tuple[str, str, str]] = {
+    "start": ("no satisfying plan is known from the start", _ASK, "{search}"),
+    "told": (
+        "a satisfying plan was followed until the world did what no plan foresees",
+        "; states after such events are trained on by `{command}`",
+        "{afresh} --falsify",
+    ),
+    "later": (
+        "a satisfying plan was followed until none was known, although nothing unforeseen happened",
+        "; plans end after {reach}, {name} {due}: `{command}` plans to the end of the drive",
+        "{search} --set time.horizon={whole}",
+    ),
+    "near": ("the best known plans miss by little", _ASK, "{search}"),
+    "missed": ("a satisfying plan is known that the policy did not propose", "", ""),
+    "rules": (
+        "the plans satisfied their specification to the end, and the rules of the drives ask for more",
+        "; the specification of the plans should ask for {name} too",
+        "{report}",
+    ),
 }
-"""Cause of a failed drive (see `stlc.controller.evaluation.causes.Cause`) -> the same in words."""
+"""Cause of a failed drive -> the same in words, remedy, and command, with the facts that fill them.
+
+The causes are those of `stlc.controller.evaluation.causes.Cause`.
+"""
 
 
 def forecast(rows: Sequence[Mapping[str, Any]], accuracy: float, feasible: float) -> Curve:

@@ -104,6 +104,14 @@ def test_the_advice_follows_from_the_cause_that_was_measured(
     assert learning.command.endswith(command)
 
 
+def test_plans_that_reach_to_the_end_are_not_made_longer() -> None:
+    found = result(1.0, 1.0) | driven(2, {"later": 4})
+    found["closed_loop"] |= {"plan_seconds": 35.0}  # type: ignore[operator]
+    learning = learning_of(found, [], COMMANDS)
+    assert "ask for less of `stop_sign`" in learning.advice[0]
+    assert learning.command == "stlc simulate s.stl --method search"
+
+
 def test_where_few_starts_have_a_plan_it_is_said() -> None:
     learning = learning_of(result(0.35, 0.36) | driven(19), rows(0.35, 0.36, 0.1), COMMANDS)
     assert learning.level == "trained"

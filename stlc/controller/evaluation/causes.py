@@ -18,8 +18,6 @@ from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.guard.feasibility import safety_task, solve
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.evaluation.rules import Broken
     from stlc.controller.problem.task import Task
@@ -60,63 +58,36 @@ def causes(
     Returns:
         Row of a drive -> cause; drives for which the search was ended too early are left out.
     """
-    safety = {rule.name for rule in task.compiled.safety}
+    safety, dt = {rule.name for rule in task.compiled.safety}, task.system.dt
+    little = NEAR * task.system.decl.objective.gamma
     foreseen = model_consistent(task, recording)
     if recording.eventless is not None:
         foreseen &= recording.eventless
-    unsafe = [each for each in broken if safety.intersection(each.rules)]
-    others = [each for each in broken if each not in unsafe]
     found: dict[int, Cause] = {}
-    for drives, asked, good in (
-        (unsafe, safety_task(task) if unsafe else task, recording.safe),
-        (others, task, recording.rho >= -TOLERANCE),
-    ):
-        if drives:
-            found |= _causes(asked, recording, drives, good, foreseen, enough)
-    return found
-
-
-def _causes(
-    asked: Task,
-    recording: DeploymentRecording,
-    drives: Sequence[Broken],
-    good: NDArray[np.bool_],
-    foreseen: NDArray[np.bool_],
-    enough: Stop,
-) -> dict[int, Cause]:
-    """Find why drives failed that violated the specification of `asked`.
-
-    Args:
-        asked: the task whose specification plans had to satisfy.
-        recording: the recorded drives.
-        drives: the failed drives.
-        good: mask of the samples at which a satisfying plan was followed, (rows, steps).
-        foreseen: mask of the steps in which the world did what the model predicts, (rows, steps).
-        enough: condition that ends the search early.
-    """
-    dt, little = asked.system.dt, NEAR * asked.system.decl.objective.gamma
-    rows = [each.row for each in drives]
-    times = [[time for time in each.rules.values() if time is not None] for each in drives]
-    lasts = [min(round(min(each, default=0.0) / dt), recording.steps - 1) for each in times]
-    since = []
-    for row, last in zip(rows, lasts, strict=True):
-        followed = np.flatnonzero(good[row, : last + 1])
-        since.append(int(followed[-1]) + 1 if len(followed) else 0)
-    states = torch.from_numpy(recording.states[rows, since])
-    rho = solve(asked, states, passes=PASSES, tries=TRIES, stop=enough).rho.tolist()
-    found: dict[int, Cause] = {}
-    for row, start, last, best in zip(rows, since, lasts, rho, strict=True):
-        if enough() and not np.isfinite(best):  # not searched for
+    for unsafe in (True, False):
+        drives = [each for each in broken if unsafe is not safety.isdisjoint(each.rules)]
+        if not drives:
             continue
-        own = float(recording.policy_rho[row, start : last + 1].max(initial=-np.inf))
-        if start > last and foreseen[row, : last + 1].all():
-            found[row] = "rules"
-        elif start and not foreseen[row, start - 1]:
-            found[row] = "told"
-        elif best >= -TOLERANCE:
-            found[row] = "missed"
-        elif max(best, own) > -little:
-            found[row] = "near"
-        else:
-            found[row] = "later" if start else "start"
+        asked = safety_task(task) if unsafe else task
+        good = recording.safe if unsafe else recording.rho >= -TOLERANCE
+        rows, lasts, since = [each.row for each in drives], [], []
+        for each in drives:
+            first = min((time for time in each.rules.values() if time is not None), default=0.0)
+            lasts.append(min(round(first / dt), recording.steps - 1))
+            followed = np.flatnonzero(good[each.row, : lasts[-1] + 1])
+            since.append(int(followed[-1]) + 1 if len(followed) else 0)
+        states = torch.from_numpy(recording.states[rows, since])
+        rho = solve(asked, states, passes=PASSES, tries=TRIES, stop=enough).rho.tolist()
+        for row, start, last, best in zip(rows, since, lasts, rho, strict=True):
+            own = float(recording.policy_rho[row, start : last + 1].max(initial=-np.inf))
+            if enough() and not np.isfinite(best):  # not searched for
+                continue
+            if start > last and foreseen[row, : last + 1].all():
+                found[row] = "rules"
+            elif start and not foreseen[row, start - 1]:
+                found[row] = "told"
+            elif best >= -TOLERANCE:
+                found[row] = "missed"
+            else:
+                found[row] = "near" if max(best, own) > -little else "later" if start else "start"
     return found
