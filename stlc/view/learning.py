@@ -204,7 +204,7 @@ def _driven_line(each: Mapping[str, Any]) -> str:
     of drives is given with a requirement that not all failed drives violate.
     """
     low, high = each["interval"]
-    failed, violated = each["drives"] - each["satisfied"], each.get("violated") or ()
+    failed, violated = each["drives"] - each["satisfied"], each.get("broken") or ()
     names = []
     for found in violated[:LISTED]:
         time = "" if found["seconds"] is None else duration(found["seconds"])
@@ -350,7 +350,7 @@ def _told(drives: Mapping[str, Any], found: Mapping[str, Any], commands: Command
     said, remedy, command = _CAUSES[cause]
     if cause == "later" and (found.get("plan_seconds") or 0.0) >= (found.get("seconds") or 0.0):
         remedy, command = _ASK, "{search}"  # plans reach to the end already
-    first = (drives.get("violated") or [{"requirement": "it"}])[0]
+    first = (drives.get("broken") or [{"requirement": "it"}])[0]
     due = f"is due at {duration(first['due'])}" if first.get("due") else "asks for more"
     facts = {"name": f"`{first['requirement']}`", "due": due, "whole": f"{found.get('seconds') or 0:g}s"}
     command = command.format(**asdict(commands), **facts)

@@ -33,7 +33,7 @@ def driven(
     """Closed-loop results of 20 drives without a guard, of 35 s, with plans of 10 s."""
     violated = [{"requirement": "stop_sign", "drives": 20 - satisfied, "seconds": 30.0, "due": due}]
     share = {"guard": "none", "drives": 20, "satisfied": satisfied, "share": satisfied / 20}
-    guard = {**share, "interval": [0.0, 1.0], "violated": violated, "causes": causes or {}}
+    guard = {**share, "interval": [0.0, 1.0], "broken": violated, "causes": causes or {}}
     return {"closed_loop": {"guards": [guard], "recommended": "none", "seconds": 35.0, "plan_seconds": 10.0}}
 
 

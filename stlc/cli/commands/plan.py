@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.documents import record
 from stlc.cli.framework.options import (
     MOST_SEED,
     FailUnderOption,
@@ -22,7 +21,7 @@ from stlc.cli.framework.options import (
     require_separate,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
-from stlc.cli.framework.plan_documents import MissedRequirement, PlannerAdvice, Plans, PlanTubes
+from stlc.cli.framework.plan_documents import Plans, PlanTubes
 from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
 from stlc.registry import PLANNERS
@@ -176,8 +175,8 @@ def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path,
         },
         "seconds": {"mean": float(spent.mean()), "median": float(spent.median()), "most": float(spent.max())},
         "evaluations": float(result.evaluations.double().mean()),
-        "missed": [record(MissedRequirement, each) for each in missed(task, states, result.plans[bad])],
-        "better": None if better is None else record(PlannerAdvice, better),
+        "missed": [asdict(each) for each in missed(task, states, result.plans[bad])],
+        "better": None if better is None else asdict(better),
         "trace": str(output),
     }
 

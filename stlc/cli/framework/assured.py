@@ -310,15 +310,6 @@ class Verified(TypedDict):
     modes: list[VerifiedMode]
 
 
-class ViolatedRequirement(TypedDict):
-    """Requirement that drives violate; see `stlc.controller.evaluation.closed_loop.Violated`."""
-
-    requirement: str
-    drives: int
-    seconds: Num | None
-    due: Num | None
-
-
 class GuardResult(TypedDict):
     """Drives under one guard after a training; see `stlc.controller.evaluation.closed_loop.Share`."""
 
@@ -331,7 +322,7 @@ class GuardResult(TypedDict):
     compared: int
     gained: int
     lost: int
-    violated: list[ViolatedRequirement]
+    broken: list[dict[str, Any]]
     causes: dict[str, int]
 
 

@@ -537,23 +537,13 @@ class JudgedRuns(TypedDict):
     broken: list[BrokenRun]
 
 
-class SearchUseRecord(TypedDict):
-    """Use of the budget by searches; see `stlc.controller.planning.planner.SearchUse`."""
-
-    budget: Num
-    searches: int
-    median: Num
-    p99: Num
-    early: Num
-
-
 class GuardedRuns(TypedDict):
     metrics: dict[str, MetricValues]
     units: dict[str, str]
     decisions: dict[str, Num]
     unsafe: NotRequired[list[UnsafeStart]]
     latency: DecisionLatencyRecord
-    search: NotRequired[SearchUseRecord]
+    search: NotRequired[dict[str, Num]]
     drives: NotRequired[JudgedRuns]
     assurance: NotRequired[Assurance]
 

@@ -1,6 +1,6 @@
 """Records that `stlc plan` prints; see `stlc.cli.framework.documents`."""
 
-from typing import NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 
 class PlanRobustness(TypedDict):
@@ -43,23 +43,6 @@ class PlanTubes(TypedDict):
     requirements: dict[str, GuaranteedRobustness]
 
 
-class MissedRequirement(TypedDict):
-    """Requirement that best plans violate; see `stlc.controller.planning.missed.Missed`."""
-
-    requirement: str
-    starts: int
-    robustness: float | str
-
-
-class PlannerAdvice(TypedDict):
-    """Planner that does better; see `stlc.controller.planning.missed.BetterPlanner`."""
-
-    method: str
-    satisfied: int
-    starts: int
-    seconds: float
-
-
 class Plans(TypedDict):
     """Result of `stlc plan`."""
 
@@ -73,7 +56,7 @@ class Plans(TypedDict):
     robustness: PlanRobustness
     seconds: PlanSeconds
     evaluations: float
-    missed: list[MissedRequirement]
-    better: PlannerAdvice | None
+    missed: list[dict[str, Any]]
+    better: dict[str, Any] | None
     tube: NotRequired[PlanTubes]
     trace: str

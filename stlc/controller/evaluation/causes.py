@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 import torch
 
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.guard.feasibility import safety_task, solve
+from stlc.controller.problem.task import satisfied
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording
@@ -69,7 +69,7 @@ def causes(
         if not drives:
             continue
         asked = safety_task(task) if unsafe else task
-        good = recording.safe if unsafe else recording.rho >= -TOLERANCE
+        good = recording.safe if unsafe else satisfied(torch.from_numpy(recording.rho)).numpy()
         rows, lasts, since = [each.row for each in drives], [], []
         for each in drives:
             first = min((time for time in each.rules.values() if time is not None), default=0.0)
@@ -77,8 +77,9 @@ def causes(
             followed = np.flatnonzero(good[each.row, : lasts[-1] + 1])
             since.append(int(followed[-1]) + 1 if len(followed) else 0)
         states = torch.from_numpy(recording.states[rows, since])
-        rho = solve(asked, states, passes=PASSES, tries=TRIES, stop=enough).rho.tolist()
-        for row, start, last, best in zip(rows, since, lasts, rho, strict=True):
+        plans = solve(asked, states, passes=PASSES, tries=TRIES, stop=enough)
+        searched = zip(rows, since, lasts, plans.rho.tolist(), plans.solved.tolist(), strict=True)
+        for row, start, last, best, solved in searched:
             own = float(recording.policy_rho[row, start : last + 1].max(initial=-np.inf))
             if enough() and not np.isfinite(best):  # not searched for
                 continue
@@ -86,7 +87,7 @@ def causes(
                 found[row] = "rules"
             elif start and not foreseen[row, start - 1]:
                 found[row] = "told"
-            elif best >= -TOLERANCE:
+            elif solved:
                 found[row] = "missed"
             else:
                 found[row] = "near" if max(best, own) > -little else "later" if start else "start"

@@ -109,7 +109,7 @@ class Share:
         safe: number of runs that satisfy the requirements tagged `@safety`; None if there are none.
         gained: number of runs that satisfy the mission, and without a guard do not.
         lost: number of runs that violate the mission, and without a guard do not.
-        violated: the requirements that runs violate, the one that most runs violate first.
+        broken: the requirements that runs violate, the one that most runs violate first.
         causes: cause -> number of failed runs that have it, of those whose cause was determined.
     """
 
@@ -119,7 +119,7 @@ class Share:
     safe: int | None
     gained: int = 0
     lost: int = 0
-    violated: tuple[Violated, ...] = ()
+    broken: tuple[Violated, ...] = ()
     causes: Mapping[Cause, int] = field(default_factory=dict)
 
     @property
@@ -145,7 +145,7 @@ class Share:
             "compared": self.runs if GUARDS.get(self.guard).intervenes else 0,
             "gained": self.gained,
             "lost": self.lost,
-            "violated": [asdict(each) for each in self.violated],
+            "broken": [asdict(each) for each in self.broken],
             "causes": dict(self.causes),
         }
 
@@ -433,7 +433,7 @@ class _Trial:
                     safe=None if None in safe else sum(map(bool, safe)),
                     gained=sum(good and not alone for good, alone in pairs),
                     lost=sum(alone and not good for good, alone in pairs),
-                    violated=self._violated(drives),
+                    broken=self._violated(drives),
                     causes=Counter(drive.cause for drive in drives if drive.cause is not None),
                 )
             )

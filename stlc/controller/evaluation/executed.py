@@ -19,6 +19,7 @@ from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
 from stlc.controller.guard.feasibility import viable as search_safe
+from stlc.controller.problem.task import satisfied
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
@@ -178,7 +179,7 @@ def _since(
         return np.full(rows, low)
     middle = (low + high) // 2
     begun = {name: each[: middle + 1] for name, each in columns.items()}
-    early = _margin(rule, begun, 1, "upper", stop=samples)[0] < -TOLERANCE
+    early = ~satisfied(torch.from_numpy(_margin(rule, begun, 1, "upper", stop=samples)[0])).numpy()
     found = np.zeros(rows, dtype=np.int64)
     for part, bounds in ((early, (low, middle)), (~early, (middle + 1, high))):
         found[part] = _since(rule, {name: each[:, part] for name, each in columns.items()}, *bounds)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import satisfied
 from stlc.diagnostics import StlcError
@@ -64,7 +63,7 @@ def missed(task: Task, x0: Tensor, plans: Tensor) -> tuple[Missed, ...]:
         plans: the best plan known from each, (B, T, m).
     """
     each = task.judge(x0.double(), plans.double(), states=False).requirements
-    violated = each < -TOLERANCE
+    violated = ~satisfied(each)
     found = [
         Missed(rule.name, int(failing.sum()), float(values[failing].max()))
         for rule, failing, values in zip(task.rules, violated.T, each.T, strict=True)

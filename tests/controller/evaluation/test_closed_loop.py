@@ -171,8 +171,8 @@ def test_what_was_driven_from_few_common_starts_is_left_out(run: Run) -> None:
 def test_what_is_said_of_drives() -> None:
     violated = Violated("b", 20, 30.25, 30.0), Violated("a", 3, None)
     shares = (
-        Share("none", 60, 40, 50, violated=violated),
-        Share("paper", 60, 59, 60, gained=20, lost=1, violated=(Violated("a", 1, 2.0),)),
+        Share("none", 60, 40, 50, broken=violated),
+        Share("paper", 60, 59, 60, gained=20, lost=1, broken=(Violated("a", 1, 2.0),)),
     )
     result = {"closed_loop": ClosedLoop(shares, 10).summary()}
     assert driven_lines(result) == [
