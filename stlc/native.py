@@ -69,15 +69,18 @@ class SearchOptions:
     Attributes:
         bounds: three numbers for each control, (3, m). They are its lowest value, its highest value, and 1 if
             the control is a periodic angle, else 0.
-        factors: one factor for each requirement, (R,). It is the weight of the requirement (tag `@weight`)
-            divided by its scale (tag `@scale`). The search multiplies each robustness by its factor, and
-            maximises the least product.
+        factors: two numbers for each requirement, (2, R). The first is its weight (tag `@weight`) divided by
+            its scale (tag `@scale`); the search multiplies each robustness by this factor, and maximises the
+            least product. The second is 1 if the requirement is tagged `@safety`, else 0.
         bank: plans that satisfied the specification from other states, (k, T, m). The search may replace the
             last steps of a plan, or all of its steps, by those of a plan in the bank.
         generations: largest number of iterations, in each of which several changes of the best plan are
             tried.
         enough: robustness at which the search for one initial state ends.
         seed: seed of the random changes.
+        cycle: number of iterations after which the comparison of violating plans changes: from the least
+            robustness to the sum of the shortfalls of all requirements, and back; 0 if it never does. If it
+            does, safe plans are preferred among violating ones.
         stop: function that returns True to end the search before all initial states are done.
     """
 
@@ -87,6 +90,7 @@ class SearchOptions:
     generations: int
     enough: float
     seed: int
+    cycle: int = 0
     stop: Stop = never
 
 
@@ -155,7 +159,7 @@ class Kernel:
         self._judge.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4
         self._climb.argtypes = [
             *([ctypes.c_int64] * 2 + [ctypes.c_void_p] * 6),
-            *(ctypes.c_int64, ctypes.c_int, ctypes.c_double, ctypes.c_uint64),
+            *(ctypes.c_int64, ctypes.c_int, ctypes.c_double, ctypes.c_uint64, ctypes.c_int),
         ]
         self._sizes = sizes
 
@@ -217,7 +221,7 @@ class Kernel:
         x0, plans = np.ascontiguousarray(x0, dtype=np.float64), np.array(plans, dtype=np.float64, order="C")
         rho = np.full(len(x0), np.nan)
         arrays = [a.ctypes.data for a in (x0, plans, rho, search.bounds, search.factors, search.bank)]
-        scalars = (len(search.bank), search.generations, search.enough, search.seed)
+        scalars = (len(search.bank), search.generations, search.enough, search.seed, search.cycle)
 
         def rows(first: int, last: int) -> int:
             done: int = self._climb(first, last, *arrays, *scalars)

@@ -27,6 +27,7 @@ from stlc.compile.augment.guidance import guidance_cost
 from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.augment.mission import Goal, mission_steps, never_over
 from stlc.compile.augment.timers import Timer, TimerTable
+from stlc.compile.augment.whole import over_mission
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.frontend.tags import nominal
@@ -223,7 +224,7 @@ def compile_resolved(
             assumptions=tuple(map(as_written, spec.assumptions)),
         )
     stage = _Stage(grid, purpose, TimerTable(spec.taken), sink, nominal(spec.signature.columns))
-    requirements = tuple(map(stage.rule, spec.requirements))
+    requirements = tuple(map(stage.requirement, spec.requirements))
     goals = tuple(stage.goals)
     assumptions = tuple(map(stage.rule, spec.assumptions))
     errors = [finding for finding in sink if finding.severity == "error"]
@@ -270,13 +271,29 @@ class _Stage:
     ranges: KnownRanges
     goals: list[Goal] = field(default_factory=list)
 
-    def rule(self, requirement: typed.Requirement) -> CompiledRequirement:
-        """Compile one requirement or assumption."""
+    def requirement(self, requirement: typed.Requirement) -> CompiledRequirement:
+        """Compile one requirement; if the mission has an end, it is one on the whole mission.
+
+        A requirement that has no such form, since states cannot hold all that it needs of the past, is
+        required of the window of each plan.
+        """
+        if self.grid.end is None:
+            return self.rule(requirement)
+        whole = replace(requirement, formula=over_mission(requirement.formula, self.grid))
+        recurs = mentions_horizon(requirement.formula) and whole != requirement
+        trial = replace(self, table=TimerTable(frozenset()), sink=[], goals=[])
+        trial.rule(whole, recurs=recurs)
+        if any(finding.severity == "error" for finding in trial.sink):
+            return self.rule(requirement)
+        return self.rule(whole, recurs=recurs)
+
+    def rule(self, requirement: typed.Requirement, *, recurs: bool = False) -> CompiledRequirement:
+        """Compile one requirement or assumption; `recurs`: see `augment`."""
         written = in_samples(requirement.formula, self.grid, self.sink)
         requirement = replace(requirement, formula=written)
         if self.purpose == "train":
             self.sink.extend(jumps(written, self.ranges))
-        rewritten = self._rewritten(requirement)
+        rewritten = self._rewritten(requirement, recurs=recurs)
         if rewritten.goal is not None:
             self.goals.append(rewritten.goal)
         lowered = lower(rewritten.formula, self.grid, self.sink)
@@ -290,7 +307,7 @@ class _Stage:
             formula=formula,
             lowered=lowered,
             reach=reach(formula).future,
-            windowed=mentions_horizon(written),
+            windowed=mentions_horizon(written) and not recurs,
             uses_end=uses_end(formula),
             absolute=absolute(written),
             alive=simplify(lower(rewritten.alive, self.grid, self.sink)),
@@ -298,14 +315,14 @@ class _Stage:
             typed=requirement,
         )
 
-    def _rewritten(self, requirement: typed.Requirement) -> Augmented:
+    def _rewritten(self, requirement: typed.Requirement, *, recurs: bool) -> Augmented:
         """Rewrite absolute operators and, for training, past operators of a requirement.
 
         For training, formulas over added states replace them. A recorded trace begins with the mission, so
         the interval of an absolute operator counts from its first sample.
         """
         if self.purpose == "train":
-            return augment(requirement, self.grid, self.table, self.sink)
+            return augment(requirement, self.grid, self.table, self.sink, recurs=recurs)
         written = requirement.formula
         formula = from_first_sample(written) if absolute(written) else written
         return Augmented(formula, typed.Truth(written.span, True), None)
@@ -331,15 +348,15 @@ def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: I
 
 def _leaves_plan(rule: CompiledRequirement, grid: Grid) -> bool:
     """True if a requirement, at the first sample of a plan, reads samples outside of the plan."""
-    if grid.horizon is None:
+    if grid.steps is None:
         return False
     from stlc.compile.ir.defined import defined
 
-    return not defined(rule.formula, grid.horizon + 1)[0]
+    return not defined(rule.formula, grid.steps + 1)[0]
 
 
 def _too_far(rule: CompiledRequirement, grid: Grid) -> Diagnostic:
-    horizon = Fraction(grid.horizon or 0)
+    horizon = Fraction(grid.steps or 0)
     need = Fraction(rule.reach)
     if reach(rule.formula).past:
         text = f"`{rule.name}` looks at samples before the start of every plan"

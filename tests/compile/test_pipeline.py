@@ -95,8 +95,8 @@ def test_absolute_always_becomes_a_clock() -> None:
         "require a: always@[0.5 s, 1 s] x > 1 m\nrequire b: always@[2 s, end] y > 1 m\nrequire c: x > 0 m"
     )
     first, second, _ = (show_formula(rule.formula) for rule in spec.requirements)
-    assert first == "a >= -0.5 and always[0..25] (clock < 5 or clock > 10 or x > 1)"
-    assert second == "b >= -0.5 and always[0..25] (clock < 20 or y > 1)"
+    assert first == "a <= -0.5 or always[0..25] (clock < 5 or clock > 10 or x > 1)"
+    assert second == "b <= -0.5 or always[0..25] (clock < 20 or y > 1)"
     clock, *statuses = spec.timers
     assert (clock.name, clock.kind, clock.initial, clock.high) == ("clock", "clock", 0, 20 + 25 + 1)
     assert [(timer.name, timer.kind, timer.initial) for timer in statuses] == [
@@ -154,31 +154,32 @@ def test_the_clock_gives_way_to_a_signal_of_its_name() -> None:
 
 
 REWRITTEN = {
-    "eventually@[0, 1 s] x > 1 m": "a >= 0.5 or eventually[0..25] (clock <= 10 and x > 1)",
+    "eventually@[0, 1 s] x > 1 m": "a <= -0.5 or a >= 0.5 or eventually[0..25] (clock <= 10 and x > 1)",
     "eventually@[1 s, 4 s) x > 1 m": (
-        "a >= 0.5 or clock <= 13 or eventually[0..25] (clock >= 10 and clock <= 39 and x > 1)"
+        "a <= -0.5 or a >= 0.5 or clock <= 13 or eventually[0..25] (clock >= 10 and clock <= 39 and x > 1)"
     ),
-    "not always@[0, 1 s] x > 1 m": "a >= 0.5 or eventually[0..25] (clock <= 10 and x <= 1)",
+    "not always@[0, 1 s] x > 1 m": "a <= -0.5 or a >= 0.5 or eventually[0..25] (clock <= 10 and x <= 1)",
     "x > 1 m until@[0, 1 s] y > 1 m": (
-        "a >= 0.5 or (a >= -0.5 and (x > 1 until[0..25] (clock <= 10 and y > 1)))"
+        "a <= -0.5 or a >= 0.5 or (x > 1 until[0..25] (clock <= 10 and y > 1))"
     ),
     "x > 0 m or always@[0, 1 s] x > 1 m": (
-        "(a >= -0.5 and (clock > 0 or x > 0)) or (a_2 >= -0.5 and always[0..25] (clock > 10 or x > 1))"
+        "(a <= -0.5 and a_2 <= -0.5) or (a >= -0.5 and (clock > 0 or x > 0))"
+        " or (a_2 >= -0.5 and always[0..25] (clock > 10 or x > 1))"
     ),
     "always[0, T] (y > 1 m -> always@[0, 1 s] x > 1 m)": (
-        "(a >= -0.5 and always[0..25] (clock > 10 or x > 1))"
+        "(a <= -0.5 and a_2 <= -0.5) or (a >= -0.5 and always[0..25] (clock > 10 or x > 1))"
         " or (a_2 >= -0.5 and always[0..25] (clock > 25 or y <= 1))"
     ),
     "always[0, T] (x > 1 m -> once[0, 1 s] y > 1 m)": (
         "always[0..25] (x <= 1 or once[0..10] y > 1 or first(a_since) + elapsed <= 10)"
     ),
     "eventually@[0, 4 s] always[0, 1 s] x > 1 m": (
-        "a >= 0.5 or (a >= -0.5 and ((clock <= 24 and always[0..25] (clock <= 39 or x > 1)) or ((clock <= 39"
+        "a <= -0.5 or a >= 0.5 or (clock <= 24 and always[0..25] (clock <= 39 or x > 1)) or ((clock <= 39"
         " or x > 1) until[0..25] (clock >= 10 and clock <= 50 and historically[0..10] x > 1"
-        " and first(a_held) + elapsed >= 10))))"
+        " and first(a_held) + elapsed >= 10))"
     ),
     "always@[0, 4 s] eventually[0, 1 s] x > 1 m": (
-        "a >= -0.5 and always[0..25] (clock < 10 or clock > 50 or once[0..10] x > 1"
+        "a <= -0.5 or always[0..25] (clock < 10 or clock > 50 or once[0..10] x > 1"
         " or first(a_since) + elapsed <= 10)"
     ),
     "always[0, T] historically[0, 1 s] y > 1 m": (

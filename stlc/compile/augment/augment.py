@@ -13,7 +13,6 @@ from stlc.compile.augment.mission import (
     Goal,
     GoalBranch,
     GoalLeaf,
-    last_step,
     possible,
     progress,
     update,
@@ -49,12 +48,20 @@ class Augmented:
 
 
 def augment(
-    requirement: typed.Requirement, grid: Grid, table: TimerTable, sink: list[Diagnostic]
+    requirement: typed.Requirement,
+    grid: Grid,
+    table: TimerTable,
+    sink: list[Diagnostic],
+    *,
+    recurs: bool = False,
 ) -> Augmented:
     """Rewrite the formula of a requirement for training; add the states that it needs to `table`.
 
     Absolute operators (`always@[a, b]` and its like) have an interval that counts from the start of the
-    mission. `grid` is the time step and the horizon. Findings are appended to `sink`: E307 for an absolute
+    mission. `grid` is the time step and the horizon. `recurs`: whether the requirement is one on every window
+    of a mission, so that an `always@` is required at later samples even if it was violated.
+
+    Findings are appended to `sink`: E307 for an absolute
     operator that cannot be moved out of the operators around it, E309 for a past operator that no timer
     represents, E310 for an absolute operator whose operands look too far into the future, E311 for an unknown
     horizon, E312 for `eventually@` or `until@` without a deadline.
@@ -66,7 +73,7 @@ def augment(
     past = Past(grid, table, sink, requirement.name)
     if not absolute(formula):
         return Augmented(past.rewrite(normal(formula)), always, None)
-    if grid.horizon is None:
+    if grid.steps is None:
         tell(sink, _without_horizon(formula.span))
         return Augmented(always, always, None)
     try:
@@ -75,8 +82,9 @@ def augment(
         tell(sink, _looks_ahead(problem.span, str(problem)))
         return Augmented(always, always, None)
     plain = past.rewrite(flat)
-    goal = _Goals(grid, table, sink, requirement.name).of(plain)
-    return Augmented(progress(goal, grid.horizon), possible(goal), goal)
+    goal = _Goals(grid, table, sink, requirement.name, recurs).of(plain)
+    asked = progress(goal, grid.steps, again=recurs or "safety" in requirement.tags)
+    return Augmented(asked, possible(goal), goal)
 
 
 @final
@@ -92,6 +100,7 @@ class _Goals:
     table: TimerTable
     sink: list[Diagnostic]
     name: str
+    recurs: bool
 
     def of(self, node: typed.Formula) -> Goal:
         """Return the goal of a formula that is evaluated at the start of the mission.
@@ -123,6 +132,11 @@ class _Goals:
         window: ir.Window,
         operands: tuple[typed.Formula, typed.Formula],
     ) -> Goal:
+        last = (window.lo if window.hi is None else window.hi) + (self.grid.steps or 0) + 1
+        if self.recurs and op == "always":
+            truth = ir.Truth(True)
+            asked = Absolute(op, window, node.span, *operands, truth, truth, truth)
+            return GoalLeaf(asked, None, self.table.clock(last))
         for body in operands:
             if not is_state(body, augmented=True):
                 tell(self.sink, _looks_ahead(body.span))
@@ -131,7 +145,7 @@ class _Goals:
             tell(self.sink, _without_deadline(node.span))
         left, right = (condition(timer_form(body), flat=True) for body in operands)
         formula = Absolute(op, window, node.span, *operands, tolerant(left), tolerant(right), right)
-        clock = self.table.clock(last_step(formula) + (self.grid.horizon or 0) + 1)
+        clock = self.table.clock(last)
         draft = Timer(self.name, "status", 0.0, ir.Const(0.0), -1.0, 1.0, _about(formula))
         return GoalLeaf(formula, self.table.add(draft, update(formula, clock)), clock)
 

@@ -84,7 +84,7 @@ def _leaf(leaf: GoalLeaf) -> _Guidance | None:
         return recurring
     promise = formula.op in ("eventually", "until")
     due = window.hi if promise else window.lo
-    if due is None or due == 0 or isinstance(formula.margin, ir.Truth):
+    if due is None or due == 0 or leaf.status is None or isinstance(formula.margin, ir.Truth):
         return None
     margin = _margin(formula.margin)
     if margin is None:
@@ -105,13 +105,15 @@ def _recurring(leaf: GoalLeaf) -> _Guidance | None:
     `always@[a, end] (once[0, c] p and once[0, d] q)`. The deadline of `once[0, c] p` is c after the last
     sample at which p held.
     """
-    margin = leaf.formula.margin
+    margin, status = leaf.formula.margin, leaf.status
+    if status is None:
+        return None
     parts = margin.items if isinstance(margin, ir.BoolOp) and margin.op == "and" else (margin,)
-    costs = [cost for part in parts if (cost := _recurring_part(part, leaf)) is not None]
+    costs = [cost for part in parts if (cost := _recurring_part(part, leaf, status)) is not None]
     return _first_due(costs) if costs else None
 
 
-def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
+def _recurring_part(part: ir.Formula, leaf: GoalLeaf, status: ir.Signal) -> _Guidance | None:
     """Return the violation and the time left of `part`, one item of a recurring goal.
 
     A recurring goal is, for example, `always@[a, end] (once[0, c] p and once[0, d] q)`; its items are
@@ -119,7 +121,7 @@ def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
     `p or c - since >= 0`, where the timer `since` counts the steps since p last held. The result is None if
     `part` does not have this form.
 
-    `leaf` is the recurring goal, with the states that the compiler adds for it.
+    `leaf` is the recurring goal, and `status` the state that holds whether it is open, true or false.
     """
     if not isinstance(part, ir.BoolOp) or part.op != "or":
         return None
@@ -131,7 +133,7 @@ def _recurring_part(part: ir.Formula, leaf: GoalLeaf) -> _Guidance | None:
         return None
     begins = ir.Op("sub", (ir.Const(float(leaf.formula.window.lo)), leaf.clock))
     left = ir.Op("max", (begins, tests[0]))
-    lost = at_least(ir.Const(-0.5), leaf.status)
+    lost = at_least(ir.Const(-0.5), status)
     gap = ir.Op("relu", (ir.Op("neg", (margin,)),))
     return _Guidance(ir.Where(lost, _ZERO, gap), ir.Where(lost, ir.Const(_LOST), left))
 

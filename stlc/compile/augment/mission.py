@@ -11,7 +11,7 @@ the absolute formula. This also holds for any combination of absolute formulas b
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, TypeAlias, assert_never
@@ -26,6 +26,7 @@ AbsoluteOp: TypeAlias = Literal["always", "eventually", "until", "release"]
 
 _OPEN, _TRUE, _FALSE = ir.Const(OPEN), ir.Const(TRUE), ir.Const(FALSE)
 _KNOWN = ir.Const(0.5)
+_OTHER: Mapping[str, Literal["and", "or"]] = {"and": "or", "or": "and"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +62,15 @@ class Absolute:
 class GoalLeaf:
     """Goal of one absolute formula (`always@[a, b] p`), with the states that the compiler adds for it.
 
-    The state `status` is 0 while the formula is open (undecided), then 1 (true) or -1 (false); the state
-    `clock` counts the steps of the mission.
+    Attributes:
+        formula: the absolute formula.
+        status: state that is 0 while the formula is open (undecided), then 1 (true) or -1 (false); None for
+            an `always@` that is required at every sample, whatever happened before.
+        clock: state that counts the steps of the mission.
     """
 
     formula: Absolute
-    status: ir.Signal
+    status: ir.Signal | None
     clock: ir.Signal
 
 
@@ -161,48 +165,66 @@ def _inside(window: ir.Window, clock: ir.Signal) -> ir.Formula:
 # ------------------------------------------------------------------------- progression
 
 
-def progress(goal: Goal, horizon: int) -> typed.Formula:
+def progress(goal: Goal, steps: int, *, again: bool) -> typed.Formula:
     """Return the formula that a plan must satisfy at its first sample in order not to falsify the goal.
 
     The goal consists of absolute formulas (`always@[a, b] p`), joined by `and` and `or`. The result is
-    evaluated over the `horizon` steps of the plan. It reads the status of each absolute formula (open, true
-    or false), which sums up what happened before the plan.
+    evaluated over the `steps` steps of the plan. It reads the status of each absolute formula (open, true or
+    false), which sums up what happened before the plan.
+
+    A part that the mission has falsified is required no more: no plan can satisfy it, and the others shall be
+    satisfied all the same. Only `always@` is required `again` at later samples, as safety requirements are.
     """
+    if isinstance(goal, GoalBranch) and goal.op == "and":
+        items = tuple(progress(item, steps, again=again) for item in goal.items)
+        return typed.Logic(goal.span, "and", items)
+    lost = _lost(goal)
+    if lost is None or (again and isinstance(goal, GoalLeaf) and goal.formula.op == "always"):
+        return _progress(goal, steps, alive=False)
+    asked = _progress(goal, steps, alive=isinstance(goal, GoalBranch))
+    return typed.Logic(lost.span, "or", (lost, asked))
+
+
+def _progress(goal: Goal, steps: int, *, alive: bool) -> typed.Formula:
     match goal:
         case GoalBranch(op, items, span):
-            return typed.Logic(span, op, tuple(progress(item, horizon) for item in items))
+            return typed.Logic(span, op, tuple(_progress(item, steps, alive=True) for item in items))
         case GoalLeaf(formula):
-            return _remainder(goal, formula, horizon)
+            return _remainder(goal, formula, steps, alive=alive)
         case _:
             assert_never(goal)
 
 
-def _remainder(leaf: GoalLeaf, formula: Absolute, horizon: int) -> typed.Formula:
+def _remainder(leaf: GoalLeaf, formula: Absolute, steps: int, *, alive: bool) -> typed.Formula:
     """Return the formula that a plan must satisfy in order not to falsify the absolute formula `formula`.
 
-    `leaf` contains the states that are added for this formula. `horizon` is the length of the plan in steps.
+    `leaf` contains the states that are added for this formula. `steps` is the length of the plan. `alive`:
+    whether the formula is false once the mission has falsified it.
     """
     span, left, right = formula.span, formula.left, formula.right
-    known = time_test(leaf.status, _KNOWN, span)
-    alive = possible(leaf)
+    plan = typed.Interval(typed.Time(), typed.Time(steps=Fraction(steps), span=span), span=span)
     inside = typed_inside(formula.window, leaf.clock, span)
     asked = typed.Logic(span, "->", (inside, right))
     met = typed.Logic(span, "and", (inside, right))
-    far = _beyond(formula, leaf.clock, horizon)
+    if formula.op == "always":
+        held = asked if formula.window.hi == 0 else typed.Temporal(span, "always", plan, asked)
+        return typed.Logic(span, "and", (possible(leaf), held)) if alive and leaf.status else held
+    assert leaf.status is not None
+    known = time_test(leaf.status, _KNOWN, span)
+    far = _beyond(formula, leaf.clock, steps)
     match formula.op:
-        case "always":
-            held = asked if formula.window.hi == 0 else _all_along(asked)
-            return typed.Logic(span, "and", (alive, held))
         case "eventually":
-            soon = typed.Temporal(span, "eventually", _plan(span), met)
+            soon = typed.Temporal(span, "eventually", plan, met)
             return typed.Logic(span, "or", (known, far, soon))
         case "until":
-            later = typed.Logic(span, "and", (far, _all_along(left)))
-            either = typed.Logic(span, "or", (later, typed.Until(span, "until", _plan(span), left, met)))
-            return typed.Logic(span, "or", (known, typed.Logic(span, "and", (alive, either))))
+            later = typed.Logic(span, "and", (far, typed.Temporal(left.span, "always", plan, left)))
+            either = typed.Logic(span, "or", (later, typed.Until(span, "until", plan, left, met)))
+            rest = typed.Logic(span, "and", (possible(leaf), either)) if alive else either
+            return typed.Logic(span, "or", (known, rest))
         case "release":
-            freed = typed.Until(span, "release", _plan(span), left, asked)
-            return typed.Logic(span, "or", (known, typed.Logic(span, "and", (alive, freed))))
+            freed = typed.Until(span, "release", plan, left, asked)
+            rest = typed.Logic(span, "and", (possible(leaf), freed)) if alive else freed
+            return typed.Logic(span, "or", (known, rest))
         case _:
             assert_never(formula.op)
 
@@ -212,8 +234,26 @@ def possible(goal: Goal) -> typed.Formula:
     match goal:
         case GoalBranch(op, items, span):
             return typed.Logic(span, op, tuple(map(possible, items)))
-        case GoalLeaf(formula):
-            return time_test(goal.status, ir.Const(-0.5), formula.span)
+        case GoalLeaf(formula, status):
+            span = formula.span
+            return typed.Truth(span, True) if status is None else time_test(status, ir.Const(-0.5), span)
+        case _:
+            assert_never(goal)
+
+
+def _lost(goal: Goal) -> typed.Formula | None:
+    """Return a formula over the current state that holds once the mission has falsified the goal.
+
+    None if that cannot be known from the state.
+    """
+    match goal:
+        case GoalBranch(op, items, span):
+            parts = [part for item in items if (part := _lost(item)) is not None]
+            if not parts or (op == "or" and len(parts) < len(items)):
+                return None
+            return parts[0] if len(parts) == 1 else typed.Logic(span, _OTHER[op], tuple(parts))
+        case GoalLeaf(formula, status):
+            return None if status is None else time_test(ir.Const(-0.5), status, formula.span)
         case _:
             assert_never(goal)
 
@@ -231,22 +271,12 @@ def typed_inside(window: ir.Window, clock: ir.Signal, span: Span) -> typed.Formu
     return not_over if window.lo == 0 else typed.Logic(span, "and", (started, not_over))
 
 
-def _beyond(formula: Absolute, clock: ir.Signal, horizon: int) -> typed.Formula:
+def _beyond(formula: Absolute, clock: ir.Signal, steps: int) -> typed.Formula:
     """Return a formula on the mission clock that holds while the window of `formula` ends after the plan.
 
-    `clock` counts the steps since the start of the mission. `horizon` is the length of the plan in steps.
+    `clock` counts the steps since the start of the mission. `steps` is the length of the plan.
     """
     hi = formula.window.hi
-    if hi is None or hi - horizon < 1:
+    if hi is None or hi - steps < 1:
         return typed.Truth(formula.span, hi is None)
-    return time_test(ir.Const(float(hi - horizon - 1)), clock, formula.span)
-
-
-def _all_along(body: typed.Formula) -> typed.Formula:
-    """Return a formula that holds if `body` holds at every sample of the plan."""
-    return typed.Temporal(body.span, "always", _plan(body.span), body)
-
-
-def _plan(span: Span) -> typed.Interval:
-    """Return the interval [0, T], which covers the whole plan."""
-    return typed.Interval(typed.Time(), typed.Time(horizons=Fraction(1), span=span), span=span)
+    return time_test(ir.Const(float(hi - steps - 1)), clock, formula.span)

@@ -31,10 +31,25 @@ _EMPTY = ir.Window(0, 0)
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Time grid: step `dt` in seconds and horizon (`T`) in steps; None where unknown."""
+    """Time grid: step `dt` in seconds and horizon (`T`) in steps; None where unknown.
+
+    Attributes:
+        dt: time step in seconds.
+        horizon: value of `T` in steps.
+        plan: steps of a plan, if it is longer than the horizon.
+        end: last step of the mission, after which nothing is required; None if it does not end, or if plans
+            do not regard its end.
+    """
 
     dt: Fraction | None = None
     horizon: int | None = None
+    plan: int | None = None
+    end: int | None = None
+
+    @property
+    def steps(self) -> int | None:
+        """Steps of a plan; None where unknown."""
+        return self.horizon if self.plan is None else self.plan
 
 
 def lacks(grid: Grid, formula: typed.Formula) -> bool:

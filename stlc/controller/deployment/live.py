@@ -32,7 +32,7 @@ class LiveMonitor:
         self.task, self.setting = task, setting
         self.moment: SimulationStep | None = None
         self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
-        self._margins = Margins([whole_run_rule(rule, task) for rule in task.rules], task.horizon)
+        self._margins = Margins([whole_run_rule(rule, task) for rule in task.rules], task.window)
 
     def push(self, moment: SimulationStep) -> None:
         """Append the next step of the deployment."""

@@ -145,7 +145,7 @@ def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
         system_hash=run.task.system.decl.hash,
         run=run.dir.name,
         seed=setting.seeds[0],
-        horizon=run.task.horizon,
+        horizon=run.task.window,
         dt=run.task.system.dt,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         stlc_version=__version__,

@@ -138,7 +138,7 @@ def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement
 def _margins_of_rules(task: Task, recording: DeploymentRecording) -> dict[str, Margins]:
     """Bounds on the robustness of each requirement at the start instants of `Executed`."""
     columns = _columns(task, recording)
-    return {rule.name: _margins(whole_run_rule(rule, task), columns, task.horizon) for rule in task.rules}
+    return {rule.name: _margins(whole_run_rule(rule, task), columns, task.window) for rule in task.rules}
 
 
 def _columns(task: Task, recording: DeploymentRecording) -> dict[str, NDArray[np.float64]]:
@@ -161,7 +161,7 @@ def _decided(
         starts = failing[:, rows].argmax(0) if len(rows) else rows
         for start in np.unique(starts):
             those = rows[starts == start]
-            high = min(last, start + max(task.horizon, rule.reach)) if written.windowed else last
+            high = min(last, start + max(task.window, rule.reach)) if written.windowed else last
             window = {name: each[start : high + 1, those] for name, each in columns.items()}
             samples[those] = start + _since(written, window, 0, high - start)
     return found

@@ -125,7 +125,7 @@ class Guard:
             robustness is -inf.
         """
         x = x.to(torch.float64)
-        fresh, judged = self.policy.plan_judged(x)
+        fresh, judged = self.policy.plan_judged(x, None if previous is None else previous.plan)
         if self.policy.task is not self.strict:
             judged = self.strict.judge(x, fresh)
         found = self._with_previous(x, previous, fresh, judged)

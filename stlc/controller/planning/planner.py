@@ -24,7 +24,7 @@ from stlc.native import Stop, never
 from stlc.registry import PLANNERS, closest
 
 if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
+    from stlc.controller.problem.task import PlanVerdicts, Task
 
 PLANNING_VERSION = 1
 """Version of the planners, raised with every change of the plans that they find within a budget."""
@@ -98,6 +98,7 @@ class PlanSearch:
             range if none were given.
         plans: the best plans found, (B, T, m).
         rho: robustness of these plans, (B,); -inf before the first plan.
+        worth: what these plans are compared by (`Task.preference`), (B,).
         infeasible: mask of the initial states from which the planner proved that no plan satisfies the
             specification, (B,).
         ended: mask of the initial states for which the planner has nothing more to try, (B,).
@@ -123,6 +124,7 @@ class PlanSearch:
         self.start = whole if start is None else _guesses(start, whole).clamp(low, high)
         self.plans = self.start.clone()
         self.rho = torch.full((len(states),), -torch.inf, dtype=torch.float64)
+        self.worth = self.rho.clone()
         self.infeasible = torch.zeros(len(states), dtype=torch.bool)
         self.ended = torch.zeros(len(states), dtype=torch.bool)
         self.seconds = torch.zeros(len(states), dtype=torch.float64)
@@ -189,13 +191,15 @@ class PlanSearch:
         each = each.double().clamp(system.control_low.double(), system.control_high.double())
         count = each.shape[1]
         x0 = self.states[rows].repeat_interleave(count, 0)
-        rho = self.task.judge(x0, each.flatten(0, 1), states=False).rho.view(-1, count)
-        value, which = rho.max(1)
-        better = (value > self.rho[rows]).nonzero()[:, 0]
+        judged = self.task.judge(x0, each.flatten(0, 1), states=False)
+        rho, worth = judged.rho.view(-1, count), self.task.preference(judged).view(-1, count)
+        value, which = worth.max(1)
+        better = (value > self.worth[rows]).nonzero()[:, 0]
         if len(better):
             states = self.task.rollout(self.states[rows[better]], each[better, which[better]])
             better = better[torch.isfinite(states).all(2).all(1)]
-        self.rho[rows[better]] = value[better]
+        self.worth[rows[better]] = value[better]
+        self.rho[rows[better]] = rho[better, which[better]]
         self.plans[rows[better]] = each[better, which[better]]
         self.evaluations[rows] += count if evaluations is None else evaluations
         if count < whole.shape[1]:
@@ -403,12 +407,21 @@ class PlannerPolicy(Policy):
 
     def candidates(self, x0: Tensor) -> Tensor:
         """The best plan found from each state: (B, n) -> (B, 1, T, m)."""
+        return self._decided(x0)[:, None]
+
+    @torch.no_grad()
+    def plan_judged(self, x0: Tensor, rest: Tensor | None = None) -> tuple[Tensor, PlanVerdicts]:
+        plans = self._decided(x0, rest)
+        return plans, self.task.judge(x0, plans)
+
+    def _decided(self, x0: Tensor, rest: Tensor | None = None) -> Tensor:
+        """Search within the budget; it begins at `rest`, (B, T, m), which is kept if it is good enough."""
         if self._prepared[0] is not self.task:
             self._prepared = self.task, prepared(self._planner, self.task)
-        search = self._searched(x0, self._prepared[1], self._budget)
+        search = self._searched(x0, self._prepared[1], self._budget, rest)
         self._spent.append(search.seconds)
         self._reached.append(search.rho >= self._budget.target - TOLERANCE)
-        return search.plans.to(x0.dtype)[:, None]
+        return search.plans.to(x0.dtype)
 
     def continuation(self, x0: Tensor) -> Tensor:
         """Plans found by a short local search from each state: (B, n) -> (B, T, m).
@@ -419,8 +432,14 @@ class PlannerPolicy(Policy):
             self._short = self.task, prepared(planner_named("search", tries=SHORT), self.task)
         return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT)).plans.to(x0.dtype)
 
-    def _searched(self, x0: Tensor, solver: Solver, budget: PlanBudget) -> PlanSearch:
-        search = PlanSearch(self.task, x0, budget, seed=self._seed)
+    def _searched(
+        self, x0: Tensor, solver: Solver, budget: PlanBudget, rest: Tensor | None = None
+    ) -> PlanSearch:
+        search = PlanSearch(self.task, x0, budget, seed=self._seed, start=rest)
         with torch.enable_grad():
+            if rest is not None:
+                rows = torch.arange(len(x0))
+                with search.charged(rows):
+                    search.offer(rows, search.start)
             solver(search)
         return search

@@ -180,7 +180,7 @@ def _meta(task: Task, seed: int | None) -> TraceMeta:
         system_text=decl.source.text,
         system_hash=decl.hash,
         seed=seed,
-        horizon=task.system.horizon,
+        horizon=task.window,
         dt=task.system.dt,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         stlc_version=__version__,

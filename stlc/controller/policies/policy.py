@@ -100,8 +100,15 @@ class Policy(ABC):
         return self.plan(x0)
 
     @torch.no_grad()
-    def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        """The selected plan from each state, as `plan` returns it, and the verdicts on these plans."""
+    def plan_judged(
+        self,
+        x0: Tensor,
+        rest: Tensor | None = None,  # noqa: ARG002
+    ) -> tuple[Tensor, PlanVerdicts]:
+        """The selected plan from each state, as `plan` returns it, and the verdicts on these plans.
+
+        `rest`: remainders of the plans that are followed, (B, T, m), where a planner may begin.
+        """
         return self._best(x0, self.candidates(x0).to(x0.dtype))
 
     def _best(self, x0: Tensor, plans: Tensor) -> tuple[Tensor, PlanVerdicts]:
@@ -221,8 +228,24 @@ class PlanProposer(nn.Module, ABC):
         return torch.cat((plans[:, None], changed.clamp(low, high)), 1)
 
 
+def blocks(steps: int, count: int) -> Tensor:
+    """Block of each step of a plan whose controls change `count` times at most: (steps,) int64.
+
+    The first blocks are single steps, and later ones ever longer: move blocking, by which the number of
+    outputs of a network does not grow with the plan.
+    """
+    if steps <= count:
+        return torch.arange(steps)
+    share = torch.arange(1, count + 1, dtype=torch.float64) / count
+    ends = torch.round(torch.arange(1, count + 1) + (steps - count) * share**2)
+    return torch.searchsorted(ends, torch.arange(steps, dtype=torch.float64), right=True)
+
+
 class PlanNetwork(PlanProposer):
     """MLP from the observation to `plans` open-loop plans over the horizon.
+
+    It has an output for each step of the horizon of the system. If plans reach further, to the end of a
+    mission, later outputs stand for several steps (`blocks`).
 
     If the system declares a mirror symmetry, states on one side of it are mirrored before the network is
     evaluated, and their plans are mirrored back.
@@ -234,6 +257,7 @@ class PlanNetwork(PlanProposer):
 
     centre: Tensor
     spread: Tensor
+    block: Tensor
 
     def __init__(
         self,
@@ -252,8 +276,10 @@ class PlanNetwork(PlanProposer):
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise(widths):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-        layers.append(nn.Linear(widths[-1], plans * task.horizon * self._width))
+        self._count = min(task.horizon, task.window)
+        layers.append(nn.Linear(widths[-1], plans * self._count * self._width))
         self.body = nn.Sequential(*layers)
+        self.register_buffer("block", blocks(task.horizon, self._count), persistent=False)
         self.register_buffer("centre", torch.zeros(widths[0]))
         self.register_buffer("spread", torch.ones(widths[0]))
         changes = variations(task) if varied else variations(task)[:0].clone()
@@ -275,17 +301,25 @@ class PlanNetwork(PlanProposer):
 
     @property
     def layers(self) -> DenseLayers:
-        """Weights of the feed-forward network."""
+        """Weights of the feed-forward network, with an output for each step of a plan."""
         normalisation = self.centre, self.spread
-        return DenseLayers.of(list(self.body), normalisation=normalisation, activation="relu")
+        found = DenseLayers.of(list(self.body), normalisation=normalisation, activation="relu")
+        weights, biases = found.weights[-1], found.biases[-1]
+        rows = torch.arange(len(biases), device=biases.device).view(self.plans, self._count, self._width)
+        each = rows[:, self.block].flatten()
+        return replace(
+            found,
+            weights=(*found.weights[:-1], weights[each]),
+            biases=(*found.biases[:-1], biases[each]),
+        )
 
     def forward(self, x0: Tensor) -> Tensor:
         """All plans, within the control bounds: (B, n) -> (B, plans, T, m)."""
         x0, swapped = self._folded(x0)
         observed = self._task.system.observe(x0).to(self.centre.dtype)
         raw = self.body((observed - self.centre) / self.spread)
-        raw = raw.view(-1, self.plans, self._task.horizon, self._width)
-        plans = squash(raw, self._task.system.decl.controls)
+        raw = raw.view(-1, self.plans, self._count, self._width)
+        plans = squash(raw, self._task.system.decl.controls)[:, :, self.block]
         if self.mirror is None or swapped is None:
             return plans
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)
@@ -387,8 +421,8 @@ class BestOfKPolicy(Policy):
         return super().plan(x0)
 
     @torch.no_grad()
-    def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
-        plans, judged = super().plan_judged(x0)
+    def plan_judged(self, x0: Tensor, rest: Tensor | None = None) -> tuple[Tensor, PlanVerdicts]:
+        plans, judged = super().plan_judged(x0, rest)
         failing = (~satisfied(judged.rho)).nonzero()[:, 0]
         if not len(self.network.changes) or not len(failing):
             return plans, judged

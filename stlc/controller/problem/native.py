@@ -50,6 +50,7 @@ class Effort:
         generations: number of generations of changed plans per initial state.
         enough: robustness at which the search for an initial state ends.
         seed: seed of the random changes.
+        cycle: generations after which the comparison of violating plans changes; 0 if it never does.
         threads: number of threads; the result does not depend on it.
         stop: condition that ends the whole search early.
     """
@@ -57,6 +58,7 @@ class Effort:
     generations: int
     enough: float
     seed: int
+    cycle: int = 0
     threads: int = 1
     stop: Stop = never
 
@@ -88,7 +90,9 @@ class NativeJudge:
         turns = torch.tensor([control.squash == "angle" for control in controls])
         low, high = system.control_low, system.control_high
         self._bounds = torch.stack((low, high, turns.to(low.dtype))).double().numpy()
-        self._factors = np.array([rule.factor for rule in rules])
+        self._factors = np.array(
+            [[rule.factor for rule in rules], ["safety" in rule.tags for rule in rules]], dtype=np.float64
+        )
 
     @classmethod
     def of(
@@ -153,6 +157,7 @@ class NativeJudge:
             effort.generations,
             effort.enough,
             effort.seed,
+            effort.cycle,
             effort.stop,
         )
         best, rho = self.kernel.climb(arrays[0], arrays[1], how, threads=effort.threads)

@@ -35,6 +35,10 @@ if TYPE_CHECKING:
     from stlc.grammar import ast
 
 HARD = Hard()
+MOST_MISSED, UNSAFE = 1e9, 1e6
+"""Greatest shortfall of a requirement that counts, and what an unsafe plan is worth less than a safe one."""
+LONGEST = 500
+"""Most steps of a plan that reaches beyond the horizon of the system, to the end of a mission."""
 MOST_VALUES = 32_000_000
 """Maximum number of values that torch holds while it judges plans: 256 MB in float64."""
 TIE = 1e-4
@@ -123,6 +127,8 @@ class Task:
 
     def __init__(self, compiled: Compiled, system: System) -> None:
         self.compiled = compiled
+        if (steps := compiled.grid.steps) is not None and steps != system.horizon:
+            system = system.planned_for(steps)
         self.plain = system
         if conditions := _on_starts(compiled, system):
             system = system.assuming(conditions)
@@ -161,19 +167,26 @@ class Task:
             UsageError: a value in `overrides` or `values` is not admissible.
             SpecError: the specification is invalid, or does not fit the system.
         """
-        decl = system.decl
-        grid = Grid(dt=decl.dt, horizon=decl.horizon)
-        compiled = compile_spec(
-            spec, grid=grid, interface=system.interface(), overrides=overrides or {}, end=end
-        )
+        decl, interface, overrides = system.decl, system.interface(), overrides or {}
+        compiled = compile_spec(spec, grid=decl.grid, interface=interface, overrides=overrides, end=end)
+        due = compiled.mission
+        if due is not None and compiled.recurring is None and decl.mission:
+            longest = min(max(due, decl.horizon), max(decl.mission, decl.horizon), LONGEST)
+            grid = Grid(decl.dt, decl.horizon, max(longest, decl.horizon), decl.mission)
+            compiled = compile_spec(spec, grid=grid, interface=interface, overrides=overrides, end=end)
         if values:
             compiled = replace(compiled, parameters=fixed(compiled.parameters, values))
         return cls(compiled, system)
 
     @property
     def horizon(self) -> int:
-        """Number of steps of a plan."""
+        """Number of steps of a plan: the horizon of the system, or more if plans reach to a mission's end."""
         return self.system.horizon
+
+    @property
+    def window(self) -> int:
+        """Number of steps that `T` stands for in the specification: the horizon of the system."""
+        return self.system.decl.horizon
 
     @property
     def rules(self) -> tuple[CompiledRequirement, ...]:
@@ -342,6 +355,21 @@ class Task:
                 return cost
             gamma = self.system.decl.objective.gamma
             return cost + SHORTFALL * (gamma - judged.rho).clamp(0.0, gamma)
+
+    def preference(self, judged: PlanVerdicts) -> Tensor:
+        """Values that compare plans in a search, (batch,); larger is better, and 0 or more is satisfying.
+
+        It is the robustness. Of plans that violate a mission, a safe one is preferred, and then the one with
+        the least sum of log(1 + shortfall) over the requirements: one that no plan satisfies any more does
+        not hide the others.
+        """
+        if self.compiled.grid.end is None:
+            return judged.rho
+        factors = judged.requirements.new_tensor([rule.factor for rule in self.rules])
+        missed = (-judged.requirements * factors).clamp(0.0, MOST_MISSED)
+        lack = -torch.log1p(missed).sum(1)
+        lack = torch.where(satisfied(judged.safe), lack, lack - UNSAFE)
+        return torch.where(judged.rho >= 0.0, judged.rho, torch.where(judged.rho.isnan(), -torch.inf, lack))
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
         """Sum of the performance terms of plans, also for plans that violate the specification: (batch,).

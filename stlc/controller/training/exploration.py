@@ -26,7 +26,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.native import Effort
-from stlc.controller.training.local_search import SearchResult
+from stlc.controller.training.local_search import TAILS, SearchResult, remainders
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,8 +54,6 @@ EFFORTS = (8, 24, 72)
 """Sweeps for a plan of `USUAL` steps: first attempt, and increased effort after failures."""
 USUAL = 30
 """Plan length in steps to which `EFFORTS` refers; the cost of a sweep grows with its square."""
-TAILS = 8
-"""Number of instants of a plan; the remainder after each of them is tried as a further plan."""
 RAISED = 250
 """Generations of the local search that increases the margin of a found plan."""
 
@@ -212,7 +210,9 @@ class Exploration:
             tried = self.plan(x, max(sweeps // 2, 2), generator, enough)
             sweeps -= tried.sweeps
             if tried.plan is not None:
-                found.append(self._on_its_way(x, self._raised(x, tried.plan.to(x.dtype), spare)))
+                plan = self._raised(x, tried.plan.to(x.dtype), spare)[None]
+                first = SearchResult(x[None], plan, self.task.judge(x[None], plan, states=False).rho)
+                found.append(remainders(self.task, first, TAILS if self.task.compiled.timers else 1))
         return SearchResult(
             *(torch.cat([getattr(part, name) for part in found]) for name in SearchResult.__slots__)
         )
@@ -228,23 +228,6 @@ class Exploration:
             return plan
         effort = Effort(RAISED, spare, 0)
         return self.task.native.climb(x[None], plan[None], plan[None], effort)[0][0]
-
-    def _on_its_way(self, x: Tensor, plan: Tensor) -> SearchResult:
-        """Return pairs of an initial state and a plan: `x` with `plan`, and later states with its remainders.
-
-        The later states are those that `plan` visits. Remainders are extended to T steps by repeating their
-        last control. A pair is left out if its plan does not satisfy the specification.
-        """
-        states, plans = [x], [plan]
-        if self.task.compiled.timers:
-            path = self.task.rollout(x[None], plan[None])[0]
-            for step in range(0, len(plan), -(-len(plan) // TAILS))[1:]:
-                states.append(path[step])
-                plans.append(torch.cat((plan[step:], plan[-1:].expand(step, -1))))
-        x0, u = torch.stack(states), torch.stack(plans)
-        judged = SearchResult(x0, u, self.task.judge(x0, u, states=False).rho)
-        good = judged.solved
-        return SearchResult(judged.states[good], judged.plans[good], judged.rho[good])
 
     def _best(self, x: Tensor, layer: Layer) -> Tensor:
         plans = torch.from_numpy(layer.plans)

@@ -28,7 +28,14 @@ from stlc.controller.training.checkpoint import below
 from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.controller.training.failures import FailureBank
-from stlc.controller.training.local_search import THOROUGH, Search, Searcher, SearchResult
+from stlc.controller.training.local_search import (
+    TAILS,
+    THOROUGH,
+    Search,
+    Searcher,
+    SearchResult,
+    remainders,
+)
 from stlc.controller.training.objective import loss
 from stlc.controller.training.run import load_weights
 from stlc.controller.training.samplers import Draws, FixedSet, Missions, ReplayBuffer, Supply
@@ -290,8 +297,8 @@ class Trainer(Learner):
     @property
     def _effort(self) -> tuple[int, int]:
         """Maximum number of failing states in a search round, and of plans judged for each of them."""
-        native = self.task.native is not None
-        return (self.config.most, THOROUGH) if native else (min(self.config.most, TORCH_MOST), TORCH_TRIES)
+        most = math.ceil(self.config.most * self.task.window / self.task.horizon)
+        return (most, THOROUGH) if self.task.native is not None else (min(most, TORCH_MOST), TORCH_TRIES)
 
     def close(self) -> None:
         """Cancel the running search."""
@@ -311,8 +318,11 @@ class Trainer(Learner):
         assert repaired_by_then is not None
         found = repaired_by_then.to(self.device)
         solved = found.solved
-        self.buffer.add(found.states[solved], found.plans[solved])
-        self.supply.follow(found.states[solved], found.plans[solved])
+        good = SearchResult(found.states[solved], found.plans[solved], found.rho[solved])
+        self.supply.follow(good.states, good.plans)
+        if self.task.compiled.grid.end is not None and len(good.rho):
+            good = remainders(self.task, good, TAILS)
+        self.buffer.add(good.states, good.plans)
         if self.failures is not None:  # the estimate is that of the fresh states
             solved = solved[: len(solved) - self.failures.repairing]
             self.failures.repairing = 0
@@ -406,7 +416,7 @@ class Trainer(Learner):
         """
         native = self.task.native is not None
         count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
-        x0 = self.supply.take(min(count, MARGIN_STATES))
+        x0 = self.supply.take(math.ceil(count * self.task.window / self.task.horizon))
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
         start = middle.to(self.device).expand(len(x0), self.task.horizon, -1)
         rho = self._searcher(math.inf).repair(x0, start, self.buffer.bank, tries=tries).rho

@@ -31,8 +31,15 @@ if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
     from stlc.native import Stop
 
+CYCLE = 1000
+"""Evaluations after which the search for plans of a mission changes the comparison of violating plans.
+
+The least robustness alone hides what a change does to the other requirements, of which a mission has many.
+"""
 THOROUGH = 4000
 """Default maximum number of evaluations per state."""
+TAILS = 8
+"""Number of instants of a plan; the remainder after each of them is tried as a further plan."""
 TRIES = 64
 """Plans per generation in torch."""
 MOST_TRIED = 4_000_000
@@ -67,6 +74,23 @@ class SearchResult:
     def to(self, device: torch.device) -> SearchResult:
         """The result with its tensors on `device`."""
         return SearchResult(self.states.to(device), self.plans.to(device), self.rho.to(device))
+
+
+def remainders(task: Task, found: SearchResult, count: int) -> SearchResult:
+    """Plans from `count` states that each plan visits at equal intervals: what remains of it there.
+
+    A plan that ends with a mission satisfies the specification from every state on its way. A remainder is
+    extended to T steps by repeating its last control, and left out if it does not satisfy the specification.
+    The first of the states is the initial one.
+    """
+    steps = found.plans.shape[1]
+    path = task.rollout(found.states, found.plans)
+    begun = torch.arange(0, steps, max(1, -(-steps // count)), device=found.plans.device)
+    index = (begun[:, None] + torch.arange(steps, device=begun.device)).clamp(max=steps - 1)
+    x0, u = path[:, begun].flatten(0, 1), found.plans[:, index].flatten(0, 1)
+    judged = SearchResult(x0, u, task.judge(x0, u, states=False).rho)
+    good = judged.solved
+    return SearchResult(x0[good], u[good], judged.rho[good])
 
 
 class Search:
@@ -226,7 +250,8 @@ class Searcher:
         x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
 
         def climb(stop: Stop) -> SearchResult:
-            effort = Effort(-(-tries // LANES), self.enough, seed, threads, stop)
+            cycle = CYCLE // LANES if self.task.compiled.grid.end is not None else 0
+            effort = Effort(-(-tries // LANES), self.enough, seed, cycle, threads, stop)
             best, _ = native.climb(x0, plans, bank, effort)
             rho = self.task.judge(x0, best, states=False).rho
             return SearchResult(x0, best, rho)

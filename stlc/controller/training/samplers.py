@@ -216,6 +216,8 @@ def mission_steps(task: Task) -> int:
     one horizon.
     """
     named, recurring = task.compiled.mission, task.compiled.recurring
+    if task.compiled.grid.end is not None:
+        return task.compiled.grid.end
     if named is None:
         return task.horizon * 4
     if recurring is None:

@@ -64,6 +64,7 @@ class SystemDecl:
         spec: path of the default specification, or None.
         dt: time step in seconds, exact.
         horizon: planning horizon in steps.
+        mission: last step of a mission, where plans end that reach so far; 0: plans do not regard its end.
         substeps: integration steps within one time step.
         integrator: name of the integration method.
         discrete: whether `flow` gives next values of the states instead of derivatives.
@@ -99,6 +100,7 @@ class SystemDecl:
     spec: Path | None
     dt: Fraction
     horizon: int
+    mission: int
     substeps: int
     integrator: str
     discrete: bool

@@ -18,6 +18,7 @@ from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
 from stlc.dynamics.schema.record import (
     EXPRESSION,
+    INSTANT,
     LINE,
     NAME,
     OF,
@@ -122,12 +123,6 @@ def _trigger(cx: Context, node: Node, label: str) -> dict[str, Any] | None:
             return {"when": cx.here.formula_of(expr)}
 
 
-@reads(EXPRESSION)
-def _instant(cx: Context, node: Node, label: str) -> int | None:
-    """Read an instant of a deployment in steps from the start; None if it is invalid."""
-    return 0 if written(node) in {"0", "0 s", "0 steps"} else STEPS.read(cx, node, label)
-
-
 @dataclass(frozen=True, slots=True)
 class EventDecl:
     """An exogenous event: a change of states between two steps, which the planner does not foresee.
@@ -139,7 +134,7 @@ class EventDecl:
     name: str = key(NAME, "for messages", "", label=OF)
     when: ir.Formula | None = key(_trigger, "condition, or `rise(…)`, `fall(…)` of one", spread=True)
     edge: Edge | None = None
-    at: int | None = key(_instant, "time or step at which it happens once")
+    at: int | None = key(INSTANT, "time or step at which it happens once")
     every: int | None = key(STEPS, "period, as a time or in steps")
     sets: tuple[Assign, ...] = key(SETS, "new values, in order", (), name="set", required=True)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -48,6 +48,7 @@ class System:
 
     Attributes:
         decl: declaration from the system file.
+        horizon: steps of a plan; those of the system file unless plans reach to the end of a mission.
         timers: states, such as clocks, that a specification adds; they are the last columns.
         parameters: random constants of a trajectory that a specification adds; their columns precede the
             timers.
@@ -57,9 +58,15 @@ class System:
     """
 
     def __init__(
-        self, decl: SystemDecl, timers: Sequence[Timer] = (), parameters: Sequence[Parameter] = ()
+        self,
+        decl: SystemDecl,
+        timers: Sequence[Timer] = (),
+        parameters: Sequence[Parameter] = (),
+        *,
+        plan: int | None = None,
     ) -> None:
         self.decl = decl
+        self.horizon = decl.horizon if plan is None else plan
         self.timers = tuple(timers)
         self.parameters = tuple(parameters)
         self.added = (*(each.column for each in parameters), *(timer.column for timer in timers))
@@ -72,7 +79,7 @@ class System:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return System, (self.decl, self.timers, self.parameters)
+        return partial(System, plan=self.horizon), (self.decl, self.timers, self.parameters)
 
     @classmethod
     def load(
@@ -98,7 +105,7 @@ class System:
         and timers that a specification adds.
         """
         real = truth(self.decl)
-        return self if real is self.decl else System(real)
+        return self if real is self.decl else System(real, plan=self.horizon)
 
     def of_agents(self, rows: Tensor) -> System:  # noqa: ARG002
         """The true system of some of the agents that are stepped in one batch, `rows`, (k,) int64.
@@ -113,7 +120,12 @@ class System:
         Each parameter is drawn once per trajectory. The next value of a timer is computed from the present
         states; no gradient flows through it. Initial states include the initial values of the timers.
         """
-        return System(self.decl, (*self.timers, *timers), (*self.parameters, *parameters))
+        timers, parameters = (*self.timers, *timers), (*self.parameters, *parameters)
+        return System(self.decl, timers, parameters, plan=self.horizon)
+
+    def planned_for(self, steps: int) -> System:
+        """Return the same system with plans of `steps` steps."""
+        return System(self.decl, self.timers, self.parameters, plan=steps)
 
     def assuming(self, conditions: Mapping[str, ir.Formula]) -> System:
         """Return the same system with further conditions on the initial states that it draws.
@@ -123,7 +135,7 @@ class System:
         init = self.decl.init
         where = (*init.where, *conditions.values())
         init = replace(init, where=where, where_text=(*init.where_text, *conditions))
-        return System(replace(self.decl, init=init), self.timers, self.parameters)
+        return System(replace(self.decl, init=init), self.timers, self.parameters, plan=self.horizon)
 
     def interface(self) -> Interface:
         """The interface that specifications are compiled against, with external functions loaded.
@@ -143,11 +155,6 @@ class System:
     def dt(self) -> float:
         """Time step in seconds."""
         return float(self.decl.dt)
-
-    @property
-    def horizon(self) -> int:
-        """Horizon of a plan in steps."""
-        return self.decl.horizon
 
     @cached_property
     def control_names(self) -> tuple[str, ...]:

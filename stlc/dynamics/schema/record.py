@@ -33,6 +33,7 @@ V = TypeVar("V")
 _Read: TypeAlias = "Callable[[Context, Node, str], Any]"
 Json = dict[str, Any]
 _KEY = "key"
+_ZERO = {"0", "0 s", "0 steps"}
 OF = "`{name}` of {of}"
 """Label of a value that also names its mapping."""
 
@@ -161,6 +162,10 @@ SECONDS = Kind(lambda cx, node, label: cx.here.duration(node, label), EXPRESSION
 """A positive time, as a fraction of seconds."""
 STEPS = Kind(lambda cx, node, label: cx.here.steps(node, label, cx.dt), EXPRESSION)
 """A positive number of steps, given as a number or as a time."""
+INSTANT = Kind(
+    lambda cx, node, label: 0 if node.text.strip() in _ZERO else STEPS.read(cx, node, label), EXPRESSION
+)
+"""An instant in steps from the start, given as a number or as a time."""
 FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
 
 

@@ -60,24 +60,31 @@ static void borrow(inputs *restrict v, int j, const double *restrict bank, int64
 }}
 
 /* Improves plans (batch, {steps}, {controls}) in place; rho (batch). Rows from `first` up to `last`.
-   1: no memory. bounds: low ({controls}), high ({controls}), turns ({controls}); factors ({rules}). */
+   1: no memory. bounds: low ({controls}), high ({controls}), turns ({controls}); factors ({rules}), then 1 for
+   rules of safety ({rules}). Plans are compared by the worst rule. If cycle > 0, this changes after so many
+   generations: by the sum over rules of what each lacks, r / (1 + r) or log(1 + r), then by the worst rule, and
+   so on; and of plans that violate rules, a safe one is returned, with the least sum of logarithms. */
 int climb(int64_t first, int64_t last, const double *x0, double *plans, double *rho, const double *bounds,
           const double *factors, const double *bank, int64_t banked, int generations, double enough,
-          uint64_t seed) {{
+          uint64_t seed, int cycle) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
+  const double UNSAFE = 1e6; /* more than any sum of logarithms */
   const double *low = bounds, *high = bounds + M, *turns = bounds + 2 * M;
   lanes *x = malloc(sizeof(lanes) * N);
   inputs *v = malloc(sizeof(double) * M * T * LANES);
-  double *room = malloc(sizeof(double) * {room} * LANES);
+  double *room = malloc(sizeof(double) * {room} * LANES), *now = malloc(sizeof(double) * M * T);
   lane *out = malloc(sizeof(double) * (R + 1) * LANES);
-  if (!x || !v || !room || !out) {{ free(x); free(v); free(room); free(out); return 1; }}
+  if (!x || !v || !room || !now || !out) {{ free(x); free(v); free(room); free(now); free(out); return 1; }}
   for (int64_t row = first; row < last; ++row) {{
     uint64_t s = seed ^ (uint64_t)row * 0xD1B54A32D192ED03ull;
-    double *plan = plans + row * T * M, best = -INFINITY;
+    double *plan = plans + row * T * M, most = -INFINITY, best = -INFINITY; /* of all; of the present one */
+    memcpy(now, plan, sizeof(double) * M * T);
     for (int i = 0; i < N; ++i) LANE x[i][0][j] = x0[row * N + i];
-    for (int g = 0; g < generations && best < enough; ++g) {{
-      for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) LANE v[i][k][j] = plan[k * M + i];
-      for (int j = g == 0; j < LANES; ++j) {{
+    for (int g = 0; g < generations && most < enough; ++g) {{
+      const int begins = cycle ? g % cycle == 0 : g == 0, by = cycle ? (g / cycle + 1) % 3 : 0;
+      if (begins) best = -INFINITY;
+      for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) LANE v[i][k][j] = now[k * M + i];
+      for (int j = begins; j < LANES; ++j) {{
         const int kind = j % 4;
         if (kind == 3) {{ borrow(v, j, bank, banked, low, high, &s); continue; }}
         const int only = M > 1 && (draw(&s) & 1) ? below(&s, M) : -1;
@@ -87,19 +94,30 @@ int climb(int64_t first, int64_t last, const double *x0, double *plans, double *
       double bad[LANES] = {{0}};
       roll(x, (const inputs *)v, bad);
       check(x, room, bad, out);
-      int which = -1;
+      int which = -1, top = -1;
       for (int j = 0; j < LANES; ++j) {{
-        double value = INFINITY;
-        for (int i = 0; i < R; ++i) value = MIN(value, weighed(out[i][j], factors[i]));
-        if (!(bad[j] > 0.0) && value > best) {{ best = value; which = j; }}
-        if (g == 0 && best >= enough) break; /* the plan itself */
+        double value = INFINITY, safe = INFINITY, shares = 0.0, lack = 0.0;
+        for (int i = 0; i < R; ++i) {{
+          const double part = weighed(out[i][j], factors[i]), miss = part < 0.0 ? MIN(-part, 1e9) : 0.0;
+          value = MIN(value, part);
+          if (!cycle) continue;
+          if (factors[R + i] > 0.0) safe = MIN(safe, part);
+          shares += miss / (1.0 + miss);
+          lack += log1p(miss);
+        }}
+        if (bad[j] > 0.0 || isnan(value)) continue;
+        const double all = !cycle || value >= 0.0 ? value : safe >= 0.0 ? -lack : -UNSAFE - lack;
+        if (all > most) {{ most = all; top = j; }}
+        if (by && value < 0.0) value = by == 1 ? -shares : -lack;
+        if (value > best) {{ best = value; which = j; }}
+        if (g == 0 && most >= enough) break; /* the plan itself */
       }}
-      if (which >= 0)
-        for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) plan[k * M + i] = v[i][k][which];
+      if (top >= 0) for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) plan[k * M + i] = v[i][k][top];
+      if (which >= 0) for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) now[k * M + i] = v[i][k][which];
     }}
-    rho[row] = best;
+    rho[row] = most;
   }}
-  free(x); free(v); free(room); free(out);
+  free(x); free(v); free(room); free(now); free(out);
   return 0;
 }}
 """
