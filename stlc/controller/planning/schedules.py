@@ -23,16 +23,16 @@ Instants = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 MOST_INSTANTS = 16
-"""Longest window of an `always` whose operand has choices of its own; longer ones are left out."""
+"""Longest window of an `always` whose operand has choices of its own; of longer ones, the first sample."""
 
 
 class GoalScheduler:
     """Generator of random schedules for given formulas.
 
     A formula that only compares the states of one sample is called a condition. Schedules leave out some
-    parts of the formulas: past operators; `freeze`; an `always` over a long window if it contains other
-    temporal operators; and comparisons that read signals other than states. Therefore a trajectory may meet a
-    schedule and still violate the formulas.
+    parts of the formulas: past operators; `freeze`; all samples but the first of an `always` over a long
+    window that contains other temporal operators; and comparisons that read signals other than states.
+    Therefore a trajectory may meet a schedule and still violate the formulas.
 
     Attributes:
         conditions: the conditions in the formulas. A conjunction is split into its parts.
@@ -52,13 +52,18 @@ class GoalScheduler:
             if isinstance(condition, ir.Predicate) and _opposite(condition) in self._numbers
         }
 
-    def draw(self, count: int, random: Generator) -> Flags:
+    def draw(self, count: int, random: Generator, holds: Flags | None = None) -> Flags:
         """Draw `count` schedules, and drop those that contradict themselves.
+
+        Args:
+            count: number of schedules.
+            random: source of the random choices.
+            holds: True for the conditions that hold at the first sample, (conditions,); None if unknown.
 
         Returns:
             True where a schedule needs a condition at a sample, (schedules, conditions, T + 1).
         """
-        drawing = _Drawing(self, count, random)
+        drawing = _Drawing(self, count, random, holds)
         for i in random.permutation(len(self._formulas)):
             formula = self._formulas[i]
             drawing.need(formula, np.zeros(count, np.int64), np.ones(count, np.bool_))
@@ -149,8 +154,8 @@ class _Drawing:
         possible: False for a schedule in which no sample was left for some formula, (schedules,).
     """
 
-    def __init__(self, scheduler: GoalScheduler, count: int, random: Generator) -> None:
-        self._scheduler, self._random = scheduler, random
+    def __init__(self, scheduler: GoalScheduler, count: int, random: Generator, holds: Flags | None) -> None:
+        self._scheduler, self._random, self._holds = scheduler, random, holds
         self._last = scheduler.steps
         self._samples = np.arange(scheduler.steps + 1)
         self.needed = np.zeros((count, len(scheduler.conditions), scheduler.steps + 1), np.bool_)
@@ -177,7 +182,10 @@ class _Drawing:
                 for i in self._random.permutation(len(items)):
                     self.need(items[i], now, on)
             case ir.BoolOp("or", items):
-                chosen = self._random.integers(len(items), size=len(on))
+                each = np.arange(len(on))
+                free = np.stack([self._free(item)[each, now] for item in items])
+                known = np.stack([(now == 0) & self._known(item) for item in items])
+                chosen = (self._random.random(free.shape) + free + known).argmax(0)
                 for i, item in enumerate(items):
                     self.need(item, now, on & (chosen == i))
             case ir.AtStart(body):
@@ -239,23 +247,35 @@ class _Drawing:
         """Mask of the samples at which `formula` can hold in each schedule, (schedules, T + 1).
 
         A sample is excluded if it would lead to a contradiction: the schedule already demands, at this
-        sample, the negation of a condition that `formula` needs.
+        sample, the negation of a condition that `formula` needs; or the first sample violates the condition.
         """
         free = np.ones((len(self.needed), self._last + 1), np.bool_)
         for part in self._scheduler.present(formula):
+            free[:, 0] &= self._holds is None or self._known(part)
             other = self._scheduler.opposite(part)
             if other is not None:
                 free &= ~self.needed[:, other]
         return free
+
+    def _known(self, formula: ir.Formula) -> bool:
+        """True if `formula` is a condition that is known to hold at the first sample."""
+        if self._holds is None or not self._scheduler.decidable(formula):
+            return False
+        match formula:
+            case ir.Truth(value):
+                return value
+            case ir.BoolOp("and", items):
+                return all(map(self._known, items))
+            case _:
+                return bool(self._holds[self._scheduler.number(formula)])
 
     def _always(self, formula: ir.Formula, first: Instants, last: Instants, on: Flags) -> None:
         if self._scheduler.decidable(formula):
             self._hold(formula, first, last, on)
             return
         length = int((last - first)[on].max(initial=-1)) + 1
-        if length <= MOST_INSTANTS:
-            for k in range(length):
-                self.need(formula, first + k, on & (first + k <= last))
+        for k in range(length if length <= MOST_INSTANTS else 1):
+            self.need(formula, first + k, on & (first + k <= last))
 
     def _hold(self, formula: ir.Formula, first: Instants, last: Instants, on: Flags) -> None:
         """Make the schedules selected by `on` demand that `formula` holds from `first` to `last`.

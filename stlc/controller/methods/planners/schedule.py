@@ -9,7 +9,7 @@ nearest are continued. At the end, a local search improves the exact robustness 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,11 +20,14 @@ from torch import Tensor
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.planning.newton import GaussNewton, Pull, state_gradient, values_of
+from stlc.controller.planning.obligations import Obligations
 from stlc.controller.planning.schedules import GoalScheduler, tempo
 from stlc.controller.training.local_search import Searcher
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from stlc.controller.planning.planner import PlanSearch, Solver
@@ -88,33 +91,65 @@ class SchedulePlanner:
             UsageError: U101, no part of the specification is a condition on the states of a single sample,
                 as `x > 1` is. Then there is nothing to schedule.
         """
-        scheduler = GoalScheduler([rule.formula for rule in task.rules], task.system.names, task.horizon)
-        if not scheduler.conditions:
+        return partial(self._run, rounds=ScheduleRounds(self, task))
+
+    def _run(self, search: PlanSearch, rounds: ScheduleRounds) -> None:
+        while len(rows := search.open()):
+            for _ in rounds.of(search, rows[:1]):
+                pass
+            search.ended[rows[:1]] = True
+
+
+class ScheduleRounds:
+    """The rounds of a search by schedules, for plans of one task.
+
+    Args:
+        options: the planner.
+        task: specification and system.
+
+    Raises:
+        UsageError: U101, there is nothing to schedule.
+    """
+
+    def __init__(self, options: SchedulePlanner, task: Task) -> None:
+        self._options, self._obligations = options, Obligations(task)
+        self._scheduler = lru_cache(maxsize=64)(
+            partial(GoalScheduler, states=task.system.names, steps=task.horizon)
+        )
+        conditions = self._scheduler(self._obligations.first).conditions
+        if not conditions:
             message = "planner `schedule` needs a condition on states, at one sample, in the specification"
             raise UsageError(Diagnostic("U101", message, help=("search and gradient plan for any task",)))
         blank = torch.zeros(1, task.horizon + 1, len(task.system.names), dtype=torch.float64)
         for states in (blank, blank[:, :1]):  # so that the programs of the conditions are built
-            values_of(task, scheduler.conditions, states)
-        return partial(self._run, scheduler=scheduler, pull=state_gradient(task.system))
+            values_of(task, conditions, states)
+        self._pull = state_gradient(task.system)
 
-    def _run(self, search: PlanSearch, scheduler: GoalScheduler, pull: Pull) -> None:
+    def of(self, search: PlanSearch, row: Tensor) -> Iterator[None]:
+        """Search for a plan from the initial state `row`, (1,), until the search for it ends.
+
+        An item is yielded after each round; none if all conditions are decided, so that none is left to meet.
+        """
+        options = self._options
         random = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
         searcher = Searcher(search.task, search.generator, enough=search.budget.target or TOLERANCE)
-        while len(rows := search.open()):
-            row = rows[:1]
-            with search.charged(row):
-                others = _random_plans(search, search.affordable(row, self.library + 1) - 1)
-                library = torch.cat((search.start[row], others))
-                rho = search.offer(row, library[None])[0]
-                if self.first and bool((search.open() == row).any()):
-                    best = rho.argsort(descending=True)[: self.starts]
-                    _polish(search, row, library[best], searcher, self.first)
-            if not bool((search.open() == row).any()):
-                continue
-            with search.charged(row):
-                attempts = _Attempts(self, search, row, library, scheduler, pull, random)
-            while bool((search.open() == row).any()):
-                attempts.round(searcher)
+        with search.charged(row):
+            others = _random_plans(search, search.affordable(row, options.library + 1) - 1)
+            library = torch.cat((search.start[row], others))
+            rho = search.offer(row, library[None])[0]
+            if options.first and bool((search.open() == row).any()):
+                best = rho.argsort(descending=True)[: options.starts]
+                _polish(search, row, library[best], searcher, options.first)
+        if not bool((search.open() == row).any()):
+            return
+        with search.charged(row):
+            scheduler = self._scheduler(self._obligations.at(search.states[row][0]))
+            if not scheduler.conditions:
+                return
+            attempts = _Attempts(options, search, row, library, scheduler, self._pull, random)
+        while bool((search.open() == row).any()):
+            attempts.round(searcher)
+            yield
 
 
 class _Attempts:
@@ -153,6 +188,7 @@ class _Attempts:
         missed = values_of(search.task, conditions, states).neg().clamp(min=0.0).sqrt()
         self._missed = missed.flatten(0, 1)  # by each plan of the library: (conditions * (T + 1), k)
         places, violated = self._newton.nearest(self._x0[0])
+        self._holds = ~violated.numpy()
         self._goals = violated.nonzero()[:, 0].numpy()
         places = torch.cat((self._x0, places[violated])) / self._newton.spread
         self._apart = torch.cdist(places, places).nan_to_num(0.0).numpy()
@@ -184,7 +220,7 @@ class _Attempts:
         Schedules that demand a low speed between goals are preferred.
         """
         options, random = self._options, self._random
-        needed: NDArray[np.bool_] = self._scheduler.draw(options.draws, random)
+        needed: NDArray[np.bool_] = self._scheduler.draw(options.draws, random, self._holds)
         speed = tempo(needed[:, self._goals], self._apart)
         order = (options.greed * np.log(speed + LEAST) - random.gumbel(size=len(speed))).argsort()
         return torch.from_numpy(needed[order[: options.schedules]])

@@ -1,0 +1,114 @@
+"""Obligations of a plan: what the requirements ask of the samples from a given state of the mission on.
+
+For plans, the compiler rewrites an absolute formula such as `p until@[0 s, 25 s] q` with states that it
+adds: a mission clock, a status, and timers for the formulas within. That form is exact from every state, but
+it hides the times at which the parts must hold. An obligation is the formula as it was written, with windows
+that count from the state at hand: 5 s into the mission, `p until[0 s, 20 s] q`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, TypeGuard
+
+import numpy as np
+
+from stlc.compile.augment.lift import hoist_absolute
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.normal_form import normal
+from stlc.compile.ir.traverse import nodes
+from stlc.compile.lowering.lower import lower
+from stlc.compile.lowering.simplify import simplify
+from stlc.compile.semantics.tolerance import TOLERANCE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from torch import Tensor
+
+    from stlc.controller.problem.task import Task
+
+
+class Obligations:
+    """The obligations of plans of one task.
+
+    What began before the state at hand is left out: of `eventually@[0 s, 9 s] always[0 s, 3 s] p`, the first
+    second of p that has passed already. So a plan may miss an obligation and satisfy the requirement.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self._names, self._horizon = task.system.names, task.horizon
+        self._clock = next((timer.name for timer in task.compiled.timers if timer.kind == "clock"), None)
+        self._relative = tuple(rule.formula for rule in task.rules if not rule.absolute)
+        absolute = [rule for rule in task.rules if rule.absolute]
+        grid = task.compiled.grid
+        self._written = [lower(hoist_absolute(normal(rule.typed.formula), []), grid, []) for rule in absolute]
+        self._progressed = [
+            part
+            for written, rule in zip(self._written, absolute, strict=True)
+            for part in _progressed(written, rule.lowered)
+        ]
+        self._known = lru_cache(maxsize=64)(self._formulas)
+
+    @property
+    def first(self) -> tuple[ir.Formula, ...]:
+        """The obligations at the start of a mission."""
+        return self._known(0, (False,) * len(self._progressed))
+
+    def at(self, state: Tensor) -> tuple[ir.Formula, ...]:
+        """Return the obligations of plans from `state`, (n,), without those that every plan meets."""
+        clock = 0 if self._clock is None else round(float(state[self._names.index(self._clock)]))
+        if not clock:
+            return self.first
+        env = {name: np.array([[float(value)]]) for name, value in zip(self._names, state, strict=True)}
+        bounds = evaluate(self._progressed, env, ops=NUMPY, end="lower", stop=self._horizon + 1)
+        met = tuple(bool(np.broadcast_to(bound[0], 1)[0] >= -TOLERANCE) for bound in bounds)
+        return self._known(clock, met)
+
+    def _formulas(self, clock: int, met: tuple[bool, ...]) -> tuple[ir.Formula, ...]:
+        """Return the obligations at step `clock`; `met`: the parts of `_progressed` that every plan meets."""
+        done = iter(met)
+        shifted = (simplify(self._from(written, clock, done)) for written in self._written)
+        return (*self._relative, *(each for each in shifted if each != ir.Truth(True)))
+
+    def _from(self, written: ir.Formula, clock: int, done: Iterator[bool]) -> ir.Formula:
+        """Return a requirement as it is at step `clock`, its windows counting from there.
+
+        `done`: for each of its absolute formulas, in order, True if every plan meets it. A formula whose
+        window is over counts as met, since no plan can change it. A goal that is due after the plan's end is
+        left to later plans.
+        """
+        if _is_branch(written):
+            return replace(written, items=tuple(self._from(item, clock, done) for item in written.items))
+        formula, over = written.body if isinstance(written, ir.AtStart) else written, next(done)
+        if not isinstance(formula, ir.Windowed):
+            return ir.Truth(True) if over or clock else formula
+        lo, hi = max(formula.window.lo - clock, 0), formula.window.hi
+        last = None if hi is None else hi - clock
+        if over or (last is not None and last < 0):
+            return ir.Truth(True)
+        if formula.op in ("eventually", "until") and (last is None or last > self._horizon):
+            if isinstance(formula, ir.Until):
+                return ir.Temporal("always", ir.Window(0, None), formula.left)
+            return ir.Truth(True)
+        return replace(formula, window=ir.Window(lo, last))
+
+
+def _progressed(written: ir.Formula, progressed: ir.Formula) -> Iterator[ir.Formula]:
+    """Yield the progressed forms of the absolute formulas that a requirement joins by `and` and `or`."""
+    if _is_branch(written) and isinstance(progressed, ir.BoolOp):
+        for one, other in zip(written.items, progressed.items, strict=True):
+            yield from _progressed(one, other)
+    else:
+        yield progressed
+
+
+def _is_branch(formula: ir.Formula) -> TypeGuard[ir.BoolOp]:
+    """True for an `and` or `or` of formulas of which one looks ahead."""
+    return isinstance(formula, ir.BoolOp) and any(
+        isinstance(node, ir.AtStart) or (isinstance(node, ir.Windowed) and not node.back)
+        for node in nodes(formula)
+    )
