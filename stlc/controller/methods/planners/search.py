@@ -1,21 +1,45 @@
-"""`search`: local search on exact robustness with restarts; it runs in C if a compiler is installed."""
+"""`search`: local search on exact robustness with restarts, and searches by the order of the goals.
+
+Local search runs in C if a compiler is installed. Where it finds no plan, and the mission needs several
+steps, two searches alternate with it that look at the requirements: for sequences of phases
+(`stlc.controller.planning.sequences`), and by schedules of the goals (the planner `schedule`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from itertools import islice
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import extremes
+from stlc.controller.methods.planners.schedule import SchedulePlanner, ScheduleRounds
 from stlc.controller.options import bounded
+from stlc.controller.planning.sequences import Sequences
 from stlc.controller.training.local_search import Searcher
+from stlc.diagnostics import TraceError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+
+
+SEVERAL = 2
+"""Least number of jumps, waits and goals of a mission for which their order is searched."""
+PHASES = 8
+"""Number of phases that are tried for each round of schedules."""
+DOUBLED = 5
+"""Number of rounds in which the searches by the order of the goals get twice as much as before."""
+RESTARTS = 4
+"""Number of searches for sequences of phases from one state. Each ends when no prefix is left to extend; the
+next makes twice the effort for each phase."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +52,7 @@ class SearchPlanner:
     piecewise constant plans; plans that solve an initial state are added.
 
     Attributes:
+        rounds: number of rounds of local search before the searches by the order of the goals begin.
         tries: number of plans tried per initial state in the first round; each later round tries twice as
             many, up to `longest`.
         longest: maximum number of plans tried per initial state and round.
@@ -37,12 +62,15 @@ class SearchPlanner:
     tries: int = bounded(2_000, 1, 10**9)
     longest: int = bounded(20_000, 1, 10**9)
     library: int = bounded(2_048, 1, 10**6)
+    rounds: int = bounded(3, 1, 10**6)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by local search, with the initial library."""
-        return partial(self._run, library=extremes(task, torch.Generator().manual_seed(0)).double())
+        library = extremes(task, torch.Generator().manual_seed(0)).double()
+        return partial(self._run, library=library, orders=_Orders(task))
 
-    def _run(self, search: PlanSearch, library: torch.Tensor) -> None:
+    def _run(self, search: PlanSearch, library: Tensor, orders: _Orders) -> None:
+        begun: dict[int, Iterator[None]] = {}
         budget, tries, number = search.budget, self.tries, 0
         target = budget.target if budget.target else TOLERANCE
         searcher = Searcher(search.task, search.generator, enough=target)
@@ -61,6 +89,67 @@ class SearchPlanner:
                 solved = search.plans[rows][search.rho[rows] >= -TOLERANCE]
                 library = torch.cat((solved, library))[: self.library]
             number, tries = number + 1, min(2 * tries, self.longest)
+            if number >= self.rounds:
+                for row in search.open().tolist():
+                    if row not in begun:
+                        begun[row] = orders.tries(search, torch.tensor([row]))
+                    for _ in islice(begun[row], 2 ** min(number - self.rounds, DOUBLED)):
+                        pass
+
+
+class _Orders:
+    """Searches by the order of the goals of one task; they are built when they are first needed."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+
+    @cached_property
+    def _sequences(self) -> Sequences:
+        return Sequences(self._task, self._task.sample(1, seed=0)[0].double())
+
+    @cached_property
+    def _schedules(self) -> ScheduleRounds | None:
+        try:
+            return ScheduleRounds(SchedulePlanner(first=1), self._task)
+        except UsageError:
+            return None
+
+    def tries(self, search: PlanSearch, row: Tensor) -> Iterator[None]:
+        """Search for a plan from the initial state `row`, (1,), if several steps are needed from there.
+
+        An item is yielded after `PHASES` phases and one round of schedules.
+        """
+        searches: list[tuple[Iterator[None], int]] = []
+        try:
+            root = self._sequences.root(search.states[row][0])
+        except TraceError:  # bounds on the robustness of a prefix need too many instants
+            moves = True
+        else:
+            if root is None or root.missing < SEVERAL:
+                return
+            searches.append((self._by_phases(search, row), PHASES))
+            moves = not root.steps
+        if moves and self._schedules is not None:  # a schedule moves states, not modes
+            searches.append((self._schedules.of(search, row), 1))
+        while searches:
+            searches = [(each, share) for each, share in searches if sum(1 for _ in islice(each, share))]
+            yield
+
+    def _by_phases(self, search: PlanSearch, row: Tensor) -> Iterator[None]:
+        sequences, state = self._sequences, search.states[row][0]
+        random = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
+        for effort in (2**i for i in range(RESTARTS)):
+            plans = sequences.plans(state, random, effort)
+            while bool((search.open() == row).any()):
+                before = sequences.tried
+                with search.charged(row):
+                    found = next(plans, search)
+                    if isinstance(found, Tensor):
+                        search.offer(row, found[None], evaluations=0)
+                    search.evaluations[row] += sequences.tried - before
+                if found is search:
+                    break
+                yield
 
 
 PLANNER = SearchPlanner

@@ -1,0 +1,107 @@
+"""Relaxed plans, phases, and plans as sequences of phases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stlc.controller.planning.phases import Ask
+from stlc.controller.planning.planner import PlanBudget, plan
+from stlc.controller.planning.sequences import Sequences
+from stlc.controller.problem.load import load_task
+from stlc.controller.problem.task import Task
+
+MISSIONS = Path(__file__).parents[2] / "data/sequences"
+
+
+@pytest.fixture(scope="module")
+def handover() -> Task:
+    return load_task(MISSIONS / "handover.stl")
+
+
+def names_of(sequences: Sequences, steps: frozenset[int]) -> set[str]:
+    each = (sequences._relaxation.steps[step].jump for step in steps)
+    return {"wait" if jump is None else jump.name for jump in each}
+
+
+def test_a_relaxed_plan_has_the_jumps_that_the_goals_need(handover: Task) -> None:
+    x0 = handover.sample(1, seed=0)[0].double()
+    sequences = Sequences(handover, x0)
+    root = sequences.root(x0)
+    assert root is not None
+    wanted = {f"{verb} {part}" for verb in ("grip", "put", "fetch", "drop") for part in "ab"}
+    assert names_of(sequences, root.steps) == wanted
+    possible = frozenset(filter(root.relaxed.possible, root.steps))
+    assert names_of(sequences, possible) == {"grip a"}  # the other part needs a free cart or a filled place
+
+
+def test_a_phase_reaches_its_target_and_stays_safe(handover: Task) -> None:
+    x0 = handover.sample(1, seed=0)[0].double()
+    sequences = Sequences(handover, x0)
+    root = sequences.root(x0)
+    assert root is not None
+    if sequences._phases is None:
+        pytest.skip("no C compiler")
+    step = next(filter(root.relaxed.possible, root.steps))
+    ask = Ask(sequences._first_step + step, 0, sequences.steps - 1)
+    phase = sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0))
+    assert phase.margin >= 0.0
+    names = handover.system.names
+    p, q = (phase.states[: phase.sample + 2, names.index(name)] for name in "pq")
+    assert (q - p >= 1.0).all()
+    assert p[phase.sample] <= 0.5
+    part = phase.states[:, names.index("part")]
+    assert part[phase.sample] == 0.0
+    assert part[phase.sample + 1] == 1.0  # the jump happens in the next step
+    again = sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0))
+    assert np.array_equal(phase.plan, again.plan)
+
+
+def test_a_target_out_of_reach_is_approached(handover: Task) -> None:
+    x0 = handover.sample(1, seed=0)[0].double()
+    sequences = Sequences(handover, x0)
+    if sequences._phases is None:
+        pytest.skip("no C compiler")
+    root = sequences.root(x0)
+    assert root is not None
+    step = next(filter(root.relaxed.possible, root.steps))
+    ask = Ask(sequences._first_step + step, 0, 1)
+    phase = sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0))
+    assert sequences._phases.margin(x0.numpy(), ask) <= phase.margin < 0.0
+
+
+@pytest.mark.parametrize(
+    "mission",
+    [
+        "handover",
+        pytest.param("recipe", marks=pytest.mark.slow),
+        pytest.param("glider", marks=pytest.mark.slow),
+    ],
+)
+def test_missions_of_many_steps_are_planned(mission: str) -> None:
+    task = load_task(MISSIONS / f"{mission}.stl")
+    if task.native is None:
+        pytest.skip("no C compiler")
+    found = plan(task, task.sample(1, seed=4), budget=PlanBudget(30.0), seed=1)
+    assert bool(found.satisfied.all())
+
+
+def test_timers_and_heaters_are_regressed_to_jumps() -> None:
+    task = load_task(MISSIONS / "recipe.stl")
+    x0 = task.sample(1, seed=0)[0].double()
+    sequences = Sequences(task, x0)
+    root = sequences.root(x0)
+    assert root is not None
+    assert names_of(sequences, root.steps) >= {"to one", "to two", "cooked 1", "cooked 2", "wait"}
+    waits = [step for step in root.steps if root.relaxed.wait(step) is not None]
+    assert sorted(root.relaxed.wait(step) for step in waits) == pytest.approx([20.0, 20.0])
+
+
+def test_each_goal_in_a_chain_is_a_step() -> None:
+    task = load_task(MISSIONS / "glider.stl")
+    state = task.sample(1, seed=0)[0].double()
+    root = Sequences(task, state).root(state)
+    assert root is not None
+    assert (root.missing, len(root.goals)) == (4, 1)  # only the first is pending
