@@ -169,10 +169,9 @@ class Task:
         """
         decl, interface, overrides = system.decl, system.interface(), overrides or {}
         compiled = compile_spec(spec, grid=decl.grid, interface=interface, overrides=overrides, end=end)
-        due = compiled.mission
-        if due is not None and compiled.recurring is None and decl.mission:
-            longest = min(max(due, decl.horizon), max(decl.mission, decl.horizon), LONGEST)
-            grid = Grid(decl.dt, decl.horizon, max(longest, decl.horizon), decl.mission)
+        if compiled.mission is not None and compiled.recurring is None and decl.mission:
+            steps = max(decl.horizon, min(decl.mission, LONGEST))
+            grid = Grid(decl.dt, decl.horizon, steps, decl.mission)
             compiled = compile_spec(spec, grid=grid, interface=interface, overrides=overrides, end=end)
         if values:
             compiled = replace(compiled, parameters=fixed(compiled.parameters, values))

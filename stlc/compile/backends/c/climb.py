@@ -60,10 +60,10 @@ static void borrow(inputs *restrict v, int j, const double *restrict bank, int64
 }}
 
 /* Improves plans (batch, {steps}, {controls}) in place; rho (batch). Rows from `first` up to `last`.
-   1: no memory. bounds: low ({controls}), high ({controls}), turns ({controls}); factors ({rules}), then 1 for
-   rules of safety ({rules}). Plans are compared by the worst rule. If cycle > 0, this changes after so many
-   generations: by the sum over rules of what each lacks, r / (1 + r) or log(1 + r), then by the worst rule, and
-   so on; and of plans that violate rules, a safe one is returned, with the least sum of logarithms. */
+   1: no memory. bounds: low ({controls}), high ({controls}), turns ({controls}); factors ({rules}), then 1
+   for rules of safety ({rules}). Plans are compared by the worst rule. If cycle > 0, this changes after so
+   many generations: by the sum over rules of what each lacks, r / (1 + r) or log(1 + r), then by the worst
+   rule, and so on. Of plans that violate rules, a safe one with the least sum of logarithms is returned. */
 int climb(int64_t first, int64_t last, const double *x0, double *plans, double *rho, const double *bounds,
           const double *factors, const double *bank, int64_t banked, int generations, double enough,
           uint64_t seed, int cycle) {{
