@@ -174,3 +174,14 @@ def negate(formula: Any) -> Any:
             return map_children(replace(formula, op=DUAL[op]), formulas=negate)
         case _:
             raise TypeError(f"not a state formula: {formula!r}")
+
+
+def pieces(formula: ir.Formula) -> list[ir.Formula]:
+    """Split a formula into conjuncts: `always (a and b) and c` gives `always a`, `always b` and `c`."""
+    match formula:
+        case ir.BoolOp("and", items):
+            return [piece for item in items for piece in pieces(item)]
+        case ir.Temporal("always", _, body):
+            return [replace(formula, body=piece) for piece in pieces(body)]
+        case _:
+            return [formula]

@@ -21,6 +21,18 @@ def tolerance_of(rho: Array) -> float:
     return FLOAT32_TOLERANCE if str(getattr(rho, "dtype", "")).endswith("float32") else TOLERANCE
 
 
+def satisfied(rho: Array) -> Array:
+    """Return whether rho >= 0 up to rounding: rho >= -1e-6 in float64, rho >= -1e-5 in float32.
+
+    Args:
+        rho: robustness, an array of any shape.
+
+    Returns:
+        A boolean array of the same shape.
+    """
+    return rho >= -tolerance_of(rho)
+
+
 def weighed(rho: Array, factor: float, ops: Ops) -> Array:
     """Robustness of a requirement, multiplied by its weight and divided by its scale.
 

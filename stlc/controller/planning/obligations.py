@@ -22,7 +22,7 @@ from stlc.compile.ir.normal_form import normal
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -65,7 +65,7 @@ class Obligations:
             return self.first
         env = {name: np.array([[float(value)]]) for name, value in zip(self._names, state, strict=True)}
         bounds = evaluate(self._progressed, env, ops=NUMPY, end="lower", stop=self._horizon + 1)
-        met = tuple(bool(np.broadcast_to(bound[0], 1)[0] >= -TOLERANCE) for bound in bounds)
+        met = tuple(bool(satisfied(np.broadcast_to(bound[0], 1))[0]) for bound in bounds)
         return self._known(clock, met)
 
     def _formulas(self, clock: int, met: tuple[bool, ...]) -> tuple[ir.Formula, ...]:

@@ -27,7 +27,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined, negate
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.planning.phases import levels
 from stlc.dynamics.model.algebra import names_in, substitute
 
@@ -155,7 +155,7 @@ class Relaxation:
                     known = {name: column[:, :1] for name, column in env.items()}
                     env[assign.name][0, i + 1] = _values([ir.Predicate(assign.value)], known)[0, 0]
         values = _values(self._literals, env)
-        met = values >= -TOLERANCE
+        met = satisfied(values)
         better = met[:, 1:] | (growing & (values[:, 1:] > values[:, :1]))
         return RelaxedState(self, values[:, 0], met[:, 0], better)
 
@@ -401,7 +401,7 @@ def _folded(formula: ir.Formula) -> ir.Formula:
     """Replace the literals that read no signal by their truth."""
     if isinstance(formula, ir.Predicate) and not columns(formula):
         blank = {"": np.zeros((1, 1))}
-        return ir.Truth(bool(_values([formula], blank)[0, 0] >= -TOLERANCE))
+        return ir.Truth(bool(satisfied(_values([formula], blank))[0, 0]))
     if isinstance(formula, ir.BoolOp):
         return joined(formula.op, map(_folded, formula.items), ir.Truth(formula.op == "and"))
     return formula

@@ -21,7 +21,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined
 from stlc.compile.ir.traverse import nodes, operands
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -86,8 +86,8 @@ class Progression:
         )
         bounds = [
             _Bounds(
-                np.broadcast_to(lower, (count, 1))[:, 0] >= -TOLERANCE,
-                np.broadcast_to(upper, (count, 1))[:, 0] < -TOLERANCE,
+                satisfied(np.broadcast_to(lower, (count, 1))[:, 0]),
+                ~satisfied(np.broadcast_to(upper, (count, 1))[:, 0]),
             )
             for lower, upper in zip(low, high, strict=True)
         ]

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined
+from stlc.compile.ir.normal_form import joined, pieces
 from stlc.compile.ir.support import reach
 from stlc.compile.ir.traverse import nodes
 from stlc.controller.guard.feasibility import extremes
@@ -30,7 +30,6 @@ from stlc.controller.planning.obligations import Obligations
 from stlc.controller.planning.phases import Ask, Phase, Phases
 from stlc.controller.planning.relaxation import Relaxation, RelaxedState
 from stlc.controller.planning.residuals import NO, YES, Progression, looks_ahead
-from stlc.controller.training.exploration import pieces
 
 if TYPE_CHECKING:
     from numpy.random import Generator

@@ -20,7 +20,7 @@ from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import is_state, nodes
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.switch import Hard, Switch
-from stlc.compile.semantics.tolerance import tolerance_of
+from stlc.compile.semantics.tolerance import satisfied as satisfied
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.native import check_plans
@@ -88,18 +88,6 @@ class PlanVerdicts:
             self.plans.index_copy(0, index, other.plans),
             columns,
         )
-
-
-def satisfied(rho: Tensor) -> Tensor:
-    """Return whether rho >= 0 up to rounding: rho >= -1e-6 in float64, rho >= -1e-5 in float32.
-
-    Args:
-        rho: robustness, any shape.
-
-    Returns:
-        A boolean tensor of the same shape.
-    """
-    return rho >= -tolerance_of(rho)
 
 
 def _on_starts(compiled: Compiled, system: System) -> dict[str, ir.Formula]:

@@ -13,7 +13,7 @@ then explore").
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.normal_form import pieces
 from stlc.compile.ir.support import columns
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.native import Effort
@@ -56,17 +56,6 @@ USUAL = 30
 """Plan length in steps to which `EFFORTS` refers; the cost of a sweep grows with its square."""
 RAISED = 250
 """Generations of the local search that increases the margin of a found plan."""
-
-
-def pieces(formula: ir.Formula) -> list[ir.Formula]:
-    """Split a formula into conjuncts: `always (a and b) and c` gives `always a`, `always b` and `c`."""
-    match formula:
-        case ir.BoolOp("and", items):
-            return [piece for item in items for piece in pieces(item)]
-        case ir.Temporal("always", _, body):
-            return [replace(formula, body=piece) for piece in pieces(body)]
-        case _:
-            return [formula]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.normal_form import pieces
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.methods import Validation
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
-from stlc.controller.training.exploration import Exploration, pieces
+from stlc.controller.training.exploration import Exploration
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.local_search import Searcher
 from stlc.dynamics.model.system import System
