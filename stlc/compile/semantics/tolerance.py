@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from stlc.compile.backends.array.namespace import Array, Ops
 
+A = TypeVar("A")
 TOLERANCE = 1e-6
 """A requirement counts as satisfied if its robustness is >= -TOLERANCE, in float64.
 
@@ -21,7 +22,7 @@ def tolerance_of(rho: Array) -> float:
     return FLOAT32_TOLERANCE if str(getattr(rho, "dtype", "")).endswith("float32") else TOLERANCE
 
 
-def satisfied(rho: Array) -> Array:
+def satisfied(rho: A) -> A:
     """Return whether rho >= 0 up to rounding: rho >= -1e-6 in float64, rho >= -1e-5 in float32.
 
     Args:
@@ -30,7 +31,9 @@ def satisfied(rho: Array) -> Array:
     Returns:
         A boolean array of the same shape.
     """
-    return rho >= -tolerance_of(rho)
+    values: Any = rho
+    verdict: A = values >= -tolerance_of(values)
+    return verdict
 
 
 def weighed(rho: Array, factor: float, ops: Ops) -> Array:

@@ -155,7 +155,7 @@ class Relaxation:
                     known = {name: column[:, :1] for name, column in env.items()}
                     env[assign.name][0, i + 1] = _values([ir.Predicate(assign.value)], known)[0, 0]
         values = _values(self._literals, env)
-        met = satisfied(values)
+        met = satisfied(values).astype(np.bool_)
         better = met[:, 1:] | (growing & (values[:, 1:] > values[:, :1]))
         return RelaxedState(self, values[:, 0], met[:, 0], better)
 

@@ -86,8 +86,8 @@ class Progression:
         )
         bounds = [
             _Bounds(
-                satisfied(np.broadcast_to(lower, (count, 1))[:, 0]),
-                ~satisfied(np.broadcast_to(upper, (count, 1))[:, 0]),
+                satisfied(np.broadcast_to(lower, (count, 1))[:, 0]).astype(np.bool_),
+                np.logical_not(satisfied(np.broadcast_to(upper, (count, 1))[:, 0])),
             )
             for lower, upper in zip(low, high, strict=True)
         ]
