@@ -218,15 +218,15 @@ def _remainder(leaf: GoalLeaf, formula: Absolute, steps: int, *, alive: bool) ->
             return typed.Logic(span, "or", (known, far, soon))
         case "until":
             later = typed.Logic(span, "and", (far, typed.Temporal(left.span, "always", plan, left)))
-            either = typed.Logic(span, "or", (later, typed.Until(span, "until", plan, left, met)))
-            rest = typed.Logic(span, "and", (possible(leaf), either)) if alive else either
-            return typed.Logic(span, "or", (known, rest))
+            reached = typed.Until(span, "until", plan, left, met)
+            rest: typed.Formula = typed.Logic(span, "or", (later, reached))
         case "release":
-            freed = typed.Until(span, "release", plan, left, asked)
-            rest = typed.Logic(span, "and", (possible(leaf), freed)) if alive else freed
-            return typed.Logic(span, "or", (known, rest))
+            rest = typed.Until(span, "release", plan, left, asked)
         case _:
             assert_never(formula.op)
+    if alive:
+        rest = typed.Logic(span, "and", (possible(leaf), rest))
+    return typed.Logic(span, "or", (known, rest))
 
 
 def possible(goal: Goal) -> typed.Formula:

@@ -163,7 +163,8 @@ SECONDS = Kind(lambda cx, node, label: cx.here.duration(node, label), EXPRESSION
 STEPS = Kind(lambda cx, node, label: cx.here.steps(node, label, cx.dt), EXPRESSION)
 """A positive number of steps, given as a number or as a time."""
 INSTANT = Kind(
-    lambda cx, node, label: 0 if node.text.strip() in _ZERO else STEPS.read(cx, node, label), EXPRESSION
+    lambda cx, node, label: 0 if getattr(node, "text", "").strip() in _ZERO else STEPS.read(cx, node, label),
+    EXPRESSION,
 )
 """An instant in steps from the start, given as a number or as a time."""
 FORMULA = Kind(lambda cx, node, label: cx.here.formula(node, label), EXPRESSION)
