@@ -14,7 +14,6 @@ from stlc.assurance.strategies import (
     PIECES,
     AlternatingVertices,
     CoarseSampling,
-    ConstantVertices,
     GradientVertices,
     PeriodicInputs,
     Perturbation,
@@ -22,16 +21,16 @@ from stlc.assurance.strategies import (
     UniformSampling,
     VertexSampling,
 )
-from stlc.assurance.surrogate import SurrogateSearch, TrustRegionSearch
+from stlc.assurance.surrogate import SurrogateSearch
 
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
 OPENING = 4
-"""Random points with which a search begins, after vertices and constant inputs."""
+"""Coarse inputs with which a search begins, after vertices and perturbations of them."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
-BLIND, BLIND_TURNS = 4, 12
-"""Vertices with which a search begins if robustness is no guide; then one point in so many is a vertex."""
+FLAT_TURNS, BLIND_TURNS = 6, 12
+"""Points one of which is a vertex, the others uniform: while robustness is flat, and if it is no guide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,19 +41,11 @@ class Proposal:
     point: Point
 
 
-@dataclass(frozen=True, slots=True)
-class _Opening:
-    """Points with which a search begins: one of a strategy, or all that it has."""
-
-    strategy: Strategy
-    once: bool = True
-
-
 class Portfolio:
-    """The strategies of a search, in turn: vertices and constant inputs, random points, then all of them.
+    """The strategies of a search, in turn: a few points of some of them, then all.
 
-    Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogates of the whole space and of a
-    trust region, two ninths are random, and a ninth follows the gradient or is periodic. Of the points after
+    Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are coarse, or
+    uniform if no input has many values, and a ninth follows the gradient or is periodic. Of the points after
     these a third is random, a third goes to the strategy that has found the least robust point, and a third
     to all in turn. If the robustness takes few values, as that of conditions on gears does, nothing can be
     learnt from it: then points are drawn at random. In a space most of whose coordinates have no effect,
@@ -83,41 +74,36 @@ class Portfolio:
                 drawn at random.
             without: names of strategies that have no turns, to see what they contribute.
         """
-        uniform, vertices = UniformSampling(space, generator), VertexSampling(space, generator)
+        uniform = UniformSampling(space, generator)
         self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
         self._guided = not random and not space.sparse and graded and space.dim > 0
-        self._blind: list[Strategy] = [uniform] if random else [*[uniform] * 5, vertices]
-        self._drawn: Strategy = vertices
-        self._leading: list[Strategy] = []
+        self._blind: list[Strategy] = [uniform]
+        if not random:
+            self._blind *= FLAT_TURNS - 1 if graded else BLIND_TURNS - 1
+            self._blind.append(VertexSampling(space, generator))
+        self._drawn: Strategy = uniform
+        self._leading: Strategy = uniform
+        self._first: list[Strategy] = []
         self._others: list[Strategy] = []
-        first = list[_Opening]()
         if self._guided:
-            climb, constant = GradientVertices(space, generator, gradient), ConstantVertices(space, generator)
-            constants, descent = _Opening(constant, once=False), _Opening(climb, once=False)
-            perturbed = _Opening(Perturbation(space, generator), once=False)
-            self._leading, self._others = [SurrogateSearch(space, generator)], [climb]
+            climb, coarse = GradientVertices(space, generator, gradient), CoarseSampling(space, generator)
+            surrogate = SurrogateSearch(space, generator)
+            self._others.append(climb)
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
-            if space.small:
-                self._drawn, first = uniform, [*[_Opening(vertices)] * 2, constants, perturbed, descent]
+            if not space.small:
+                self._first.append(AlternatingVertices(space, generator))
+            if space.small or len(space.blocks) < 2:
+                self._first.append(Perturbation(space, generator))
+            if any(len(block.values) > max(PIECES) for block in space.blocks) and coarse.name not in without:
+                self._drawn = coarse
+                self._first += [coarse, climb, *[coarse] * (OPENING - 1)]
             else:
-                self._leading.append(TrustRegionSearch(space, generator))
-                if any(len(block.values) > max(PIECES) for block in space.blocks):
-                    self._drawn = CoarseSampling(space, generator)
-                drawn, alternating = _Opening(self._drawn), AlternatingVertices(space, generator)
-                several = len(space.blocks) > 1
-                simple = [_Opening(constant)] * 2 if several else [constants, perturbed]
-                first = [_Opening(alternating, once=False), *simple, drawn, descent, constants]
-                first += [drawn] * (OPENING - 1)
-        elif not random and not graded:
-            self._blind = [*[uniform] * (BLIND_TURNS - 1), vertices]
-            first = [_Opening(vertices)] * BLIND
-        self._first = [each for each in first if each.strategy.name not in without]
-        if self._drawn.name in without:
-            self._drawn = uniform
-        for turns in (self._leading, self._others):
-            turns[:] = [each for each in turns if each.name not in without] or [self._drawn]
-        self._late = [*self._others, *self._leading]
+                self._first.append(climb)
+            self._leading = self._drawn if surrogate.name in without else surrogate
+            self._first = [each for each in self._first if each.name not in without]
+            self._others = [each for each in self._others if each.name not in without] or [self._drawn]
+        self._late = [*self._others, self._leading]
         self._turn = 0
         self._values: deque[float] = deque(maxlen=FLAT_VALUES)
 
@@ -129,12 +115,12 @@ class Portfolio:
 
     def next(self) -> Proposal:
         """Return the next point and the strategy that proposes it."""
-        while (opening := next((each for each in self._first if each.strategy.ready), None)) is not None:
-            point = opening.strategy.propose()
-            if point is None or opening.once:
+        while (opening := next((each for each in self._first if each.ready), None)) is not None:
+            point = opening.propose()
+            if point is None or opening is self._drawn:
                 self._first.remove(opening)
             if point is not None:
-                return Proposal(opening.strategy, point)
+                return Proposal(opening, point)
         while True:
             strategy = self._chosen()
             point = strategy.propose()
@@ -150,7 +136,7 @@ class Portfolio:
         self._turn += 1
         if self._turn <= SURROGATE_TURNS:
             if self._turn % 3:
-                return _rotated(self._leading)
+                return self._leading
             return self._drawn if self._turn % 9 else _rotated(self._others)
         if self._turn % 3 == 0:
             return self._drawn
@@ -180,7 +166,7 @@ class Portfolio:
         """Strategies that learn from the points of others."""
         if self._sensitive is not None:
             return (self._sensitive,)
-        return tuple(dict.fromkeys((*self._late, *(each.strategy for each in self._first))))
+        return tuple(dict.fromkeys((*self._late, *self._first)))
 
 
 def _rotated(strategies: list[Strategy]) -> Strategy:
