@@ -251,7 +251,7 @@ def side_by_side(simulator: ModelSimulator, searches: Sequence[ViolationSearch],
     going = searches
     while going:
         points = [search.ask(1) for search in going]
-        outcomes = simulator.simulate_apart(points, [search.focus for search in going])
+        outcomes = simulator.simulate_apart(points, [search.requirement for search in going])
         for search, point, outcome in zip(going, points, outcomes, strict=True):
             search.tell(point, outcome)
         going = [each for each in going if each.found is None and each.tried < most]

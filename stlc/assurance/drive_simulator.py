@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.simulation import PARTS, Focus, Simulations
+from stlc.assurance.simulation import PARTS, Simulations
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
@@ -89,19 +89,19 @@ class DriveSimulator:
         """True: robustness of drives varies with their states."""
         return True
 
-    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
-        """Simulate `points`, (count, dim), and judge the drives.
+    def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
+        """Simulate `points`, (count, dim), and judge the drives by a requirement.
 
         A point is admissible if the assumptions of the specification hold for one of its agents. It has a
         verdict if one of them violates the requirement, or all have a verdict.
         """
         verdict = self._verdict(self.drive(points))
-        margins = self._margins_of_agents(verdict).min(1)[:, focus.requirement]
+        margins = self._margins_of_agents(verdict).min(1)[:, requirement]
         inside = np.broadcast_to(_inside(verdict), (len(points) * self.setting.agents,))
         admissible: NDArray[np.bool_] = np.any(inside.reshape(len(points), -1), axis=1)
-        open_ = np.array(verdict.requirements[focus.requirement].statuses) == "inconclusive"
+        open_ = np.array(verdict.requirements[requirement].statuses) == "inconclusive"
         judged = (margins < -TOLERANCE) | ~open_.reshape(len(points), -1).any(1)
-        return Simulations.unscaled(margins, admissible, judged)
+        return Simulations(margins, admissible, judged)
 
     def drive(self, points: NDArray[np.float64], watch: Watch | None = None) -> DeploymentRecording:
         """Simulate `points`, (count, dim), side by side, and return the recorded drives.
@@ -144,7 +144,7 @@ class DriveSimulator:
     def at_half_step(
         self,
         points: NDArray[np.float64],  # noqa: ARG002
-        focus: Focus,  # noqa: ARG002
+        requirement: int,  # noqa: ARG002
     ) -> Simulations | None:
         """None: a world has the time step for which it was written, and the policy that of its training."""
         return None

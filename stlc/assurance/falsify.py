@@ -17,16 +17,15 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.guidance import SAMPLES, scales_of
 from stlc.assurance.portfolio import Portfolio, Proposal
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
-from stlc.assurance.simulation import Focus, Simulations, Simulator
+from stlc.assurance.simulation import Simulations, Simulator
 from stlc.assurance.strategies import GradientVertices
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 
-FALSIFIER_VERSION = 12
+FALSIFIER_VERSION = 13
 """Version of the search; results of older versions are recomputed."""
 CELLS = 4
 """Cells per coordinate of the grid on which pairwise coverage is counted."""
@@ -109,11 +108,8 @@ class Falsification:
 class ViolationSearch:
     """A search for a violation of one requirement, as a dialogue: points are asked for, outcomes are told.
 
-    The first simulations measure the sizes of the predicates. They are judged again with the scales that
-    follow, before the strategies learn from them.
-
     Attributes:
-        focus: what the next points are judged by.
+        requirement: index of the requirement that judges the points.
         found: the counterexample; None until there is one.
         tried: number of simulations.
         inconclusive: number of those without a verdict.
@@ -130,19 +126,15 @@ class ViolationSearch:
         without: Collection[str] = (),
     ) -> None:
         """Begin a search; arguments as of `falsify`, and names of strategies that have no turns."""
-        self._simulator, self._requirement = simulator, requirement
+        self._simulator, self.requirement = simulator, requirement
         self._part = simulator.space.visible(simulator.seen(requirement))
         generator, graded = np.random.default_rng(seed), simulator.graded(requirement)
         self._portfolio = Portfolio(
             self._part.space, generator, self._gradient, random=random, graded=graded, without=without
         )
-        self.focus = Focus(requirement, sized=True)
         self.found: Counterexample | None = None
         self.tried, self.inconclusive, self.least = 0, 0, math.inf
         self._open: list[Proposal] = []
-        self._first: list[Proposal] = []
-        self._sizes: list[NDArray[np.float64]] = []
-        self._again = False
         self._points: list[Point] = []
         self._spurious: list[Counterexample] = []
         self._counts: Counter[str] = Counter()
@@ -154,42 +146,25 @@ class ViolationSearch:
         return self._row >= REJECTED
 
     def ask(self, count: int) -> NDArray[np.float64]:
-        """Points to simulate next, (k, dim); k is `count`, unless the first ones are judged again."""
-        if self._again:
-            self._open, self._first = self._first, []
-        else:
-            self._open = [self._portfolio.next() for _ in range(count)]
+        """Points to simulate next, (count, dim)."""
+        self._open = [self._portfolio.next() for _ in range(count)]
         return np.stack([self._part.whole(each.point) for each in self._open])
 
     def tell(self, points: NDArray[np.float64], outcome: Simulations) -> None:
         """Take the outcomes of the points that were asked for."""
-        again, self._again = self._again, False
-        told = outcome.guidance.copy()
-        if not again:
-            self._count(points, outcome, told)
-        if outcome.sizes.shape[1] == 0:
-            self.focus = Focus(self._requirement, self.focus.scales)
-            self._teach(outcome, told)
-            return
-        self._first += self._open
-        self._sizes.append(outcome.sizes)
-        if len(self._first) >= SAMPLES:
-            self.focus = Focus(self._requirement, scales_of(np.concatenate(self._sizes)))
-            self._again = True
+        told = outcome.margins.copy()
+        self._count(points, outcome, told)
+        for index, each in enumerate(self._open):
+            self._portfolio.tell(each, float(told[index]) if outcome.admissible[index] else math.inf)
 
     def _gradient(self, point: Point) -> Point | None:
         """Gradient of the robustness at a point, which counts as a simulation; None if there is none."""
-        found = self._simulator.gradient(self._part.whole(point), self._requirement)
+        found = self._simulator.gradient(self._part.whole(point), self.requirement)
         if found is None:
             return None
         self.tried += 1
         self._counts[GradientVertices.name] += 1
         return found[list(self._part.coordinates)]
-
-    def _teach(self, outcome: Simulations, told: NDArray[np.float64]) -> None:
-        for index, each in enumerate(self._open):
-            value = float(told[index]) if outcome.admissible[index] else math.inf
-            self._portfolio.tell(each, value)
 
     def _count(self, points: NDArray[np.float64], outcome: Simulations, told: NDArray[np.float64]) -> None:
         """Count simulations, and examine violations; `told`, (count,), becomes what strategies are told."""
@@ -210,32 +185,31 @@ class ViolationSearch:
                 told[index] = self._examined(points[index], margin, name)
 
     def _examined(self, point: Point, margin: float, name: str) -> float:
-        """Examine a violation at half the time step, and return the guidance there, which may be positive.
+        """Examine a violation at half the time step, and return the robustness there, which may be positive.
 
         A drive is simulated alone first, as a replay does: the rounding of a policy's plans depends on the
         number of drives that are simulated side by side.
         """
         simulator = self._simulator
         if simulator.space.sparse and simulator.batch > 1:
-            margin = float(simulator.simulate(point[None], self.focus).margins[0])
+            margin = float(simulator.simulate(point[None], self.requirement).margins[0])
             if margin >= -TOLERANCE:
                 return margin
-        half = self._simulator.at_half_step(point[None], self.focus)
-        at_half = None if half is None else float(half.margins[0])
-        candidate = Counterexample(point, margin, at_half, name, self.tried)
+        half = simulator.at_half_step(point[None], self.requirement)
+        candidate = _candidate(point, margin, half, name, self.tried)
         if candidate.spurious:
             self._spurious.append(candidate)
         else:
             self.found = candidate
-        return margin if half is None else float(half.guidance[0])
+        return margin if half is None else float(half.margins[0])
 
     def result(self, seconds: float = 0.0, *, shrinks: bool = True) -> Falsification:
         """The result so far, after `seconds`; a counterexample is shrunk if `shrinks`."""
         simulator, found = self._simulator, self.found
         return Falsification(
-            simulator.requirements[self._requirement],
+            simulator.requirements[self.requirement],
             found,
-            shrunk(simulator, self._requirement, found) if found is not None and shrinks else None,
+            shrunk(simulator, self.requirement, found) if found is not None and shrinks else None,
             tuple(self._spurious),
             self.tried if found is None else found.simulation,
             self.inconclusive,
@@ -272,7 +246,7 @@ def falsify(
         if budget.seconds is not None and perf_counter() - began > budget.seconds:
             break
         points = search.ask(min(simulator.batch, budget.simulations - search.tried))
-        search.tell(points, simulator.simulate(points, search.focus))
+        search.tell(points, simulator.simulate(points, requirement))
     return search.result(perf_counter() - began, shrinks=shrinks)
 
 
@@ -346,10 +320,10 @@ def _search(simulator: Simulator, ordered: _Ordered) -> Falsification:
 
 
 def _candidate(
-    simulator: Simulator, requirement: int, point: Point, margin: float, strategy: str, count: int
+    point: Point, margin: float, half: Simulations | None, strategy: str, count: int
 ) -> Counterexample:
-    half = simulator.at_half_step(point[None], Focus(requirement))
-    at_half = None if half is None else float(half.margins[0])
+    """Counterexample with its robustness at half the step: NaN, which refutes nothing, without a verdict."""
+    at_half = None if half is None else float(half.margins[0] if half.judged[0] else np.nan)
     return Counterexample(point, margin, at_half, strategy, count)
 
 
@@ -366,10 +340,11 @@ def shrunk(simulator: Simulator, requirement: int, found: Counterexample) -> Cou
             point = _set(found.point, coordinates, value)
             if np.array_equal(point, found.point):
                 break
-            outcome = simulator.simulate(point[None], Focus(requirement))
+            outcome = simulator.simulate(point[None], requirement)
             margin = float(outcome.margins[0])
             if outcome.admissible[0] and margin < -TOLERANCE:
-                simpler = _candidate(simulator, requirement, point, margin, found.strategy, found.simulation)
+                half = simulator.at_half_step(point[None], requirement)
+                simpler = _candidate(point, margin, half, found.strategy, found.simulation)
                 if not simpler.spurious:
                     found = simpler
                     break

@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.assurance.guidance import Columns, ScaledRobustness, graded
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
-from stlc.assurance.simulation import PARTS, Focus, Simulations
+from stlc.assurance.simulation import PARTS, Simulations
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns as columns_read_by
+from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.planning.planner import PlanResult
 from stlc.controller.planning.traces import trace_of
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.trace import Trace
 
+Columns = Mapping[str, NDArray[np.float64]]
+"""Signals of simulations: name -> (time, batch)."""
 SMALL = 1e-4
 """Differences, in the unit cube, by which initial states are differentiated."""
 SLOPE = 10.0
@@ -129,43 +132,41 @@ class ModelSimulator:
         return min(last * self.task.system.dt / _duration(self.task), 1.0)
 
     def graded(self, requirement: int) -> bool:
-        """True if the robustness varies with real signals, rather than with whole numbers."""
-        return graded(self.task.rules[requirement].formula, self.task.system.decl.signature)
+        """True if a predicate reads a real signal, so that its margin varies continuously."""
+        whole = {each.name for each in self.task.system.decl.signature.columns if each.kind != "real"}
+        found = nodes(self.task.rules[requirement].formula)
+        predicates = [each for each in found if isinstance(each, ir.Predicate) and not each.guard]
+        return not predicates or any(columns_read_by(each) - whole for each in predicates)
 
-    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
-        """Simulate and judge `points`, (count, dim)."""
-        return self.simulate_apart([points], [focus])[0]
+    def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
+        """Simulate `points`, (count, dim), and judge them by a requirement."""
+        return self.simulate_apart([points], [requirement])[0]
 
     def simulate_apart(
-        self, parts: Sequence[NDArray[np.float64]], foci: Sequence[Focus]
+        self, parts: Sequence[NDArray[np.float64]], requirements: Sequence[int]
     ) -> list[Simulations]:
-        """Simulate the points of several searches side by side, and judge each part by its own focus.
+        """Simulate the points of several searches side by side, and judge each part by its own requirement.
 
         The native kernel takes about as long for sixteen points as for one.
         """
         states = self.points.states(torch.from_numpy(np.concatenate(parts)))
         admissible = self.points.admissible(states).numpy()
         columns, found, end = self._moved(self.task, states), [], 0
-        for part, focus in zip(parts, foci, strict=True):
+        for part, requirement in zip(parts, requirements, strict=True):
             rows, end = slice(end, end + len(part)), end + len(part)
             own = {name: np.ascontiguousarray(column[:, rows]) for name, column in columns.items()}
-            found.append(self._judged(self.task, own, focus, admissible[rows]))
+            found.append(self._judged(self.task, own, requirement, admissible[rows]))
         return found
 
     @staticmethod
-    def _judged(task: Task, columns: Columns, focus: Focus, admissible: NDArray[np.bool_]) -> Simulations:
-        guide = _guides(task)[focus.requirement]
-        margins = guide(columns, None)
+    def _judged(task: Task, columns: Columns, requirement: int, admissible: NDArray[np.bool_]) -> Simulations:
+        margins = _margins(task, columns, [requirement])[:, 0]
         broken = ~np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
         margins = np.where(broken | np.isnan(margins), -np.inf, margins)
-        guidance = margins
-        if focus.scales is not None:
-            guidance = np.where(np.isneginf(margins), -np.inf, guide(columns, focus.scales))
-        sizes = guide.sizes(columns) if focus.sized else np.zeros((len(margins), 0))
         every = np.ones(len(margins), dtype=np.bool_)
-        return Simulations(margins, guidance, admissible & in_scope(task, columns), sizes, every)
+        return Simulations(margins, admissible & in_scope(task, columns), every)
 
-    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> Simulations | None:
         """Outcomes at half the time step; None for a system in discrete time.
 
         A requirement that counts samples is judged by the same samples, at half the step of the integration.
@@ -174,8 +175,8 @@ class ModelSimulator:
             return None
         states = self.points.states(torch.tensor(points))
         admissible = self.points.admissible(states).numpy()
-        task = self.finer(counts_samples(self.task.rules[focus.requirement].typed.formula))
-        return self._judged(task, self._moved(task, states), focus, admissible)
+        task = self.finer(counts_samples(self.task.rules[requirement].typed.formula))
+        return self._judged(task, self._moved(task, states), requirement, admissible)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:
         """Gradient of the exact robustness at a point, (dim,), by the native kernel.
@@ -264,12 +265,6 @@ def in_scope(task: Task, columns: Columns) -> NDArray[np.bool_]:
         _, high = rule_bounds(rule, Record.of(columns, NUMPY), range(1), task.horizon, "open")
         scope &= ~(high[0] < -TOLERANCE)
     return scope
-
-
-@cache
-def _guides(task: Task) -> tuple[ScaledRobustness, ...]:
-    """Guidance of each requirement of a task."""
-    return tuple(ScaledRobustness(rule.formula) for rule in task.rules)
 
 
 @cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,16 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.guidance import ScaledRobustness
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
-from stlc.assurance.simulation import Focus, Simulations
+from stlc.assurance.simulation import Simulations
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.monitor.instants import rule_bounds, starts_of
-from stlc.monitor.signals import arrange, needs_of
-from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 from stlc.plants.judge import PlantJudge
 from stlc.plants.plant import Plant, PlantFinding, PlantRun
@@ -54,75 +50,6 @@ class RepeatedSimulation:
 
     trace: Trace
     margin: float
-
-
-@dataclass(frozen=True, slots=True)
-class _JudgedTrace:
-    """One simulation under one requirement.
-
-    Attributes:
-        margin: exact robustness; +inf if the simulation failed.
-        guidance: robustness with scaled predicates.
-        sizes: sizes of the margins of the predicates, (predicates,); empty if they are not wanted.
-        inside: whether the assumptions of the specification hold.
-        failed: whether there is no trace.
-        judged: whether there is a verdict: a simulation that ended early may have none.
-    """
-
-    margin: float
-    guidance: float
-    sizes: NDArray[np.float64]
-    inside: bool = True
-    failed: bool = False
-    judged: bool = True
-
-
-@dataclass(frozen=True)
-class _Judging:
-    """Judgement of simulations by the requirements of a monitor, with scaled guidance."""
-
-    monitor: Monitor
-
-    @cached_property
-    def _guides(self) -> tuple[ScaledRobustness, ...]:
-        return tuple(ScaledRobustness(rule.formula) for rule in self.monitor.compiled.requirements)
-
-    def __call__(self, run: PlantRun, focus: Focus) -> _JudgedTrace:
-        """Judge one simulation."""
-        guide, compiled = self._guides[focus.requirement], self.monitor.compiled
-        sizes = np.zeros(len(guide.predicates) if focus.sized else 0)
-        if isinstance(run.outcome, PlantFinding):
-            return _JudgedTrace(np.inf, np.inf, sizes, failed=True, judged=False)
-        rule = compiled.requirements[focus.requirement]
-        verdict = self.monitor.check(run.outcome, require=(rule.name,))
-        margin = float(verdict.requirements[0].high.min())
-        inside, judged = verdict.statuses[0] != "out of scope", verdict.statuses[0] != "inconclusive"
-        signals, guidance = arrange(run.outcome, needs_of(compiled, [rule]), plain=True), margin
-        if focus.sized:
-            (sizes,) = guide.sizes(signals.env)
-        if focus.scales is not None:
-            scaled = guide.scaled(focus.scales)
-            rule = replace(rule, formula=scaled, lowered=scaled)
-            starts = starts_of(rule, signals.samples, compiled.grid.horizon, None)
-            record = Record.of(signals.env, signals.ops)
-            _, high = rule_bounds(rule, record, starts, compiled.grid.horizon, "open")
-            guidance = float(high.min())
-        return _JudgedTrace(margin, guidance, sizes, inside, judged=judged)
-
-
-def _together(found: Sequence[_JudgedTrace]) -> Simulations:
-    """Outcomes of several simulations; the sizes of failed ones are taken to be typical of the others."""
-    sizes = np.stack([each.sizes for each in found])
-    failed = np.array([each.failed for each in found], dtype=np.bool_)
-    if failed.any() and not failed.all():
-        sizes[failed] = np.median(sizes[~failed], axis=0)
-    return Simulations(
-        np.array([each.margin for each in found]),
-        np.array([each.guidance for each in found]),
-        np.array([each.inside for each in found], dtype=np.bool_),
-        sizes,
-        np.array([each.judged for each in found], dtype=np.bool_),
-    )
 
 
 @dataclass(frozen=True)
@@ -190,10 +117,6 @@ class PlantSimulator:
         """Names of the requirements."""
         return self.monitor.requirements
 
-    @cached_property
-    def _judging(self) -> _Judging:
-        return _Judging(self.judge.monitor)
-
     def seen(self, requirement: int) -> float:
         """Share of the duration, at most 1, after which values of inputs no longer affect a requirement.
 
@@ -212,39 +135,29 @@ class PlantSimulator:
 
     # ------------------------------------------------------------------------ simulation
 
-    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
-        """Simulate and judge `points`, (count, dim)."""
+    def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
+        """Simulate `points`, (count, dim), and judge them by a requirement."""
         runs = self.plant.simulate(self.plant.points_of(points), jobs=self.jobs)
         for point, run in zip(points, runs, strict=True):
             known = any(np.array_equal(each.point, point) for each in self.findings)
             if isinstance(run.outcome, PlantFinding) and not known:
                 self.findings.append(FailedSimulation(point, run.outcome))
-        return _together([self._judging(run, focus) for run in runs])
+        return _judged(self.monitor, runs, requirement)
 
-    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> Simulations | None:
         """Outcomes at half the time step; None if the plant file does not allow it.
 
         None too for a requirement that counts samples, which would mean other times there.
-
-        The margin of a simulation without a verdict is NaN there: it neither confirms a violation nor refutes
-        it.
         """
-        rule = self.monitor.compiled.requirements[focus.requirement]
+        rule = self.monitor.compiled.requirements[requirement]
         if self._finer is None or counts_samples(rule.typed.formula):
             return None
         plant = self._finer.plant
-        found = [self._finer_judging(run, focus) for run in plant.simulate(plant.points_of(points))]
-        confirmed = [each if each.judged else replace(each, margin=np.nan) for each in found]
-        return _together(confirmed)
+        return _judged(self._finer.monitor, plant.simulate(plant.points_of(points)), requirement)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
         """None: a black box has no gradient."""
         return None
-
-    @cached_property
-    def _finer_judging(self) -> _Judging:
-        assert self._finer is not None
-        return _Judging(self._finer.monitor)
 
     @cached_property
     def _finer(self) -> PlantJudge | None:
@@ -285,6 +198,20 @@ class PlantSimulator:
             note = (f"{found.reason}: {found.message}",)
             raise SystemFileError(Diagnostic("S401", message, decl.places.get(decl.kind), note=note))
         return self.judge.stored([found])
+
+
+def _judged(monitor: Monitor, runs: Sequence[PlantRun], requirement: int) -> Simulations:
+    """Judge simulations by a requirement; the robustness of a failed one is +inf."""
+    name = monitor.compiled.requirements[requirement].name
+    margins = np.full(len(runs), np.inf)
+    inside, judged = np.ones(len(runs), dtype=np.bool_), np.zeros(len(runs), dtype=np.bool_)
+    for index, run in enumerate(runs):
+        if not isinstance(run.outcome, PlantFinding):
+            verdict = monitor.check(run.outcome, require=(name,))
+            margins[index] = verdict.requirements[0].high.min()
+            inside[index] = verdict.statuses[0] != "out of scope"
+            judged[index] = verdict.statuses[0] != "inconclusive"
+    return Simulations(margins, inside, judged)
 
 
 def _reads_everything(rule: CompiledRequirement) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.simulation import Focus, Simulations, Simulator, SimulatorSource
+from stlc.assurance.simulation import Simulations, Simulator, SimulatorSource
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, CallWorkers, LostCall, results
 
 if TYPE_CHECKING:
@@ -159,47 +159,38 @@ class SharedSimulator:
         """True if the robustness varies with real signals, rather than with whole numbers."""
         return self.local.graded(requirement)
 
-    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
-        """Simulate and judge `points`, (count, dim), in equal parts."""
+    def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
+        """Simulate `points`, (count, dim), in equal parts, and judge them by a requirement."""
         parts = [points[first : first + self.part] for first in range(0, len(points), self.part)]
         if self.workers is None or len(points) == 1:
-            return Simulations.joined([self.local.simulate(part, focus) for part in parts])
-        found = list(self.workers.run(_simulated, [_Part(part, focus) for part in parts]))
-        known = [each for each in found if not isinstance(each, LostCall)]
-        sizes = np.concatenate([each.sizes for each in known]) if known else np.zeros((0, 0))
+            return Simulations.joined([self.local.simulate(part, requirement) for part in parts])
+        found = self.workers.run(_simulated, [_Part(part, requirement) for part in parts])
         whole = []
         for part, each in zip(parts, found, strict=True):
             if isinstance(each, LostCall):
                 self.workers.lost += len(part)
-                whole.append(_missing(len(part), sizes))
+                outside = np.zeros(len(part), dtype=np.bool_)
+                whole.append(Simulations(np.full(len(part), np.inf), outside, outside))
             else:
                 whole.append(each)
         return Simulations.joined(whole)
 
-    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> Simulations | None:
         """Outcomes at half the time step; None if the step cannot be changed."""
-        return self.local.at_half_step(points, focus)
+        return self.local.at_half_step(points, requirement)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:
         """Gradient of the exact robustness at a point, (dim,); None if there is none."""
         return self.local.gradient(point, requirement)
 
 
-def _missing(count: int, sizes: NDArray[np.float64]) -> Simulations:
-    """Outcomes of lost simulations; the sizes of their predicates are taken to be typical, of `sizes`."""
-    typical = np.median(sizes, axis=0) if len(sizes) else np.zeros(sizes.shape[1])
-    nothing = np.full(count, np.inf)
-    outside = np.zeros(count, dtype=np.bool_)
-    return Simulations(nothing, nothing, outside, np.tile(typical, (count, 1)), outside)
-
-
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Points, (count, dim), as they are sent to a worker, and the focus of their judgement."""
+    """Points, (count, dim), as they are sent to a worker, and the requirement that judges them."""
 
     points: NDArray[np.float64]
-    focus: Focus
+    requirement: int
 
 
 def _simulated(simulator: Simulator, part: _Part) -> Simulations:
-    return simulator.simulate(part.points, part.focus)
+    return simulator.simulate(part.points, part.requirement)

@@ -20,55 +20,26 @@ PARTS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Focus:
-    """Requirement by which simulations are judged.
-
-    Attributes:
-        requirement: its index.
-        scales: factors of its predicates in the guidance; None: the guidance is the exact robustness.
-        sized: whether the sizes of the margins of its predicates are wanted.
-    """
-
-    requirement: int
-    scales: tuple[float, ...] | None = None
-    sized: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Simulations:
     """Outcomes of simulations for one requirement.
 
     Attributes:
         margins: exact robustness, (count,); -inf where states are not finite.
-        guidance: robustness with scaled predicates, (count,), of the same sign.
         admissible: whether the initial state meets the conditions of `where`, (count,).
-        sizes: sizes of the margins of the predicates, (count, predicates); no columns if they are not
-            wanted, or there is nothing to compare.
         judged: whether the requirement has a verdict, (count,); not if a simulation ended before it, or
             failed.
     """
 
     margins: NDArray[np.float64]
-    guidance: NDArray[np.float64]
     admissible: NDArray[np.bool_]
-    sizes: NDArray[np.float64]
     judged: NDArray[np.bool_]
-
-    @classmethod
-    def unscaled(
-        cls, margins: NDArray[np.float64], admissible: NDArray[np.bool_], judged: NDArray[np.bool_]
-    ) -> Simulations:
-        """Outcomes whose guidance is the exact robustness."""
-        return cls(margins, margins, admissible, np.zeros((len(margins), 0)), judged)
 
     @classmethod
     def joined(cls, parts: Sequence[Simulations]) -> Simulations:
         """The outcomes of all parts, one after the other."""
         return cls(
             np.concatenate([part.margins for part in parts]),
-            np.concatenate([part.guidance for part in parts]),
             np.concatenate([part.admissible for part in parts]),
-            np.concatenate([part.sizes for part in parts]),
             np.concatenate([part.judged for part in parts]),
         )
 
@@ -76,7 +47,7 @@ class Simulations:
 class Simulator(Protocol):
     """Simulations of a closed system, as a function of points in the unit cube.
 
-    The outcome of a point depends on nothing but the point and the focus.
+    The outcome of a point depends on nothing but the point and the requirement, given by its index.
     """
 
     @property
@@ -101,10 +72,10 @@ class Simulator(Protocol):
     def graded(self, requirement: int) -> bool:
         """True if the robustness varies with real signals, rather than with whole numbers."""
 
-    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
-        """Simulate and judge `points`, (count, dim)."""
+    def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
+        """Simulate `points`, (count, dim), and judge them by a requirement."""
 
-    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> Simulations | None:
         """Outcomes at half the time step; None if the step cannot be changed."""
 
     def gradient(self, point: Point, requirement: int) -> Point | None:

@@ -14,7 +14,6 @@ import pytest
 from stlc.assurance.drive_search import EARLIER, WRONG, round_of, search_drives, wrong_states
 from stlc.assurance.drive_simulator import DriveSimulator
 from stlc.assurance.search_space import SearchSpace
-from stlc.assurance.simulation import Focus
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording
@@ -54,7 +53,7 @@ def test_a_search_makes_as_many_simulations_as_asked_and_repeats(simulator: Driv
     first = search_drives(simulator, 6, seed=1, starts=found.worst(2))
     assert np.array_equal(first.points[:2], found.worst(2))
     for requirement in range(len(simulator.requirements)):
-        alone = simulator.simulate(found.points[3:4], Focus(requirement)).margins
+        alone = simulator.simulate(found.points[3:4], requirement).margins
         assert alone[0] == pytest.approx(found.margins[3].min(0)[requirement], abs=1e-5)  # but for rounding
 
 

@@ -14,11 +14,9 @@ from helpers.documents import misfits
 
 from stlc.assurance.draws import ModelDraws
 from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify, falsify_each
-from stlc.assurance.guidance import ScaledRobustness, scales_of
 from stlc.assurance.model_simulator import ModelSimulator
 from stlc.assurance.plant_simulator import PlantSimulator
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
-from stlc.assurance.simulation import Focus
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.parallel.workers import LocalProcesses
@@ -100,8 +98,8 @@ def test_exactly_the_values_that_a_requirement_sees_are_searched(interpolate, ke
     (block,) = part.space.blocks
     assert len(block.values) == kept
     rising = np.linspace(0.6, 0.9, simulator.space.dim) * np.ones((simulator.space.dim, 1))
-    first = simulator.simulate(rising, Focus(early)).margins
-    changed = simulator.simulate(rising + 0.01 * np.eye(simulator.space.dim), Focus(early)).margins != first
+    first = simulator.simulate(rising, early).margins
+    changed = simulator.simulate(rising + 0.01 * np.eye(simulator.space.dim), early).margins != first
     assert set(np.flatnonzero(changed)) == set(part.coordinates)
 
 
@@ -126,8 +124,8 @@ def test_gradients_agree_with_differences_and_count_as_simulations():
     slope = simulator.gradient(point, 0)
     if slope is None:
         pytest.skip("there is no C compiler")
-    moved = simulator.simulate(point + 1e-5 * np.eye(len(point)), Focus(0)).margins
-    assert np.allclose(slope, (moved - simulator.simulate(point[None], Focus(0)).margins) / 1e-5, atol=1e-4)
+    moved = simulator.simulate(point + 1e-5 * np.eye(len(point)), 0).margins
+    assert np.allclose(slope, (moved - simulator.simulate(point[None], 0).margins) / 1e-5, atol=1e-4)
     found = falsify(simulator, 1, budget=SearchBudget(24), seed=2)
     assert found.strategies["gradient"] >= 2
     assert sum(found.strategies.values()) == found.simulations >= 24
@@ -167,24 +165,6 @@ def test_a_violation_that_half_the_step_does_not_have_is_spurious():
     discrete = falsify(simulator, 1, budget=SearchBudget(60), seed=0, shrinks=False)
     assert discrete.found is not None
     assert set(discrete.strategies) <= {"uniform", "vertices"}  # nothing can be learnt
-
-
-def test_guidance_has_the_sign_of_the_margin_and_scales_the_larger_predicate():
-    simulator = ModelSimulator.load("oscillator.stl", None, {})
-    index = simulator.requirements.index("mixed")
-    points = np.random.default_rng(0).random((30, simulator.space.dim))
-    first = simulator.simulate(points, Focus(index, sized=True))
-    assert first.sizes.shape == (30, 2)
-    scales = scales_of(first.sizes)
-    assert scales is not None
-    assert np.allclose(np.median(first.sizes, axis=0) * scales, 1.0)
-    second = simulator.simulate(points, Focus(index, scales))
-    assert np.array_equal(first.margins, second.margins)
-    assert ((second.margins < 0.0) == (second.guidance < 0.0)).all()
-    assert not np.allclose(second.margins, second.guidance)
-    alone = ScaledRobustness(simulator.task.rules[0].formula)
-    assert alone.predicates == ()  # one predicate needs no scale
-    assert scales_of(np.array([[1.0, 2.0], [2.0, 1.0]])) is None
 
 
 def test_inputs_of_different_durations_are_cut_at_the_same_time(home: Path):
@@ -227,7 +207,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
     simulator = PlantSimulator.load("fall.stl", Path("fall.yaml"), {})
     with simulator.plant:
         assert [block.name for block in simulator.space.blocks] == ["lift"]
-        outcome = simulator.simulate(np.stack([np.ones(5), np.zeros(5)]), Focus(0))
+        outcome = simulator.simulate(np.stack([np.ones(5), np.zeros(5)]), 0)
     assert outcome.admissible.tolist() == [True, True]
     assert outcome.margins[1] == np.inf
     assert "below the ground" in simulator.findings[0].finding.message
@@ -246,7 +226,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
 @pytest.mark.usefixtures("fall")
 def test_a_failure_is_a_file_that_replays(capsys):
     command = ["falsify", "fall.stl", "--plant", "fall.yaml"]
-    assert main([*command, "--require", "deep", "--simulations", "12", "--json"]) == 1
+    assert main([*command, "--require", "deep", "--simulations", "60", "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
     assert not misfits(document, load_schema("falsify/1"))
     result = document["result"]
@@ -279,7 +259,7 @@ def test_a_failure_is_a_file_that_replays(capsys):
 @pytest.mark.apart
 @pytest.mark.usefixtures("fall")
 def test_a_counterexample_whose_plant_fails_now(capsys):
-    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
+    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "60"]
     assert main(command) == 1
     trace = load_trace("counterexamples/up.npz")
     assert (trace.meta.spec_name, trace.meta.dt) == ("fall", 0.05)
@@ -326,8 +306,8 @@ def test_a_plant_that_does_not_repeat_itself_is_told(capsys):
     count = "TIMES = [0]\n\n\n"
     Path("fall.py").write_text(count + FALL.replace("    return", "    TIMES[0] += 1\n    return", 1))
     text = Path("fall.py").read_text()
-    Path("fall.py").write_text(re.sub(r"return \[(.*?),", r"return [\1 + 1e-3 * TIMES[0],", text, count=1))
-    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
+    Path("fall.py").write_text(re.sub(r"return \[(.*?),", r"return [\1 + 1e-5 * TIMES[0],", text, count=1))
+    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "60"]
     assert main([*command, "--json"]) == 1
     (found,) = json.loads(capsys.readouterr().out)["result"]["requirements"]
     assert found["trace_margin"] != (found["simpler"] or found["found"])["margin"]
@@ -358,7 +338,7 @@ def test_workers_search_several_requirements_with_the_results_of_one_process(hom
         (one,) = falsify_each(simulator, (1,), order, workers)
         shared = SharedSimulator(simulator, workers)
         assert shared.batch == 2
-        together = shared.simulate(points, Focus(3, sized=True))
+        together = shared.simulate(points, 3)
     alone = list(falsify_each(simulator, (0, 1), order))
     for left, right in zip(apart, alone, strict=True):
         assert (left.requirement, left.simulations, left.least) == (
@@ -367,9 +347,8 @@ def test_workers_search_several_requirements_with_the_results_of_one_process(hom
             right.least,
         )
     assert one.simulations == 30
-    expected = simulator.simulate(points, Focus(3, sized=True))
+    expected = simulator.simulate(points, 3)
     assert np.array_equal(together.margins, expected.margins)
-    assert np.array_equal(together.sizes, expected.sizes)
 
 
 @pytest.mark.slow
@@ -416,16 +395,16 @@ def test_a_requirement_that_counts_samples_is_judged_by_the_same_samples_at_half
 
 
 def test_half_of_a_step_that_is_no_decimal_fraction_is_exact():
-    found = falsify(ramp("require r: eventually[1 s, 1 s] x <= 1.2"), 0, budget=SearchBudget(5), seed=0)
+    found = falsify(ramp("require r: eventually[1 s, 1 s] x <= 1.2"), 0, budget=SearchBudget(60), seed=0)
     assert found.found is not None
     assert found.found.half_step == pytest.approx(found.found.margin)
 
 
 def test_a_simulation_in_which_an_assumption_fails_violates_nothing_and_is_not_counted():
     simulator = ramp("assume low: always[0 s, 1 s] x <= 1.2\nrequire r: always[0 s, 1 s] x <= 1.1")
-    outcome = simulator.simulate(np.array([[0.1], [0.3], [0.9]]), Focus(0))
+    outcome = simulator.simulate(np.array([[0.1], [0.3], [0.9]]), 0)
     assert outcome.admissible.tolist() == [True, True, False]
-    found = falsify(simulator, 0, budget=SearchBudget(20), seed=0)
+    found = falsify(simulator, 0, budget=SearchBudget(20), seed=8)
     assert found.found is not None
     assert found.found.margin >= -0.1 - 1e-9
     assert found.rejected > 0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stlc.assurance.falsify import Falsification, SearchBudget, SearchOrder, falsify_each
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
-from stlc.assurance.simulation import Focus, Simulations
+from stlc.assurance.simulation import Simulations
 from stlc.controller.parallel.workers import LocalProcesses
 
 pytestmark = pytest.mark.apart
@@ -59,15 +59,14 @@ class Bowl:
     def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
         return None
 
-    def simulate(self, points: NDArray[np.float64], focus: Focus) -> Simulations:
+    def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
         assert len(points) <= max(self.batch, 1)
         if os.getpid() != self.home and (points.min(1) > 0.8).any():
             self.end()
         away = np.abs(points - 0.5).max(1)
-        margins = np.stack([away - 1e-3, 0.499 - away, away + 1.0], 1)[:, focus.requirement]
-        sizes = np.stack([away, 100.0 * away], 1) if focus.sized else np.zeros((len(points), 0))
+        margins = np.stack([away - 1e-3, 0.499 - away, away + 1.0], 1)[:, requirement]
         every = np.ones(len(points), dtype=np.bool_)
-        return Simulations(margins, margins, every, sizes, every)
+        return Simulations(margins, every, every)
 
     def end(self) -> None:
         """End this process, unless enough have ended."""
@@ -76,7 +75,7 @@ class Bowl:
                 (self.marks / str(number)).touch(exist_ok=False)
                 os._exit(3)
 
-    def at_half_step(self, points: NDArray[np.float64], focus: Focus) -> Simulations | None:  # noqa: ARG002
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> Simulations | None:  # noqa: ARG002
         return None
 
 
@@ -131,7 +130,6 @@ def test_parts_depend_on_the_simulator_only(tmp_path: Path) -> None:
         assert SharedSimulator(Bowl(tmp_path), workers).batch == 3
         assert SharedSimulator(Bowl(tmp_path), workers, 8).batch == 8
     points = np.random.default_rng(0).random((10, 2))
-    parts = SharedSimulator(Bowl(tmp_path, batch=16), None).simulate(points, Focus(0, sized=True))
-    whole = Bowl(tmp_path, batch=16).simulate(points, Focus(0, sized=True))
+    parts = SharedSimulator(Bowl(tmp_path, batch=16), None).simulate(points, 0)
+    whole = Bowl(tmp_path, batch=16).simulate(points, 0)
     assert np.array_equal(parts.margins, whole.margins)
-    assert np.array_equal(parts.sizes, whole.sizes)

@@ -11,7 +11,6 @@ import pytest
 from helpers.documents import misfits
 
 from stlc.assurance.drive_simulator import DriveSimulator
-from stlc.assurance.simulation import Focus
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
@@ -119,8 +118,8 @@ def test_points_decide_the_drives():
     run = Run.open("latest")
     simulator = DriveSimulator(run, "none", Setting((0,), 2, 20, 1))
     points = np.random.default_rng(0).random((3, simulator.space.dim))
-    together = simulator.simulate(points, Focus(0)).margins
-    alone = np.concatenate([simulator.simulate(each[None], Focus(0)).margins for each in points])
+    together = simulator.simulate(points, 0).margins
+    alone = np.concatenate([simulator.simulate(each[None], 0).margins for each in points])
     assert np.allclose(together, alone, atol=1e-6)
     low = np.zeros((1, simulator.space.dim))
     assert simulator.drive(low).states[0, 0, 0] == pytest.approx(-0.5)
@@ -139,7 +138,7 @@ def test_a_drive_that_violates_an_assumption_violates_no_requirement():
     assert 0 < left.sum() < left.size
     assert np.isposinf(margins[~left]).all()
     assert np.allclose(margins[left], every[left], atol=1e-6)
-    assert (assumed.simulate(points, Focus(0)).admissible == left.any(1)).all()
+    assert (assumed.simulate(points, 0).admissible == left.any(1)).all()
 
 
 @pytest.mark.parametrize(

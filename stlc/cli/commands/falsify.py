@@ -406,7 +406,6 @@ def _command(source: _Source, path: Path) -> str:
 
 def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: Path) -> Answer[FalsifyResult]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
-    from stlc.assurance.simulation import Focus
     from stlc.compile.semantics.tolerance import TOLERANCE
     from stlc.trace import load_trace
 
@@ -426,7 +425,7 @@ def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: P
         return findings.replayed(_plant_of(simulator, path), point, stored)
     index = _wanted(simulator.requirements, [stored["requirement"]])[0]
     point = _point(stored, simulator.space.dim, path)
-    outcome = simulator.simulate(point[None], Focus(index))
+    outcome = simulator.simulate(point[None], index)
     margin, inside = float(outcome.margins[0]), bool(outcome.admissible[0])
     violated, judged = inside and margin < -TOLERANCE, not inside or bool(outcome.judged[0])
     verdict: Any = "violated" if violated else "satisfied" if judged else "inconclusive"
