@@ -7,13 +7,11 @@ plants and loops with PID controllers, from easy to hard. Rows of the ARCH-COMP 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist, fmean, stdev
 from typing import Annotated, Any
-from unittest.mock import patch
 
 import typer
 
@@ -63,54 +61,8 @@ class Problem:
         return self.requirement + ("" if self.competition is None else f", instance {self.competition}")
 
 
-@dataclass(frozen=True, slots=True)
-class Removal:
-    """Part of the search that is left out.
-
-    Attributes:
-        name: name of the part.
-        strategies: names of the strategies that have no turns.
-        replaced: other values of settings of the search: name of the module and the setting -> value.
-        acts: names of the strategies whose points the part affects first: a search in which none of them had
-            a turn is the same without the part. Empty if that is not known.
-    """
-
-    name: str
-    strategies: frozenset[str] = frozenset()
-    replaced: tuple[tuple[str, Any], ...] = ()
-    acts: frozenset[str] = frozenset()
-
-    def same(self, search: Mapping[str, Any]) -> bool:
-        """True if a stored search is the same without the part."""
-        return bool(self.acts) and self.acts.isdisjoint(search["strategies"])
-
-    @contextmanager
-    def made(self) -> Iterator[None]:
-        """Context in which searches are without the part."""
-        with ExitStack() as stack:
-            for target, value in self.replaced:
-                stack.enter_context(patch(f"stlc.assurance.{target}", value))
-            yield
-
-
-def _turns(*names: str) -> Removal:
-    strategies = frozenset(names)
-    return Removal(" and ".join(names), strategies, acts=strategies)
-
-
-def _setting(name: str, setting: str, value: Any, *acts: str) -> Removal:
-    return Removal(name, replaced=((setting, value),), acts=frozenset(acts))
-
-
-REMOVALS = (
-    Removal(WHOLE),
-    *map(_turns, ("alternating vertices", "constant vertices", "coarse", "surrogate", "trust region")),
-    *map(_turns, ("periodic", "uniform", "vertices")),
-    Removal("gradient", frozenset({"gradient"})),  # its turns count even where there is none
-    _setting("means in the distance", "surrogate.WEIGHTS", (0.0,), "surrogate"),
-    _setting("scales of predicates", "falsify.scales_of", lambda _: None),
-)
-"""Parts of the search, each left out alone; the first one is the whole search."""
+REMOVALS = (WHOLE, "alternating vertices", "perturbation", "coarse", "surrogate", "periodic", "gradient")
+"""Strategies of the search, each left out alone; the first one is the whole search."""
 ROWS = (
     *("AT6a, instance 2", "AT6b, instance 2", "AT6c, instance 2", "AT51, instance 2", "CC5, instance 2"),
     *("CCx, instance 1", "NN, instance 1", "NNx, instance 1", "SC, instance 1", "AFC27, instance 2"),
@@ -189,7 +141,7 @@ def _ratio(logarithms: Sequence[float]) -> str:
     return f"{math.exp(mean):.2f} [{low:.2f}, {high:.2f}]"
 
 
-@command("python -m benchmarks searches", "python -m benchmarks searches --only periodic,trend --seeds 0..2")
+@command("python -m benchmarks searches", "python -m benchmarks searches --only periodic,coarse --seeds 0..2")
 def searches(
     only: OnlyOption = None,
     seeds: Annotated[str, typer.Option(metavar="SEEDS", help="Seeds of the searches.")] = "0..9",
@@ -200,15 +152,14 @@ def searches(
 
     Results are kept.
     """
-    names = chosen(only, [each.name for each in REMOVALS[1:]], "part of the search")
-    removals = [REMOVALS[0], *(each for each in REMOVALS if each.name in names)]
+    names = chosen(only, REMOVALS[1:], "part of the search")
     store, drawn, every = ResultStore("searches", out), parse_seeds(seeds), problems()
     with one_thread():
         for problem in every:
             simulator = ModelSimulator.load(str(problem.spec), None, dict(problem.changes))
-            whole = _searched(problem, simulator, REMOVALS[0], drawn, store, {})
+            whole = _searched(problem, simulator, WHOLE, drawn, store, {})
             known = {each["seed"]: each for each in whole["searches"]}
-            for removal in removals[1:]:
+            for removal in names:
                 _searched(problem, simulator, removal, drawn, store, known)
 
     def section() -> list[str]:
@@ -222,14 +173,15 @@ def searches(
 def _searched(
     problem: Problem,
     simulator: ModelSimulator,
-    removal: Removal,
+    removal: str,
     seeds: Sequence[int],
     store: ResultStore,
     whole: Mapping[int, Mapping[str, Any]],
 ) -> Result:
     """Searches of a problem without a part, stored or carried out now and stored.
 
-    `whole`: seed -> whole search.
+    `whole`: seed -> whole search. One in which the part had no turn is the same without it; only the turns of
+    the gradient count even where there is none.
     """
     name = _name(problem, removal)
     values = {
@@ -241,15 +193,15 @@ def _searched(
     }
 
     def compute() -> Result:
-        found = {seed: each for seed, each in whole.items() if removal.same(each)}
+        unused = {} if removal == "gradient" else whole
+        found = {seed: each for seed, each in unused.items() if removal not in each["strategies"]}
         requirement = simulator.requirements.index(problem.requirement)
-        with removal.made():
-            going = {
-                seed: ViolationSearch(simulator, requirement, seed, without=removal.strategies)
-                for seed in seeds
-                if seed not in found
-            }
-            side_by_side(simulator, [*going.values()], SIMULATIONS)
+        going = {
+            seed: ViolationSearch(simulator, requirement, seed, without=(removal,))
+            for seed in seeds
+            if seed not in found
+        }
+        side_by_side(simulator, [*going.values()], SIMULATIONS)
         for seed, search in going.items():
             result, best = search.result(shrinks=False), search.found
             found[seed] = {
@@ -270,22 +222,20 @@ def _table(stored: Mapping[str, Result], every: Sequence[Problem]) -> Table[Any,
     return listed("searches", [row for row in rows if row.seeds], COLUMNS)
 
 
-def _compared(removal: Removal, stored: Mapping[str, Result], every: Sequence[Problem]) -> Comparison:
+def _compared(removal: str, stored: Mapping[str, Result], every: Sequence[Problem]) -> Comparison:
     """Stored searches without a part beside the whole ones."""
     ratios: dict[bool, list[float]] = {False: [], True: []}
     missed, seeds = 0, 0
     for problem in every:
         if (without := stored.get(_name(problem, removal))) is None:
             continue
-        whole = {
-            each["seed"]: each["simulations"] for each in stored[_name(problem, REMOVALS[0])]["searches"]
-        }
+        whole = {each["seed"]: each["simulations"] for each in stored[_name(problem, WHOLE)]["searches"]}
         common = [each for each in without["searches"] if each["seed"] in whole]
         missed, seeds = missed + sum(each["strategy"] is None for each in common), len(common)
         logarithms = [math.log(each["simulations"] / whole[each["seed"]]) for each in common]
         ratios[problem.competition is not None].append(fmean(logarithms))
-    return Comparison(removal.name, tuple(ratios[False]), tuple(ratios[True]), missed, seeds)
+    return Comparison(removal, tuple(ratios[False]), tuple(ratios[True]), missed, seeds)
 
 
-def _name(problem: Problem, removal: Removal) -> str:
-    return f"{problem.name}, without {removal.name}"
+def _name(problem: Problem, removal: str) -> str:
+    return f"{problem.name}, without {removal}"
