@@ -18,7 +18,8 @@ from stlc.compile.augment.lift import hoist_absolute
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import normal
+from stlc.compile.ir.normal_form import joined, normal
+from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
@@ -67,6 +68,23 @@ class Obligations:
         bounds = evaluate(self._progressed, env, ops=NUMPY, end="lower", stop=self._horizon + 1)
         met = tuple(bool(satisfied(np.broadcast_to(bound[0], 1))[0]) for bound in bounds)
         return self._known(clock, met)
+
+    def within(self, formula: ir.Formula) -> ir.Formula:
+        """Return a state formula without alternatives that hold at no sample of the mission.
+
+        Such an alternative is a condition on the mission clock, as in `clock > 216 or p`.
+        """
+        if not isinstance(formula, ir.BoolOp) or formula.op != "or":
+            return formula
+        time = np.arange(self._horizon + 1.0)[:, None]
+        env = {name: time if name == self._clock else np.full_like(time, np.nan) for name in self._names}
+        kept = [
+            item
+            for item in formula.items
+            if columns(item) != {self._clock}
+            or bool((evaluate([item], env, ops=NUMPY, count=len(time))[0] >= 0.0).any())
+        ]
+        return joined("or", kept, ir.Truth(False))
 
     def _formulas(self, clock: int, met: tuple[bool, ...]) -> tuple[ir.Formula, ...]:
         """Return the obligations at step `clock`; `met`: the parts of `_progressed` that every plan meets."""

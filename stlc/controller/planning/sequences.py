@@ -124,7 +124,7 @@ class Sequences:
         )
         self._kept = tuple(ir.BoolOp("or", (each.left, _present(each.right))) for each in self._untils)
         self._safe = tuple(
-            piece.body
+            self._obligations.within(piece.body)
             for rule in task.rules
             for piece in pieces(rule.formula)
             if isinstance(piece, ir.Temporal) and piece.op == "always" and not looks_ahead(piece.body)
