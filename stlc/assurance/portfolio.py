@@ -14,6 +14,7 @@ from stlc.assurance.strategies import (
     PIECES,
     AlternatingVertices,
     CoarseSampling,
+    ConstantVertices,
     GradientVertices,
     PeriodicInputs,
     Perturbation,
@@ -91,15 +92,16 @@ class Portfolio:
             self._others.append(climb)
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
-            if not space.small:
-                self._first.append(AlternatingVertices(space, generator))
-            if space.small or len(space.blocks) < 2:
-                self._first.append(Perturbation(space, generator))
+            constant, perturbed = ConstantVertices(space, generator), Perturbation(space, generator)
             if any(len(block.values) > max(PIECES) for block in space.blocks) and coarse.name not in without:
                 self._drawn = coarse
-                self._first += [coarse, climb, *[coarse] * (OPENING - 1)]
+            drawn = [] if self._drawn is uniform else [coarse]
+            alternating = [] if space.small else [AlternatingVertices(space, generator)]
+            if len(space.blocks) > 1 and not space.small:
+                simple, rest = [constant, constant], [constant]
             else:
-                self._first.append(climb)
+                simple, rest = [constant, perturbed], []
+            self._first = [*alternating, *simple, *drawn, climb, *rest, *drawn * (OPENING - 1)]
             self._leading = self._drawn if surrogate.name in without else surrogate
             self._first = [each for each in self._first if each.name not in without]
             self._others = [each for each in self._others if each.name not in without] or [self._drawn]
@@ -117,7 +119,7 @@ class Portfolio:
         """Return the next point and the strategy that proposes it."""
         while (opening := next((each for each in self._first if each.ready), None)) is not None:
             point = opening.propose()
-            if point is None or opening is self._drawn:
+            if point is None or opening is self._drawn or self._first.count(opening) > 1:
                 self._first.remove(opening)
             if point is not None:
                 return Proposal(opening, point)

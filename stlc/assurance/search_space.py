@@ -6,15 +6,17 @@ input signal. A uniformly distributed point is therefore a simulation as the sys
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 Point = NDArray[np.float64]
 """Point of the unit cube, (dim,)."""
-SMALL = 4
-"""Coordinates at most of a small cube."""
+MOST_VERTICES, MOST_CORNERS = 64, 16
+"""Maximum number of constant vertices that are simulated, and of all vertices of a small cube."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +69,14 @@ class SearchSpace:
         return tuple(each for each in range(self.dim) if each not in taken)
 
     @property
+    def handles(self) -> tuple[tuple[int, ...], ...]:
+        """Coordinates that move together while inputs are constant: a group per input or other number."""
+        return (*(block.values for block in self.blocks), *((each,) for each in self.rest))
+
+    @property
     def small(self) -> bool:
-        """True if there are few coordinates."""
-        return self.dim <= SMALL
+        """True if all vertices of the cube are simulated at the beginning of a search."""
+        return bool(2**self.dim <= MOST_CORNERS)
 
     def visible(self, share: float) -> PartOfSpace:
         """The part of the space in which inputs are varied up to a share of their duration, 0 to 1."""
@@ -98,6 +105,36 @@ class SearchSpace:
         for block in self.blocks:
             point[list(block.times)] = (np.arange(len(block.times)) + 1.0) / (len(block.times) + 1.0)
         return point
+
+    def constant_vertices(self) -> Iterator[Point]:
+        """Points at which each input is constant at an end of its range, and other numbers at ends of theirs.
+
+        If there are too many, inputs alone are at their ends, and other numbers at their medians; with too
+        many inputs, all are at the same end.
+        """
+        handles = self.handles
+        if 2 ** len(handles) > MOST_VERTICES:
+            handles = tuple(block.values for block in self.blocks)
+        if not handles:
+            return
+        if 2 ** len(handles) > MOST_VERTICES:
+            handles = (tuple(each for handle in handles for each in handle),)
+        ends_of_all = product((1.0, 0.0), repeat=len(handles))
+        for ends in sorted(ends_of_all, key=lambda ends: len(set(ends)) == 1):  # opposite ends first
+            point = self.middle()
+            for handle, end in zip(handles, ends, strict=True):
+                point[list(handle)] = end
+            yield point
+
+    def corners(self) -> Iterator[Point]:
+        """All vertices of the cube, those with most switches of inputs first; none if there are too many."""
+        if not self.small or not self.blocks:
+            return
+        corners = np.array(list(product((1.0, 0.0), repeat=self.dim)))
+        switches = np.zeros(len(corners))
+        for block in self.blocks:
+            switches += np.abs(np.diff(corners[:, list(block.values)], axis=1)).sum(1)
+        yield from corners[np.argsort(-switches, kind="stable")]
 
     def held(self, generator: np.random.Generator, most: int = 5) -> NDArray[np.int64]:
         """Labels (dim,): coordinates with one label hold one value, in 1 to `most` pieces per input.

@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,21 @@ class Strategy(ABC):
 
     def observe(self, point: Point, value: float) -> None:  # noqa: B027
         """Take the guidance value at a point that another strategy proposed."""
+
+
+class ConstantVertices(Strategy):
+    """Inputs that are constant at the ends of their ranges, one after the other; then few other vertices."""
+
+    name = "constant vertices"
+
+    def __init__(self, space: SearchSpace, generator: np.random.Generator) -> None:
+        super().__init__(space, generator)
+        constant = list(space.constant_vertices())
+        others = (each for each in space.corners() if not any(np.array_equal(each, old) for old in constant))
+        self._left: Iterator[Point] = chain(constant, others)
+
+    def propose(self) -> Point | None:
+        return next(self._left, None)
 
 
 def _values(
