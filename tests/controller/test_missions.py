@@ -30,7 +30,7 @@ CPU = torch.device("cpu")
 LINE = """
 stlc: 1
 name: line
-time: {dt: 0.1 s, horizon: 8 steps, mission: 0}
+time: {dt: 0.1 s, horizon: 8 steps}
 state: {x: {unit: m, range: [-4, 4]}, y: {unit: m, role: env}}
 control: {u: {unit: m/s, range: [-5, 5]}}
 flow: {x: u}

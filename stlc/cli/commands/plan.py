@@ -103,7 +103,7 @@ def plan(
     choice = planner_choice(method, option, budget)
     judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
     planner = planner_named(choice.name, **choice.options)
-    task = load_task(spec, system, parse_overrides(set_), scenario=tube)
+    task = load_task(spec, system, parse_overrides(set_), scenario=tube, whole=True)
     show_diagnostics(task.compiled.warnings)
     model = None if tube is None else TubeModel(task)
     states = starts_of(task, from_, starts, seed)

@@ -279,7 +279,7 @@ def _planner_run(
     from stlc.controller.problem.load import load_task
     from stlc.controller.training.launch import Launch, open_planner
 
-    task = load_task(spec, system, overrides)
+    task = load_task(spec, system, overrides, whole=True)
     launch = Launch(root=runs, overrides=overrides, command=sys.argv[1:])
     return str(open_planner(task, choice, seed=0, launch=launch).path)
 

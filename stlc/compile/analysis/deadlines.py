@@ -60,7 +60,7 @@ def beyond_plans(compiled: Compiled) -> Iterator[Diagnostic]:
     planned for window by window.
     """
     guided = {node.span for rule in compiled.requirements for node in _guided(rule.typed.formula)}
-    reach = time_text((compiled.grid.dt or 0) * (compiled.grid.horizon or 0))
+    reach = time_text((compiled.grid.dt or 0) * (compiled.grid.steps or 0))
     for late in unreached(compiled):
         if late.recurs and late.span not in guided:
             due = time_text(late.seconds)
@@ -89,7 +89,7 @@ def _guided(formula: typed.Formula) -> Iterator[typed.Formula]:
 
 def _late(rule: typed.Requirement, grid: Grid) -> Iterator[Unreached]:
     """Yield the operators of a requirement that are due later than a plan reaches."""
-    if grid.dt is None or grid.horizon is None:
+    if grid.dt is None or grid.steps is None:
         return
     for node in nodes(rule.formula):
         match node:
@@ -99,5 +99,5 @@ def _late(rule: typed.Requirement, grid: Grid) -> Iterator[Unreached]:
                 step = to_window(interval, grid, [], outward=True).lo
             case _:
                 continue
-        if step is not None and step > grid.horizon:
+        if step is not None and step > grid.steps:
             yield Unreached(rule.name, float(step * grid.dt), interval.clock == "now", node.span)

@@ -40,6 +40,7 @@ def load_task(
     hint: str = HINT,
     found: Callable[[Path], None] | None = None,
     scenario: str | None = None,
+    whole: bool = False,
 ) -> Task:
     """Load a specification and a system, and compile the specification for the system.
 
@@ -50,6 +51,7 @@ def load_task(
         hint: what the user may do if no system is named.
         found: function that receives the path of the system file before it is read.
         scenario: name of a scenario of the system file to apply.
+        whole: whether plans reach to the end of a deployment (`Task.of`).
 
     Raises:
         UsageError: U101, no system is named, or there is no such scenario; U102, there is no such file.
@@ -67,4 +69,5 @@ def load_task(
     changed = dict(overrides or {})
     if scenario is not None:
         changed = {**scenario_constants(there, scenario, changed), **changed}
-    return Task.of(parsed, System.load(there, changed, scenario=scenario), overrides=changed)
+    found_system = System.load(there, changed, scenario=scenario)
+    return Task.of(parsed, found_system, overrides=changed, whole=whole)

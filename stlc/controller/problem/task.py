@@ -141,8 +141,12 @@ class Task:
         overrides: Mapping[str, str] | None = None,
         values: Mapping[str, str] | None = None,
         end: End = "strict",
+        whole: bool = False,
     ) -> Task:
         """Compile a specification for a system.
+
+        If it has deadlines, plans may reach to the end of a mission (`whole`, or the key `mission` of the
+        system file), and then end there. Otherwise they have the horizon of the system.
 
         Args:
             spec: parsed specification.
@@ -150,6 +154,7 @@ class Task:
             overrides: constants to change, name -> text such as `3 s`; a parameter becomes a constant.
             values: parameters that get one fixed value in all trajectories; the policy still observes them.
             end: "truncate" cuts windows that extend beyond the end of the plan; "strict" refuses them.
+            whole: whether plans reach to the end of a deployment, unless the system file says otherwise.
 
         Raises:
             UsageError: a value in `overrides` or `values` is not admissible.
@@ -157,9 +162,9 @@ class Task:
         """
         decl, interface, overrides = system.decl, system.interface(), overrides or {}
         compiled = compile_spec(spec, grid=decl.grid, interface=interface, overrides=overrides, end=end)
-        if compiled.mission is not None and compiled.recurring is None and decl.mission:
-            steps = max(decl.horizon, min(decl.mission, LONGEST))
-            grid = Grid(decl.dt, decl.horizon, steps, decl.mission)
+        last = decl.test.steps if whole and decl.mission is None else decl.mission
+        if compiled.mission is not None and compiled.recurring is None and last:
+            grid = Grid(decl.dt, decl.horizon, max(decl.horizon, min(last, LONGEST)), last)
             compiled = compile_spec(spec, grid=grid, interface=interface, overrides=overrides, end=end)
         if values:
             compiled = replace(compiled, parameters=fixed(compiled.parameters, values))

@@ -167,6 +167,8 @@ def task_of_run(
 ) -> Task:
     """Compile the specification and the system in a run's folder.
 
+    Plans of a run that plans instead of training reach to the end of a deployment (`Task.of`).
+
     Args:
         folder: folder of the run, whose own `--set` changes are applied first.
         overrides: further changes, name -> text. A parameter that varied in training gets the given value. It
@@ -179,7 +181,9 @@ def task_of_run(
     drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
     values = {name: text for name, text in changed.items() if name in drawn}
     constants = {name: text for name, text in changed.items() if name not in drawn}
-    return Task.of(spec, System(decl), overrides=constants, values=values)
+    config = folder.read_json(CONFIG) if folder.has(CONFIG) else {}
+    planned = isinstance(config, dict) and "planner" in config
+    return Task.of(spec, System(decl), overrides=constants, values=values, whole=planned)
 
 
 def declaration_of_run(

@@ -76,9 +76,7 @@ class Clockwork:
     integrator: str = key(word(INTEGRATORS.names), "integration method", "euler")
     substeps: int = key(integer(high=1000), "integration steps within one step", 1)
     discrete: bool = key(FLAG, "`flow` gives next values instead of derivatives", False)
-    mission: int | None = key(
-        INSTANT, "end of a mission, where plans end; that of `test` unless given, 0: none"
-    )
+    mission: int | None = key(INSTANT, "end of missions, to which plans reach; 0: none")
 
 
 class Shaped(Protocol):

@@ -64,7 +64,8 @@ class SystemDecl:
         spec: path of the default specification, or None.
         dt: time step in seconds, exact.
         horizon: planning horizon in steps.
-        mission: last step of a mission, where plans end that reach so far; 0: plans do not regard its end.
+        mission: last step of the missions to whose end plans reach; 0: plans have the horizon, and regard no
+            end; None: that is so in training, and planners reach to the end of a deployment.
         substeps: integration steps within one time step.
         integrator: name of the integration method.
         discrete: whether `flow` gives next values of the states instead of derivatives.
@@ -100,7 +101,7 @@ class SystemDecl:
     spec: Path | None
     dt: Fraction
     horizon: int
-    mission: int
+    mission: int | None
     substeps: int
     integrator: str
     discrete: bool

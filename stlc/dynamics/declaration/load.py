@@ -207,14 +207,13 @@ def _declaration(
     _report_idle(found.control, cx, flow, jumps)
     spec = reader.text(found.spec, "`spec`")
     clamped = [each for each in names.columns if each.kind == "real" and each.fact]
-    test, end = read(TestDecl, cx.timed, found.test, "`test`"), named.clock.mission
     return SystemDecl(
         name=reader.name(found.name, "`name`") or path.stem,
         doc=" ".join((reader.text(found.doc, "`doc`") or "").split()),
         path=path,
         source=reader.source,
         spec=Path(os.path.normpath(named_in(found.spec.span.source, spec))) if found.spec and spec else None,
-        **{**asdict(named.clock), "mission": test.steps if end is None else end},
+        **asdict(named.clock),
         constants=MappingProxyType(names.constants),
         signature=Signature(tuple(names.columns)),
         controls=tuple(names.controls),
@@ -230,7 +229,7 @@ def _declaration(
         policy=_observing(read(PolicyDecl, cx, found.policy, "`policy`"), sampled.hidden, cx),
         train=read(TrainDecl, cx, found.train, "`train`"),
         backup=read_backup(cx, found.backup, "`backup`"),
-        test=test,
+        test=read(TestDecl, cx.timed, found.test, "`test`"),
         scenarios=read_scenarios(found.scenario, cx),
         functions=named.functions,
         overrides=MappingProxyType(dict(overrides)),

@@ -20,7 +20,7 @@ from stlc.source import Source
 LINE = """
 stlc: 1
 name: line
-time: {dt: 0.1 s, horizon: 8 steps, mission: 0}
+time: {dt: 0.1 s, horizon: 8 steps}
 state: {x: {unit: m, range: [-4, 4]}}
 control: {u: {unit: m/s, range: [-5, 5]}}
 flow: {x: u}

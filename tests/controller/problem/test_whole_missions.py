@@ -50,7 +50,7 @@ require back: always@[11 s, 12 s] (x > -1 m and x < 1 m)
 def task_of(folder: Path, time: str = "", text: str = ERRAND) -> Task:
     path = folder / "cart.yaml"
     path.write_text(CART % time)
-    return Task.of(parse(Source("errand.stl", text)), System.load(path))
+    return Task.of(parse(Source("errand.stl", text)), System.load(path), whole=True)
 
 
 @pytest.fixture
