@@ -27,7 +27,7 @@ from stlc.assurance.surrogate import SurrogateSearch
 FLAT, FLAT_VALUES = 0.9, 20
 """Share of equal values, and number of last values, at which robustness counts as flat."""
 OPENING = 4
-"""Coarse inputs with which a search begins, after vertices and perturbations of them."""
+"""Coarse inputs with which a search begins, beside vertices."""
 SURROGATE_TURNS = 300
 """Turns after the first points in which the surrogate has most of the points, and not later."""
 FLAT_TURNS, BLIND_TURNS = 6, 12
@@ -43,7 +43,7 @@ class Proposal:
 
 
 class Portfolio:
-    """The strategies of a search, in turn: a few points of some of them, then all.
+    """The strategies of a search, in turn: vertices and constant inputs, coarse inputs, then all of them.
 
     Two thirds of the next `SURROGATE_TURNS` points are chosen by the surrogate, two ninths are coarse, or
     uniform if no input has many values, and a ninth follows the gradient or is periodic. Of the points after
@@ -80,28 +80,27 @@ class Portfolio:
         self._guided = not random and not space.sparse and graded and space.dim > 0
         self._blind: list[Strategy] = [uniform]
         if not random:
-            self._blind *= FLAT_TURNS - 1 if graded else BLIND_TURNS - 1
-            self._blind.append(VertexSampling(space, generator))
+            turns = FLAT_TURNS if graded else BLIND_TURNS
+            self._blind = [*self._blind * (turns - 1), VertexSampling(space, generator)]
         self._drawn: Strategy = uniform
         self._leading: Strategy = uniform
         self._first: list[Strategy] = []
         self._others: list[Strategy] = []
         if self._guided:
             climb, coarse = GradientVertices(space, generator, gradient), CoarseSampling(space, generator)
-            surrogate = SurrogateSearch(space, generator)
-            self._others.append(climb)
-            if space.blocks:
-                self._others.append(PeriodicInputs(space, generator))
-            constant, perturbed = ConstantVertices(space, generator), Perturbation(space, generator)
+            constant, surrogate = ConstantVertices(space, generator), SurrogateSearch(space, generator)
+            self._others = [climb, PeriodicInputs(space, generator)] if space.blocks else [climb]
             if any(len(block.values) > max(PIECES) for block in space.blocks) and coarse.name not in without:
                 self._drawn = coarse
-            drawn = [] if self._drawn is uniform else [coarse]
-            alternating = [] if space.small else [AlternatingVertices(space, generator)]
-            if len(space.blocks) > 1 and not space.small:
-                simple, rest = [constant, constant], [constant]
+            drawn = [coarse] if self._drawn is coarse else []
+            alternating, perturbed = AlternatingVertices(space, generator), Perturbation(space, generator)
+            if space.small:
+                self._first = [constant, perturbed, climb]
+            elif len(space.blocks) > 1:
+                self._first = [alternating, constant, constant, *drawn, climb, constant]
             else:
-                simple, rest = [constant, perturbed], []
-            self._first = [*alternating, *simple, *drawn, climb, *rest, *drawn * (OPENING - 1)]
+                self._first = [alternating, constant, perturbed, *drawn, climb]
+            self._first += drawn * (OPENING - 1)
             self._leading = self._drawn if surrogate.name in without else surrogate
             self._first = [each for each in self._first if each.name not in without]
             self._others = [each for each in self._others if each.name not in without] or [self._drawn]
@@ -119,7 +118,8 @@ class Portfolio:
         """Return the next point and the strategy that proposes it."""
         while (opening := next((each for each in self._first if each.ready), None)) is not None:
             point = opening.propose()
-            if point is None or opening is self._drawn or self._first.count(opening) > 1:
+            # one point for each entry of a strategy, and for the last one all that are left
+            if point is None or self._first.count(opening) > 1 or opening is self._drawn:
                 self._first.remove(opening)
             if point is not None:
                 return Proposal(opening, point)

@@ -69,20 +69,13 @@ class SearchSpace:
         return tuple(each for each in range(self.dim) if each not in taken)
 
     @property
-    def handles(self) -> tuple[tuple[int, ...], ...]:
-        """Coordinates that move together while inputs are constant: a group per input or other number."""
-        return (*(block.values for block in self.blocks), *((each,) for each in self.rest))
-
-    @property
     def small(self) -> bool:
         """True if all vertices of the cube are simulated at the beginning of a search."""
         return bool(2**self.dim <= MOST_CORNERS)
 
     def visible(self, share: float) -> PartOfSpace:
         """The part of the space in which inputs are varied up to a share of their duration, 0 to 1."""
-        kept: list[int] = []
-        blocks = []
-        dropped = set()
+        blocks, dropped = list[SignalBlock](), set[int]()
         for block in self.blocks:
             count = block.acting_before(share)
             dropped |= set(block.values[count:])
@@ -112,9 +105,10 @@ class SearchSpace:
         If there are too many, inputs alone are at their ends, and other numbers at their medians; with too
         many inputs, all are at the same end.
         """
-        handles = self.handles
+        inputs = tuple(block.values for block in self.blocks)
+        handles = (*inputs, *((each,) for each in self.rest))
         if 2 ** len(handles) > MOST_VERTICES:
-            handles = tuple(block.values for block in self.blocks)
+            handles = inputs
         if not handles:
             return
         if 2 ** len(handles) > MOST_VERTICES:

@@ -31,6 +31,24 @@ TWO = SearchSpace(
 )
 
 
+def test_constant_vertices_hold_every_input_at_an_end():
+    points = list(TWO.constant_vertices())
+    assert len(points) == 8  # two inputs and one other number
+    assert all(set(point[:3]) in ({0.0}, {1.0}) and set(point[3:6]) in ({0.0}, {1.0}) for point in points)
+    assert len({tuple(point) for point in points}) == 8
+
+
+def test_opposite_ends_come_first():
+    two = SearchSpace(2, (SignalBlock("throttle", (0,)), SignalBlock("brake", (1,))))
+    assert [tuple(point) for point in two.constant_vertices()] == [(1, 0), (0, 1), (1, 1), (0, 0)]
+
+
+def test_many_other_numbers_stay_at_their_medians():
+    space = SearchSpace(20, (SignalBlock("u", (0, 1)),))
+    points = list(space.constant_vertices())
+    assert [tuple(point[:3]) for point in points] == [(1.0, 1.0, 0.5), (0.0, 0.0, 0.5)]
+
+
 def test_inputs_beyond_the_horizon_of_a_requirement_are_not_searched():
     part = TWO.visible(0.5)
     assert part.space.dim == 5
