@@ -61,7 +61,10 @@ class Problem:
         return self.requirement + ("" if self.competition is None else f", instance {self.competition}")
 
 
-REMOVALS = (WHOLE, "alternating vertices", "perturbation", "coarse", "surrogate", "periodic", "gradient")
+REMOVALS = (
+    *(WHOLE, "alternating vertices", "constant vertices", "perturbation"),
+    *("coarse", "surrogate", "periodic", "gradient"),
+)
 """Strategies of the search, each left out alone; the first one is the whole search."""
 ROWS = (
     *("AT6a, instance 2", "AT6b, instance 2", "AT6c, instance 2", "AT51, instance 2", "CC5, instance 2"),

@@ -226,7 +226,7 @@ def test_black_boxes_are_falsified_and_their_failures_reported(capsys):
 @pytest.mark.usefixtures("fall")
 def test_a_failure_is_a_file_that_replays(capsys):
     command = ["falsify", "fall.stl", "--plant", "fall.yaml"]
-    assert main([*command, "--require", "deep", "--simulations", "60", "--json"]) == 1
+    assert main([*command, "--require", "deep", "--simulations", "12", "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
     assert not misfits(document, load_schema("falsify/1"))
     result = document["result"]
@@ -259,7 +259,7 @@ def test_a_failure_is_a_file_that_replays(capsys):
 @pytest.mark.apart
 @pytest.mark.usefixtures("fall")
 def test_a_counterexample_whose_plant_fails_now(capsys):
-    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "60"]
+    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
     assert main(command) == 1
     trace = load_trace("counterexamples/up.npz")
     assert (trace.meta.spec_name, trace.meta.dt) == ("fall", 0.05)
@@ -306,8 +306,8 @@ def test_a_plant_that_does_not_repeat_itself_is_told(capsys):
     count = "TIMES = [0]\n\n\n"
     Path("fall.py").write_text(count + FALL.replace("    return", "    TIMES[0] += 1\n    return", 1))
     text = Path("fall.py").read_text()
-    Path("fall.py").write_text(re.sub(r"return \[(.*?),", r"return [\1 + 1e-5 * TIMES[0],", text, count=1))
-    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "60"]
+    Path("fall.py").write_text(re.sub(r"return \[(.*?),", r"return [\1 + 1e-3 * TIMES[0],", text, count=1))
+    command = ["falsify", "fall.stl", "--plant", "fall.yaml", "--require", "up", "--simulations", "8"]
     assert main([*command, "--json"]) == 1
     (found,) = json.loads(capsys.readouterr().out)["result"]["requirements"]
     assert found["trace_margin"] != (found["simpler"] or found["found"])["margin"]
@@ -395,7 +395,7 @@ def test_a_requirement_that_counts_samples_is_judged_by_the_same_samples_at_half
 
 
 def test_half_of_a_step_that_is_no_decimal_fraction_is_exact():
-    found = falsify(ramp("require r: eventually[1 s, 1 s] x <= 1.2"), 0, budget=SearchBudget(60), seed=0)
+    found = falsify(ramp("require r: eventually[1 s, 1 s] x <= 1.2"), 0, budget=SearchBudget(5), seed=0)
     assert found.found is not None
     assert found.found.half_step == pytest.approx(found.found.margin)
 
@@ -404,7 +404,7 @@ def test_a_simulation_in_which_an_assumption_fails_violates_nothing_and_is_not_c
     simulator = ramp("assume low: always[0 s, 1 s] x <= 1.2\nrequire r: always[0 s, 1 s] x <= 1.1")
     outcome = simulator.simulate(np.array([[0.1], [0.3], [0.9]]), 0)
     assert outcome.admissible.tolist() == [True, True, False]
-    found = falsify(simulator, 0, budget=SearchBudget(20), seed=8)
+    found = falsify(simulator, 0, budget=SearchBudget(20), seed=0)
     assert found.found is not None
     assert found.found.margin >= -0.1 - 1e-9
     assert found.rejected > 0

@@ -10,7 +10,7 @@ import pytest
 
 from stlc.assurance.portfolio import Portfolio
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
-from stlc.assurance.strategies import Perturbation, Strategy, UniformSampling
+from stlc.assurance.strategies import Strategy, UniformSampling
 from stlc.assurance.surrogate import (
     CANDIDATES,
     RobustnessProcess,
@@ -97,38 +97,36 @@ def searched(portfolio: Portfolio, count: int, value: Callable[[str, int], float
     return names
 
 
-def test_a_search_begins_with_vertices_and_coarse_inputs():
+def test_a_search_begins_with_vertices_and_opposite_constants():
     blocks = tuple(
         SignalBlock(name, tuple(range(at, at + 8))) for name, at in (("throttle", 0), ("brake", 8))
     )
     portfolio = Portfolio(SearchSpace(16, blocks), np.random.default_rng(0), lambda _: None)
-    names = searched(portfolio, 80, lambda _, k: k % 7)
-    assert names[:6] == [*["alternating vertices"] * 2, *["coarse"] * 4]
-    # slightly more, as the gradient has nothing to propose
-    assert names[6:].count("surrogate") == pytest.approx(2 / 3 * 74, abs=3)
-    assert names[6:].count("coarse") == pytest.approx(2 / 9 * 74, abs=3)
+    names, points = [], []
+    for index in range(80):
+        proposal = portfolio.next()
+        names.append(proposal.strategy.name)
+        points.append(proposal.point)
+        portfolio.tell(proposal, float(index % 7))
+    constant = ["constant vertices"] * 2
+    assert names[:10] == [*["alternating vertices"] * 2, *constant, "coarse", *constant, *["coarse"] * 3]
+    assert [(point[0], point[8]) for point in points[2:4]] == [(1.0, 0.0), (0.0, 1.0)]
+    assert names[10:].count("surrogate") == pytest.approx(2 / 3 * 70, abs=4)  # more, without a gradient
     assert "periodic" in names
 
 
-def test_the_best_vertex_of_one_input_is_perturbed():
+@pytest.mark.parametrize(("scatter", "count"), [(1.0, 16), (0.01, 3)])
+def test_the_best_vertex_of_one_input_is_perturbed_while_robustness_scatters_there(
+    scatter: float, count: int
+):
     space = SearchSpace(8, (SignalBlock("reference", tuple(range(8))),))
     portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
-    names = searched(portfolio, 30, lambda _, k: k % 7)
-    assert names[:2] == ["alternating vertices"] * 2
-    assert names[2:18] == ["perturbation"] * 16
-    assert names[18:22] == ["coarse"] * 4
-
-
-@pytest.mark.parametrize(("scatter", "count"), [(1.0, 16), (0.01, 3)])
-def test_perturbations_go_on_while_robustness_scatters_among_them(scatter: float, count: int):
-    strategy = Perturbation(SearchSpace(8), np.random.default_rng(0))
-    for index in range(12):
-        strategy.observe(np.full(8, 0.5), 1.0 + index)
-    made = 0
-    while (point := strategy.propose()) is not None:
-        made += 1
-        strategy.tell(point, 1.0 + scatter * (3.0 * made % 7.0))
-    assert made == count
+    names = searched(
+        portfolio, 30, lambda name, k: 1.0 + (scatter if name == "perturbation" else 1.0) * (k % 7)
+    )
+    assert names[:4] == [*["alternating vertices"] * 2, *["constant vertices"] * 2]
+    assert names[4 : 4 + count] == ["perturbation"] * count
+    assert names[4 + count :][:4] == ["coarse"] * 4
 
 
 @pytest.mark.parametrize(("value", "near"), [(lambda _: 1.0, 1.0), (lambda k: k % 7, math.inf)])
@@ -156,7 +154,7 @@ def test_points_of_a_batch_are_told_late_and_the_gradient_is_followed_all_the_sa
 
 def test_a_strategy_that_is_left_out_has_no_turn():
     space = SearchSpace(8, (SignalBlock("reference", tuple(range(8))),))
-    for without in ("coarse", "surrogate", "alternating vertices", "periodic"):
+    for without in ("coarse", "surrogate", "constant vertices", "periodic"):
         portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None, without=(without,))
         assert without not in searched(portfolio, 60, lambda _, k: k % 7)
 
@@ -177,7 +175,7 @@ def test_where_robustness_is_no_guide_points_are_random_and_one_in_twelve_is_a_v
     assert names == (["uniform"] * 11 + ["vertices"]) * 2
 
 
-def test_a_small_space_is_searched_by_perturbations_and_the_surrogate():
+def test_in_a_small_space_all_vertices_come_first():
     space = SearchSpace(3, (SignalBlock("reference", (0, 1, 2)),))
     portfolio = Portfolio(space, np.random.default_rng(0), lambda _: None)
     names, points = [], []
@@ -186,12 +184,11 @@ def test_a_small_space_is_searched_by_perturbations_and_the_surrogate():
         names.append(proposal.strategy.name)
         points.append(proposal.point)
         portfolio.tell(proposal, float(np.abs(proposal.point - (0.05, 0.05, 0.95)).sum()))
-    assert names[0] == "surrogate"  # nothing is known yet
-    count = names.count("perturbation")
-    assert names[1 : 1 + count] == ["perturbation"] * count
-    assert 3 <= count <= 16
-    later = [names[1 + count :].count(each) / (59 - count) for each in ("surrogate", "uniform")]
-    assert later == pytest.approx([2 / 3, 2 / 9], abs=0.06)
+    assert names[:8] == ["constant vertices"] * 8
+    assert len({tuple(point) for point in points[:8]}) == 8
+    assert names[8:11] == ["perturbation"] * 3  # the robustness does not scatter
+    later = [names[11:].count(each) for each in ("surrogate", "uniform")]
+    assert later == pytest.approx([34, 11], abs=2)
     near = [point for name, point in zip(names, points, strict=True) if name == "surrogate"]
     assert np.median(np.abs(np.array(near[-10:]) - (0.05, 0.05, 0.95))) < 0.1
 

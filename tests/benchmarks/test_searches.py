@@ -25,7 +25,7 @@ def test_there_are_thirty_problems_of_our_own_and_rows_of_the_competition(every:
 
 
 def test_a_search_is_the_same_without_a_part_that_had_no_turn(every: tuple[Problem, ...], tmp_path: Path):
-    (problem,) = [each for each in every if each.name == "tanks_high"]
+    (problem,) = [each for each in every if each.name == "lander_fast"]
     simulator = ModelSimulator.load(str(problem.spec), None, {})
 
     def searched(removal: str):
@@ -34,11 +34,11 @@ def test_a_search_is_the_same_without_a_part_that_had_no_turn(every: tuple[Probl
 
     whole = searched(WHOLE)
     unused = [each for each in REMOVALS[1:-1] if not any(each in search["strategies"] for search in whole)]
-    assert unused
+    assert len(unused) >= 3
     assert all(searched(removal) == whole for removal in unused)
-    without = searched("alternating vertices")
-    assert all("alternating vertices" in each["strategies"] for each in whole)
-    assert not any("alternating vertices" in each["strategies"] for each in without)
+    without = searched("constant vertices")
+    assert all("constant vertices" in each["strategies"] for each in whole)
+    assert not any("constant vertices" in each["strategies"] for each in without)
 
 
 def test_a_ratio_is_that_of_geometric_means_over_the_same_seeds(every: tuple[Problem, ...]):
