@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 443_013
+NODES = 455_560
 CROSSINGS = 6.98
 CIRCLES = {
     ("cli/certify", "cli/check"),

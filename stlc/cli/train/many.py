@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from stlc.cli.framework.documents import TrainedJob, TrainedRuns
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.escape import operand
-from stlc.view.learning import best_drives
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.jobs import Job, JobResult
@@ -189,6 +188,8 @@ def _cells(record: TrainedJob) -> tuple[str, ...]:
 
 def _drives(record: TrainedJob) -> str:
     """The drives that obey under the recommended guard, or under that with which most do."""
+    from stlc.view.learning import best_drives
+
     best = best_drives(record)
     return "" if best is None else f"{best['satisfied']:,} of {best['drives']:,}, {best['guard']}"
 
