@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import Field, dataclass, fields, is_dataclass
+from dataclasses import Field, dataclass, fields, is_dataclass, replace
 from time import process_time
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -30,6 +30,8 @@ PLANNING_VERSION = 1
 """Version of the planners, raised with every change of the plans that they find within a budget."""
 SHORT = 64
 """Number of plans judged in the search for a plan that continues a prefix."""
+FIRST = 50
+"""Budgets of a decision that the first plan of a mission may take: it is made before the mission begins."""
 SECONDS = 1.0
 """Default budget per initial state, in seconds of processor time."""
 
@@ -392,6 +394,10 @@ class PlannerPolicy(Policy):
         self._planner, self._budget, self._seed = planner, budget, seed
         self._prepared = task, prepared(planner, task)
         self._short: tuple[Task, Solver] | None = None
+        self._clock = None
+        if task.compiled.grid.end is not None:
+            clock = next(timer.name for timer in task.compiled.timers if timer.kind == "clock")
+            self._clock = task.system.names.index(clock)
         self._spent: list[Tensor] = []
         self._reached: list[Tensor] = []
 
@@ -415,10 +421,16 @@ class PlannerPolicy(Policy):
         return plans, self.task.judge(x0, plans)
 
     def _decided(self, x0: Tensor, rest: Tensor | None = None) -> Tensor:
-        """Search within the budget; it begins at `rest`, (B, T, m), which is kept if it is good enough."""
+        """Search within the budget; it begins at `rest`, (B, T, m), which is kept if it is good enough.
+
+        A search draws other random numbers than the one before: what has failed is not tried again.
+        """
         if self._prepared[0] is not self.task:
             self._prepared = self.task, prepared(self._planner, self.task)
-        search = self._searched(x0, self._prepared[1], self._budget, rest)
+        budget = self._budget
+        if self._clock is not None and bool((x0[:, self._clock] == 0.0).all()):
+            budget = replace(budget, seconds=FIRST * budget.seconds)
+        search = self._searched(x0, self._prepared[1], budget, rest, seed=self._seed + len(self._spent))
         self._spent.append(search.seconds)
         self._reached.append(search.rho >= self._budget.target - TOLERANCE)
         return search.plans.to(x0.dtype)
@@ -430,12 +442,13 @@ class PlannerPolicy(Policy):
         """
         if self._short is None or self._short[0] is not self.task:
             self._short = self.task, prepared(planner_named("search", tries=SHORT), self.task)
-        return self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT)).plans.to(x0.dtype)
+        found = self._searched(x0, self._short[1], PlanBudget(torch.inf, SHORT), seed=self._seed)
+        return found.plans.to(x0.dtype)
 
     def _searched(
-        self, x0: Tensor, solver: Solver, budget: PlanBudget, rest: Tensor | None = None
+        self, x0: Tensor, solver: Solver, budget: PlanBudget, rest: Tensor | None = None, *, seed: int = 0
     ) -> PlanSearch:
-        search = PlanSearch(self.task, x0, budget, seed=self._seed, start=rest)
+        search = PlanSearch(self.task, x0, budget, seed=seed, start=rest)
         with torch.enable_grad():
             if rest is not None:
                 rows = torch.arange(len(x0))

@@ -11,7 +11,7 @@ import torch
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, plan, planner_named
+from stlc.controller.planning.planner import FIRST, PlanBudget, PlannerPolicy, plan, planner_named
 from stlc.controller.policies.policy import PlanNetwork, blocks
 from stlc.controller.problem.task import LONGEST, Task
 from stlc.controller.training.local_search import SearchResult, remainders
@@ -168,3 +168,17 @@ def test_remainders_of_a_plan_satisfy_from_the_states_on_its_way(task: Task) -> 
     assert torch.equal(rest.states[0], found.states[0])
     clock = rest.states[:, task.system.names.index("clock")]
     assert clock[:6].tolist() == [0.0, 10.0, 20.0, 30.0, 40.0, 50.0]
+
+
+def test_the_first_plan_of_a_mission_may_take_longer(task: Task) -> None:
+    hard = task_of(Path(task.system.decl.path).parent, text=ERRAND.replace("x > 5 m", "x > 6.9 m"))
+    policy = PlannerPolicy(hard, planner_named("search"), PlanBudget(0.001, target=torch.inf))
+    x = hard.sample(1, seed=1, dtype=torch.float64)
+    policy.plan_judged(x)
+    first = policy.take_use()
+    x[:, hard.system.names.index("clock")] = 1.0
+    policy.plan_judged(x)
+    later = policy.take_use()
+    assert first is not None
+    assert later is not None
+    assert first.median >= FIRST * 0.001 > later.median
