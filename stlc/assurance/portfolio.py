@@ -89,7 +89,9 @@ class Portfolio:
         if self._guided:
             climb, coarse = GradientVertices(space, generator, gradient), CoarseSampling(space, generator)
             constant, surrogate = ConstantVertices(space, generator), SurrogateSearch(space, generator)
-            self._others = [climb, PeriodicInputs(space, generator)] if space.blocks else [climb]
+            self._others.append(climb)
+            if space.blocks:
+                self._others.append(PeriodicInputs(space, generator))
             if any(len(block.values) > max(PIECES) for block in space.blocks) and coarse.name not in without:
                 self._drawn = coarse
             drawn = [coarse] if self._drawn is coarse else []
