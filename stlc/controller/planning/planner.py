@@ -26,7 +26,7 @@ from stlc.registry import PLANNERS, closest
 if TYPE_CHECKING:
     from stlc.controller.problem.task import PlanVerdicts, Task
 
-PLANNING_VERSION = 1
+PLANNING_VERSION = 2
 """Version of the planners, raised with every change of the plans that they find within a budget."""
 SHORT = 64
 """Number of plans judged in the search for a plan that continues a prefix."""
