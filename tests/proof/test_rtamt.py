@@ -22,4 +22,4 @@ def test_rtamt_says_the_same(numbers: range) -> None:
         found = case.monitor().robustness(case.signals, end="truncate")
         case.same(found, values(case.formula, case.signals), "RTAMT")
         compared += 1
-    assert compared > 0.9 * len(numbers)
+    assert compared > 0.8 * len(numbers)

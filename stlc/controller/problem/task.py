@@ -15,6 +15,7 @@ from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.parameters import fixed
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import is_state, nodes
@@ -28,7 +29,6 @@ from stlc.native import check_plans
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.compile.ir import nodes as ir
     from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.compile.schedule.schedule import End
     from stlc.dynamics.model.system import System
@@ -324,6 +324,17 @@ class Task:
     def _moving(self) -> tuple[str, ...]:
         """Names of the states that change along a plan; a plan on which one is NaN is violated."""
         return tuple(motion_of(self.system).next)
+
+    @cached_property
+    def timed(self) -> Tensor:
+        """Mask of the requirements that read clock, statuses or timers, (R,)."""
+        return torch.tensor(
+            [
+                any(isinstance(part, ir.Predicate) and part.guard for part in nodes(rule.formula))
+                for rule in self.rules
+            ],
+            dtype=torch.bool,
+        )
 
     @cached_property
     def _values_of_a_row(self) -> int:

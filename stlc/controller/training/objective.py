@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.switch import StraightThrough, Switch, Tanh
 from stlc.controller.problem.task import satisfied
 
@@ -126,10 +124,7 @@ def without_lost(task: Task, each: Tensor) -> Tensor:
     about plans, and would hide the other requirements in their minimum. The robustness of a requirement that
     reads no such state is -inf only if its numbers overflow, and stays so.
     """
-    lost = each.detach() == -torch.inf
-    for index in lost.any(0).nonzero()[:, 0].tolist():
-        parts = nodes(task.rules[index].formula)
-        lost[:, index] &= any(isinstance(part, ir.Predicate) and part.guard for part in parts)
+    lost = (each.detach() == -torch.inf) & task.timed.to(each.device)
     return each.masked_fill(lost, torch.inf)
 
 
