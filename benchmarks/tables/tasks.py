@@ -205,7 +205,7 @@ def _policy(cell: TaskCell, trace: Path, runs: Path) -> Iterator[Outcome]:
 
 
 def _told(trained: Mapping[str, Any]) -> str:
-    """What `stlc train` says about its policy: of drives by guard, and its verdict."""
+    """Account that `stlc train` gives of its policy: drives by guard, and the verdict."""
     driven = [
         f"{each['guard']} {each['satisfied']} of {each['drives']}"
         for each in trained.get("closed_loop", {}).get("guards", ())

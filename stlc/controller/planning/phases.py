@@ -267,7 +267,7 @@ def levels(*ends: Numbers, most: int) -> Numbers:
 
 
 class _Shortfall:
-    """What a state lacks for a formula, as a formula whose robustness is 0 where nothing is missing.
+    """Lack of a state for a formula, as a formula whose robustness is 0 where nothing is missing.
 
     What a conjunction lacks is the sum over its items, each in units of its typical size: unlike a minimum,
     it becomes less with every item that comes nearer. Predicates that read the same states form a group;
