@@ -55,7 +55,7 @@ SMALL = {
     "stlc.controller.guard.feasibility.TRIES": 1000,
     "stlc.controller.evaluation.deployment.LATENCY_SECONDS": 0.01,
 }
-"""What makes the least training take half a second, and a simulation five."""
+"""Sizes of searches in tests; with the usual ones the least training takes .5 s, and a simulation 5 s."""
 ROUNDS = {"pool": 128, "most": 32}
 """States of a search round."""
 TRAINING = {

@@ -51,7 +51,7 @@ def farm() -> Arrays:
 
 
 def with_grid(signals: Arrays) -> Arrays:
-    """What the farm buys follows from the rest."""
+    """Power that the farm buys: it follows from the rest."""
     hour = signals["hour"]
     demand = np.interp(hour, (0, 5, 7, 9, 12, 16, 18, 20, 22, 24), (1.5, 1.5, 4, 3, 3.5, 3, 6, 7, 3, 1.5))
     sun = np.interp(hour, (0, 6, 9, 12, 15, 19, 24), (0, 0, 4, 7, 5, 0, 0))

@@ -1,4 +1,4 @@
-"""What is due later than a plan reaches, and what of it nothing bridges."""
+"""Requirements that are due later than a plan reaches, and those among them that nothing bridges."""
 
 from __future__ import annotations
 

@@ -6,28 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.point import task
 
 from stlc.controller.planning.missed import STARTS, Missed, better_planner, missed
-from stlc.controller.problem.task import Task
-from stlc.dynamics.model.system import System
-from stlc.grammar.parse.parser import parse
-from stlc.source import Source
-
-SYSTEM = """
-stlc: 1
-name: point
-time: {dt: 1 s, horizon: 8 steps, integrator: euler}
-state: {x: {unit: m, range: [0, 10]}}
-control: {v: {unit: m/s, range: [-1, 1]}}
-flow: {x: v}
-init: {mixture: [{draw: {x: "uniform(4, 5)"}}]}
-"""
-
-
-def task(folder: Path, rules: str) -> Task:
-    (folder / "point.yaml").write_text(SYSTEM)
-    spec = f"spec s\nstate signal x [m]\n{rules}\n"
-    return Task.of(parse(Source("s.stl", spec)), System.load(folder / "point.yaml"))
 
 
 def test_the_requirement_that_most_best_plans_violate_comes_first(tmp_path: Path) -> None:
