@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.feasibility import ENOUGH, solve
+from stlc.controller.guard.feasibility import solve
+from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import satisfied
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
-from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.controller.training.samplers import mission_steps
 from stlc.files import write_atomic
 from stlc.native import never
@@ -34,8 +34,9 @@ CEILING_TRIES = 8000
 """Plans tried for a held-out state before it counts as infeasible."""
 MOST_SEARCHED = 1024
 """Maximum number of failing states to search; extrapolation has a standard error of 1.6 %."""
-EXPLORED = 4
-"""Number of failing states to explore if no satisfying plan is known for any state."""
+FEW, JUDGED = 4, 80_000
+"""Number of failing states from which the planner `search` searches if no satisfying plan is known for any
+state, and number of plans that it judges for each of them."""
 CHUNK = 256
 """Batch size of the search."""
 TORCH_CHUNK = 32
@@ -138,7 +139,8 @@ def score(
             break
         known[chunk], searched[chunk] = found, True
     if len(failing) and not bool(known.any()) and not enough():
-        _explore(task, states, failing, known, enough)
+        few = failing[:FEW]
+        known[few] = plan(task, states[few], budget=PlanBudget(torch.inf, JUDGED, stop=enough)).satisfied
         searched |= known
     accuracy = float(good.double().mean())
     return Score(
@@ -179,25 +181,6 @@ def _judged(
         each.append(judged.requirements)
     count = sum(map(len, rho))
     return states[:count], torch.cat(plans), torch.cat(rho), torch.cat(each)
-
-
-def _explore(task: Task, states: Tensor, failing: Tensor, known: Tensor, enough: Stop) -> None:
-    """Search for satisfying plans from a few failing states by exploration, and update `known`.
-
-    Exploration builds plans step by step, by extending partial plans; it does not use the policy. The search
-    ends early once `enough` returns True.
-
-    Args:
-        task: specification and system.
-        states: all states, (n, dim).
-        failing: indices of the states at which the policy's plan fails, (k,).
-        known: mask of the states with a known satisfying plan, (n,); changed in place.
-        enough: function that returns True to end the search.
-    """
-    first = failing[:EXPLORED]
-    generator = torch.Generator().manual_seed(HELD_OUT_SEED + 2)
-    found = Exploration(task).solved(states[first], EFFORTS[1], generator, ENOUGH, enough)
-    known[first] = (states[first][:, None] == found.states[None]).all(2).any(1)
 
 
 def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:

@@ -107,9 +107,9 @@ class Validation:
             last search; None if no search has ended.
         failing: number of states from which the last search started; 0 without a search.
         repaired: number of states for which the last search found a satisfying plan.
-        explored: number of satisfying plans that exploration has found since the previous validation.
-            Exploration is a search that builds plans by extending prefixes (first actions of plans). If the
-            remainder of a plan found satisfies the specification from a later state, it is counted too.
+        explored: number of plans that the planner `search` has found since the previous validation.
+            If the remainder of a plan found satisfies the specification from a later state, it is counted
+            too.
     """
 
     accuracy: float
@@ -147,8 +147,8 @@ class Learner(ABC):
     """State of a training run; the training loop advances, validates and saves it step by step.
 
     A subclass supplies the steps, the policy and the contents of a checkpoint. Some subclasses also search
-    for better plans, concurrently with the steps, or build plans by exploration (see `explore`). This class
-    does neither.
+    for better plans, concurrently with the steps and before validations (see `explore`). This class does
+    not.
 
     Attributes:
         task: the specification and system for which a policy is trained.
@@ -164,7 +164,7 @@ class Learner(ABC):
         searches: whether the learner searches for better plans, concurrently with the steps.
         searching: whether such a search is running now.
         solved: whether any search has found a satisfying plan.
-        exhausted: whether exploration has found no plan, even with its largest effort.
+        exhausted: whether the longest search before a validation has found no plan.
         settles_rarely: whether `settle` has nothing to do after most steps.
         failures: states of failing closed-loop drives, which are mixed into the training; None without
             `--falsify`.
@@ -262,12 +262,12 @@ class Learner(ABC):
         return self.task.torch_reasons(self.device.type, searches=False, smooth=True)
 
     def explore(self, stop: Stop = never) -> bool:  # noqa: ARG002
-        """Search for satisfying plans by exploration, if the last search found too few.
+        """Search for plans by the planner `search`, if the last search found too few.
 
-        Exploration builds plans by extending prefixes (first actions of plans). By default nothing is done.
+        By default nothing is done.
 
         Returns:
-            False if `stop` ended the exploration early, else True.
+            False if `stop` ended the search early, else True.
         """
         return True
 

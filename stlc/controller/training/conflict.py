@@ -23,8 +23,8 @@ from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.planning.missed import better_planner, missed
+from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import Task
-from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.diagnostics import Diagnostic, Label
 from stlc.native import never
 
@@ -40,6 +40,8 @@ PROOF = (
     "within the horizon"
 )
 TRIES = 4000
+JUDGED = 20_000
+"""Plans that the planner `search` judges for each of two starts, where local search has found none."""
 PLANNING = 2.0
 """Seconds of search beside which other planners are tried (see `better_planner`)."""
 
@@ -64,7 +66,10 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
         if not rest or enough():
             continue
         found = _climbed(task, rest, enough)
-        if not (bool(found.solved.any()) or _explored(task, rest, enough) or enough()):
+        if bool(found.solved.any()):
+            continue
+        budget = PlanBudget(torch.inf, JUDGED, ENOUGH, enough)
+        if not (bool(plan(_alone(task, rest), _starts(task)[:2], budget=budget).satisfied.any()) or enough()):
             core, nearest = rest, found
     said = _told(task, core, nearest, proved=False)
     listed = [f"`{each.requirement}` from {each.starts}" for each in missed(task, first.states, first.plans)]
@@ -99,13 +104,6 @@ def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> 
     alone, x0 = _alone(task, rules), _starts(task)
     nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
     return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
-
-
-def _explored(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> bool:
-    """True if exploration from two of the tested initial states finds a plan that satisfies `rules` alone."""
-    generator = torch.Generator().manual_seed(0)
-    found = Exploration(_alone(task, rules)).solved(_starts(task)[:2], EFFORTS[0], generator, ENOUGH, enough)
-    return len(found.rho) > 0
 
 
 def _told(

@@ -1,4 +1,4 @@
-"""Training state of a plan network: gradient steps, exploration, validation, checkpoint contents.
+"""Training state of a plan network: gradient steps, searches for plans, validation, checkpoint contents.
 
 Every few dozen steps the policy's plans from newly drawn states are judged. In the method `guided`, a search
 starts from the plans that fail, and tries to repair them. The network imitates a repaired plan for as long as
@@ -22,11 +22,11 @@ from torch import Tensor
 from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.methods import Learner, Method, Validation
 from stlc.controller.parallel.ddp import ALONE, Ranks
+from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import rank, satisfied
 from stlc.controller.training.checkpoint import below
 from stlc.controller.training.diagnose import TrainingStep, diagnose
-from stlc.controller.training.exploration import EFFORTS, Exploration
 from stlc.controller.training.failures import FailureBank
 from stlc.controller.training.local_search import (
     TAILS,
@@ -66,9 +66,9 @@ TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
 They are: states for the margin, states per search round, and plans tried per state.
 """
 BARREN = 0.05
-"""Share of failing states solved by local search below which exploration is used too."""
+"""Share of failing states solved by local search below which whole plans are searched for too."""
 LEARNT = 0.5
-"""Accuracy on fresh states at and above which exploration is not used."""
+"""Accuracy on fresh states at and above which they are not."""
 NEAREST = 0.75
 """Share of the states of a search round that are chosen because their plans fail by the least amount."""
 COUNTS = ("accuracy", "solved", "barren", "effort", "failing")
@@ -76,7 +76,9 @@ COUNTS = ("accuracy", "solved", "barren", "effort", "failing")
 DRIVEN = 8
 """States of failing drives in a search round: one for so many fresh ones, beside them."""
 EXPLORED = 4
-"""Number of initial states that are explored before a search round."""
+"""Number of initial states from which the planner `search` searches before a validation."""
+EFFORTS = 20_000, 80_000, 320_000
+"""Plans that it judges for each of them at first, and after each search that found none."""
 RISE = 30
 """Steps over which the learning rate rises if its peak is held; independent of the total number of steps."""
 
@@ -185,25 +187,28 @@ class Trainer(Learner):
 
     @torch.no_grad()
     def explore(self, stop: Stop = never) -> bool:
-        """Search for satisfying plans by exploration, if the last local search solved hardly any state.
+        """Search for plans by the planner `search`, if the last local search solved hardly any state.
 
-        Exploration builds plans step by step from prefixes. The plans found are imitated from then on. If
-        there are none, the next exploration is longer.
+        The planner looks at the order of the goals too. The plans found are imitated from then on; if there
+        are none, the next search is longer.
 
         Returns:
-            False if `stop` ended the exploration early, which then has no effect; else True.
+            False if `stop` ended the search early, which then has no effect; else True.
         """
         if not self.barren:
             return True
         before = self.generator.get_state()
         starts = self.task.sample(EXPLORED, generator=self.generator)
         seed = int(torch.randint(2**62, (), generator=self.generator))
-        generator = torch.Generator().manual_seed(seed)
-        effort, spare = EFFORTS[self.effort], self.searcher.enough
-        found = Exploration(self.task).solved(starts, effort, generator, spare, stop).to(self.device)
+        budget = PlanBudget(torch.inf, EFFORTS[self.effort], self.searcher.enough, stop)
+        searched = plan(self.task, starts, budget=budget, seed=seed)
         if stop():
             self.generator.set_state(before)
             return False
+        good = searched.satisfied
+        plans = SearchResult(starts[good], searched.plans[good].to(starts.dtype), searched.rho[good])
+        count = TAILS if self.task.compiled.timers else 1
+        found = remainders(self.task, plans, count).to(self.device)
         self.buffer.add(found.states, found.plans)
         self.supply.follow(found.states, found.plans)
         self.barren, self.explored = False, len(found.rho)
@@ -212,10 +217,7 @@ class Trainer(Learner):
 
     @property
     def exhausted(self) -> bool:  # type: ignore[override]
-        """True once exploration with the largest effort has found no plan.
-
-        Exploration builds plans step by step from prefixes.
-        """
+        """True once the longest search by the planner `search` has found no plan."""
         return self.effort >= len(EFFORTS)
 
     @torch.no_grad()

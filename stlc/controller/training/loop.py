@@ -41,7 +41,7 @@ DEFAULT_BUDGET = 60.0
 BARREN_VALIDATIONS, BARREN_SHARE = 5, 0.1
 """If no plan was ever found, training ends after this many validations, but not before this share of steps.
 
-By then exploration has used its largest effort. If bounds prove that no plan exists, training ends at the
+By then the longest search for plans has been made. If bounds prove that no plan exists, training ends at the
 first validation.
 """
 SAVE_EVERY = 500
@@ -529,8 +529,8 @@ class _Session:
     def _validate(self, began: float) -> None:
         """Validate and write a row of `train.jsonl`.
 
-        `began`: clock reading before the exploration that precedes a validation. The recorded duration
-        includes this exploration.
+        `began`: clock reading before the search that precedes a validation. The recorded duration includes
+        this search.
         """
         learner = self.learner
         found = learner.validate()
@@ -589,7 +589,7 @@ class _Session:
         """True if no satisfying plan was ever found, and further search is useless.
 
         Search is useless in two cases: bounds prove that no plan exists; or enough steps have been made, and
-        exploration with the largest effort has found none.
+        the longest search has found none.
         """
         learner = self.learner
         enough = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)

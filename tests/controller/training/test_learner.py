@@ -1,4 +1,4 @@
-"""Plans that are put together from their beginnings, where climbing whole plans leads nowhere."""
+"""Training searches for whole plans by the planner where changing them locally leads nowhere."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import pieces
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.methods import Validation
+from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
-from stlc.controller.training.exploration import Exploration
-from stlc.controller.training.learner import Trainer
+from stlc.controller.training.learner import EFFORTS, Trainer
 from stlc.controller.training.local_search import Searcher
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
@@ -54,48 +51,16 @@ def puzzle(tmp_path_factory: pytest.TempPathFactory) -> Task:
     return Task.of(parse(Source("puzzle.stl", SPEC)), System.load(path))
 
 
-def test_a_puzzle_is_solved_that_a_climb_does_not_solve(puzzle: Task) -> None:
+def test_the_planner_solves_a_puzzle_that_a_climb_does_not_solve(puzzle: Task) -> None:
     x0 = puzzle.sample(4, seed=0, dtype=torch.float64)
     middle = torch.zeros(len(x0), puzzle.horizon, 2)
     climbed = Searcher(puzzle, torch.Generator().manual_seed(0), enough=1e-4).repair(
         x0.float(), middle, middle[:0], tries=1000
     )
     assert not bool(climbed.solved.all())
-    found = Exploration(puzzle).plan(x0[0], 40, torch.Generator().manual_seed(0))
-    assert found.plan is not None
-    judged = puzzle.judge(x0[:1], found.plan[None])
-    assert float(judged.rho) >= -TOLERANCE
-    assert bool((found.plan.abs() <= 1.0).all())
-
-
-def test_the_same_seed_finds_the_same(puzzle: Task) -> None:
-    starts = puzzle.sample(3, seed=0)
-    one, other = (
-        Exploration(puzzle).solved(starts, 24, torch.Generator().manual_seed(3), 0.05) for _ in range(2)
-    )
-    assert len(one.rho) > 0
+    one, other = (plan(puzzle, x0, budget=PlanBudget(torch.inf, EFFORTS[0])) for _ in range(2))
+    assert bool(one.satisfied.all())
     assert torch.equal(one.plans, other.plans)
-    assert bool((puzzle.judge(one.states, one.plans).rho >= -1e-5).all())
-
-
-def test_what_is_found_is_raised_to_what_is_asked(puzzle: Task) -> None:
-    starts = puzzle.sample(2, seed=1)
-    if puzzle.native is None:
-        pytest.skip("there is no C compiler")
-    found = Exploration(puzzle).solved(starts, 48, torch.Generator().manual_seed(0), 0.1)
-    assert float(found.rho.max()) >= 0.1
-
-
-def test_one_sweep_is_made_where_there_is_no_time(puzzle: Task) -> None:
-    asked: list[int] = []
-
-    def enough() -> bool:
-        asked.append(1)
-        return True
-
-    found = Exploration(puzzle).plan(puzzle.sample(1, seed=0)[0], 9, torch.Generator().manual_seed(0), enough)
-    assert found.sweeps == 1
-    assert len(asked) <= 1
 
 
 def test_a_training_explores_where_climbing_leads_nowhere(
@@ -115,12 +80,3 @@ def test_a_training_explores_where_climbing_leads_nowhere(
     assert [look.explored for look in rounds[:2]] == [0, 0]  # climbing is tried first
     assert rounds[-1].explored > 0
     assert trainer.buffer.count >= rounds[-1].explored
-
-
-def test_pieces_are_what_a_formula_is_the_conjunction_of() -> None:
-    a, b, c = (ir.Predicate(ir.Signal(name)) for name in "abc")
-    window = ir.Window(0, 3)
-    whole = ir.BoolOp("and", (c, ir.Temporal("always", window, ir.BoolOp("and", (a, b)))))
-    assert pieces(whole) == [c, ir.Temporal("always", window, a), ir.Temporal("always", window, b)]
-    either = ir.Temporal("eventually", window, ir.BoolOp("and", (a, b)))
-    assert pieces(either) == [either]
