@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @command(
     "stlc plan specs/traffic.stl",
     'stlc plan specs/reach_n_avoid.stl --from "x=1, v=0" --budget 50ms',
-    "stlc plan specs/ship_safe.stl --starts 1000 --method halving --option starts=128",
+    "stlc plan specs/ship_safe.stl --starts 1000 --option tries=500",
     "stlc plan specs/ship_safe.stl --target max --tube mismatch-10",
     drives=True,
 )

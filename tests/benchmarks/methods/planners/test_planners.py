@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[4]
 SMALL = ["--seeds", "0", "--agents", "2", "--steps", "3", "--no-pictures"]
 
 
-@pytest.fixture(params=["cem", "cma"])
+@pytest.fixture(params=["cem", "cma", "halving"])
 def planner(request: pytest.FixtureRequest) -> str:
     return laws.available(request.param)
 
