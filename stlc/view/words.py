@@ -112,8 +112,10 @@ CAUSES = {
     "told": "lost at {}, by an exogenous event after which no plan is known",
     "later": "no plan is known from {} on, although the plan followed until then satisfied",
     "missed": "a plan is known at {}, but another plan was followed",
+    "near": "the best plans known from {} on miss by little",
+    "rules": "the plans followed until {} satisfied their specification",
 }
-"""Causes of a violation, from `stlc.controller.evaluation.rules.Lost`."""
+"""Causes of a violation, from `stlc.controller.evaluation.causes.Lost`."""
 
 
 def viable_sentence(simulation: Mapping[str, Any]) -> str:

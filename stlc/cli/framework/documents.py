@@ -514,7 +514,7 @@ class RuleCounts(TypedDict):
 
 
 class LossCause(TypedDict):
-    why: Literal["start", "told", "later", "missed"]
+    why: Literal["start", "told", "later", "missed", "near", "rules"]
     time: Positive
 
 

@@ -1,13 +1,13 @@
 """Causes of failed drives: what became of the plans before a requirement was violated.
 
-A drive follows a satisfying plan for some time. From some sample on it follows none, and later a requirement
-is violated. The cause is told from that sample: whether a search finds a satisfying plan there, and whether
-the world did at the step before what the model predicts. A drive is the closed-loop run of one agent.
+A drive is the closed-loop run of one agent. It follows a good plan for some time. From some sample on it
+follows none, and later a requirement is violated. A search for good plans from there on tells the cause.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -16,6 +16,7 @@ import torch
 from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.guard.feasibility import safety_task, solve
 from stlc.controller.problem.task import satisfied
+from stlc.native import never
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording
@@ -24,71 +25,94 @@ if TYPE_CHECKING:
     from stlc.native import Stop
 
 Cause: TypeAlias = Literal["start", "told", "later", "missed", "near", "rules"]
-"""Cause of a failed drive; the first four are those of `stlc.controller.evaluation.rules.Lost`.
+"""Cause of a failed drive.
 
-- `start`: no satisfying plan is known from the start of the mission.
-- `told`: a satisfying plan was followed, until the world did what its model does not foresee.
-- `later`: a satisfying plan was followed, until one step later none was known, although the world did what
-  the model foresees: plans end too early to see what comes.
-- `missed`: a satisfying plan is known, and none was followed.
+- `start`: no good plan is known, even at the start.
+- `told`: a good plan was known until the world did what its model does not foresee; for example, an obstacle
+  came into view.
+- `later`: a good plan was known until an instant before which the world did what the model foresees: plans
+  end too early to see what comes.
+- `missed`: a good plan was known, but another plan was followed.
 - `near`: the best known plans miss the specification by little (`NEAR`).
-- `rules`: plans that satisfied their specification were followed to the end; the rules of the drives ask for
-  more.
+- `rules`: good plans were followed until the violation; the rules of the drives ask for more.
 """
 TRIES, PASSES = 4000, 2
 """Plans tried from a state in a pass of the search, and number of passes."""
+LOOKS = 8
+"""Number of instants, from the last good plan to the violation, at which plans are searched for."""
 NEAR = 0.1
 """Robustness below 0 that counts as little, as a share of gamma, the margin that plans should have."""
 
 
-def causes(
-    task: Task, recording: DeploymentRecording, broken: Sequence[Broken], enough: Stop
-) -> dict[int, Cause]:
-    """Find why drives failed.
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Loss of a drive that violates a rule: since when no good plan was known, and why.
 
-    Plans are asked for what the drive violated: the requirements tagged `@safety` if one of these is among
-    them, else the whole specification.
+    If the drive violates a rule tagged `@safety`, a plan is good if it satisfies the requirements tagged
+    `@safety`. Otherwise a plan is good if it satisfies the whole specification of the plans. A good plan is
+    known at an instant if the followed plan is good, or if a search finds a good plan.
+
+    Attributes:
+        why: cause of the loss.
+        time: instant from which on no good plan was known, in seconds from the start; for `missed`, the last
+            instant at which one was known; for `rules`, that of the violation.
+        unforeseen: whether the world did what its model does not foresee when the last good plan was lost.
+    """
+
+    why: Cause
+    time: float
+    unforeseen: bool = False
+
+
+def losses(
+    task: Task,
+    recording: DeploymentRecording,
+    broken: Sequence[Broken],
+    safety: Collection[str],
+    enough: Stop = never,
+) -> dict[int, Lost]:
+    """Find why drives failed.
 
     Args:
         task: specification of the plans, and system.
         recording: the recorded drives.
         broken: the drives whose cause is wanted.
+        safety: names of the rules tagged `@safety`. The first rule that a drive violated counts; if it
+            violated some of these, the first of these.
         enough: condition that ends the searches early.
 
     Returns:
-        Row of a drive -> cause; drives for which the search was ended too early are left out.
+        Row of a drive -> its loss. Drives whose cause cannot be determined are left out, and those for which
+        the search was ended too early.
     """
-    safety, dt = {rule.name for rule in task.compiled.safety}, task.system.dt
-    little = NEAR * task.system.decl.objective.gamma
-    foreseen = model_consistent(task, recording)
-    if recording.eventless is not None:
-        foreseen &= recording.eventless
-    found: dict[int, Cause] = {}
-    for unsafe in (True, False):
-        drives = [each for each in broken if unsafe is not safety.isdisjoint(each.rules)]
-        if not drives:
+    foreseen = model_consistent(task, recording) if recording.eventless is None else recording.eventless
+    little, dt = NEAR * task.system.decl.objective.gamma, task.system.dt
+    found: dict[int, Lost] = {}
+    for each in broken:
+        row, unsafe = each.row, any(name in safety for name in each.rules)
+        good = recording.safe[row] if unsafe else satisfied(torch.from_numpy(recording.rho[row])).numpy()
+        times = [time for name, time in each.rules.items() if not unsafe or name in safety]
+        located = [time for time in times if time is not None]
+        last = min(round(min(located) / dt), recording.steps) if located else 0
+        followed = np.flatnonzero(good[: last + 1])
+        since = int(followed[-1]) + 1 if len(followed) else 0
+        if since > last:
+            if located and foreseen[row, :last].all():
+                found[row] = Lost("rules", dt * last)
             continue
-        asked = safety_task(task) if unsafe else task
-        good = recording.safe if unsafe else satisfied(torch.from_numpy(recording.rho)).numpy()
-        rows, lasts, since = [each.row for each in drives], [], []
-        for each in drives:
-            first = min((time for time in each.rules.values() if time is not None), default=0.0)
-            lasts.append(min(round(first / dt), recording.steps - 1))
-            followed = np.flatnonzero(good[each.row, : lasts[-1] + 1])
-            since.append(int(followed[-1]) + 1 if len(followed) else 0)
-        states = torch.from_numpy(recording.states[rows, since])
+        at = np.unique(np.linspace(since, last, min(LOOKS, last - since + 1)).round().astype(int))
+        asked = safety_task(task) if unsafe and task.compiled.safety else task
+        states = torch.from_numpy(recording.states[row, at])
         plans = solve(asked, states, passes=PASSES, tries=TRIES, stop=enough)
-        searched = zip(rows, since, lasts, plans.rho.tolist(), plans.solved.tolist(), strict=True)
-        for row, start, last, best, solved in searched:
-            own = float(recording.policy_rho[row, start : last + 1].max(initial=-np.inf))
-            if enough() and not np.isfinite(best):  # not searched for
-                continue
-            if start > last and foreseen[row, : last + 1].all():
-                found[row] = "rules"
-            elif start and not foreseen[row, start - 1]:
-                found[row] = "told"
-            elif solved:
-                found[row] = "missed"
-            else:
-                found[row] = "near" if max(best, own) > -little else "later" if start else "start"
+        solved = np.flatnonzero(plans.solved.numpy())
+        unforeseen = since > 0 and not foreseen[row, since - 1]
+        if len(solved):
+            if located:
+                found[row] = Lost("missed", dt * int(at[solved[-1]]), unforeseen)
+        elif not enough() or bool(torch.isfinite(plans.rho).all()):
+            own = float(recording.policy_rho[row, since : last + 1].max(initial=-np.inf))
+            why: Cause = "told" if unforeseen else "later" if since else "start"
+            if not unforeseen and max(float(plans.rho.max()), own) > -little:
+                why = "near"
+            found[row] = Lost(why, dt * since, unforeseen)
     return found

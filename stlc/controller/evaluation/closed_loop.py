@@ -26,7 +26,7 @@ from stlc.controller.deployment.simulator import (
     SimulationStep,
     simulate,
 )
-from stlc.controller.evaluation.causes import Cause, causes
+from stlc.controller.evaluation.causes import Cause, losses
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.rules import (
@@ -366,14 +366,14 @@ class _Trial:
         safe, broken = runs.safe, {each.row: each for each in runs.broken}
         told = [each for each in runs.broken if any(time is not None for time in each.rules.values())]
         room = max(0, EXPLAINED - sum(drive.cause is not None for drive in known.found.values()))
-        why = causes(self.task, recording, told[:room], lambda: self.left() <= 0.0)
+        why = losses(self.task, recording, told[:room], runs.safety, lambda: self.left() <= 0.0)
         for row, obeyed in enumerate(runs.obeyed.tolist()):
             where, agent = divmod(row, agents)
             known.found[seeds[where], agent] = Driven(
                 obeyed,
                 None if safe is None else bool(safe[row]),
                 broken[row].rules if row in broken else {},
-                why.get(row),
+                None if (lost := why.get(row)) is None else "told" if lost.unforeseen else lost.why,
             )
         known.seeds += count
 

@@ -10,16 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.controller.evaluation.causes import Lost, losses
 from stlc.controller.evaluation.executed import MOST_TIMED
-from stlc.controller.guard.feasibility import safety_task, solvable
 from stlc.controller.training.run import INDEX, read_library, save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
 from stlc.files import read_source
@@ -68,27 +66,6 @@ class Rules:
         """Comments on the rules: name of a rule -> text of its `##` comment."""
         rules = (item for item in self.spec.items if isinstance(item, ast.Require))
         return {item.name: " ".join((item.doc or "").split()) for item in rules}
-
-
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """Loss of a run that broke a rule: since when no good plan was known, and why.
-
-    If the run broke a rule tagged `@safety`, a plan is good if it satisfies the requirements tagged
-    `@safety`. Otherwise a plan is good if it satisfies the whole specification of the plans. A good plan is
-    known at an instant if the followed plan is good, or if a search finds a good plan.
-
-    Attributes:
-        why: cause of the loss. `start`: no good plan was known, even at the start. `told`: a good plan was
-            known until an exogenous event; for example, an obstacle came into view. `later`: a good plan was
-            known until an instant without such an event; the horizon of plans was too short, or the model is
-            wrong. `missed`: a good plan was known to the end, but another plan was followed.
-        time: instant from which on no good plan was known, in seconds from the start; for `missed`, the last
-            instant at which a good plan was known.
-    """
-
-    why: Literal["start", "told", "later", "missed"]
-    time: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,11 +240,8 @@ def judge_runs(
         SpecError: the rules use names that the system does not have.
     """
     runs = runs_by_rules(rules, task, recording)
-    safety, able = frozenset(runs.safety), viable.copy()
-    broken = tuple(
-        replace(each, lost=_lost(each, safety, task, recording, bool(viable[each.row])))
-        for each in runs.broken
-    )
+    able, found = viable.copy(), losses(task, recording, runs.broken, runs.safety)
+    broken = tuple(replace(each, lost=found.get(each.row)) for each in runs.broken)
     for each in broken:
         able[each.row] = not each.excused
     return replace(runs, broken=broken, viable=able | runs.obeyed)
@@ -299,51 +273,6 @@ def verdict_on_runs(rules: Rules, task: Task, recording: DeploymentRecording) ->
     )
     columns = np.moveaxis(recording.states, -1, 0)
     return monitor.check(dict(zip(task.system.names, columns, strict=True)))
-
-
-def _lost(
-    broken: Broken, safety: frozenset[str], task: Task, recording: DeploymentRecording, viable: bool
-) -> Lost | None:
-    """Find since when no good plan was known in a run that broke a rule, and why.
-
-    The run broke either a rule tagged `@safety`, or only other rules. In the first case, a plan is good if it
-    satisfies the requirements tagged `@safety`. In the second case, a plan is good if it satisfies the whole
-    specification of the plans.
-
-    Args:
-        broken: the run. The first rule that it broke counts; if it broke rules tagged `@safety`, the first of
-            these.
-        safety: names of the rules tagged `@safety`.
-        task: specification of the plans, and system.
-        recording: all recorded runs.
-        viable: whether a safe plan from the first state of the run is known.
-
-    Returns:
-        Time and cause, see `Lost`. None if the plans followed until the violation were good, or if the
-        cause cannot be determined.
-    """
-    row, unsafe = broken.row, not safety.isdisjoint(broken.rules)
-    asked = safety_task(task) if unsafe and task.compiled.safety else task
-    times = [time for name, time in broken.rules.items() if not unsafe or name in safety]
-    located = [time for time in times if time is not None]
-    if not located:  # time not located: decided by the start alone
-        known = viable if unsafe else bool(solvable(task, torch.from_numpy(recording.states[row, :1]))[0])
-        return None if known else Lost("start", 0.0)
-    dt = float(task.system.decl.dt)
-    last = min(round(min(located) / dt), recording.steps)
-    good = recording.safe[row] if unsafe else recording.rho[row] >= -TOLERANCE
-    followed = np.flatnonzero(good[: last + 1])
-    since = int(followed[-1]) + 1 if len(followed) else 0  # no satisfying plan is followed from here on
-    if since > last:
-        return None
-    states = torch.from_numpy(recording.states[row, since : last + 1])
-    solved = solvable(asked, states).numpy()
-    if solved.any():
-        return Lost("missed", dt * (since + int(np.flatnonzero(solved)[-1])))
-    if not since:
-        return Lost("start", 0.0)
-    event = recording.eventless is not None and not recording.eventless[row, since - 1]
-    return Lost("told" if event else "later", dt * since)
 
 
 def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:

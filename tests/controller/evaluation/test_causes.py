@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
-from stlc.controller.evaluation.causes import causes
+from stlc.controller.evaluation.causes import Lost, losses
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.rules import Broken, judge_runs_by_plans
 from stlc.controller.guard.guard import Guard
@@ -18,7 +18,6 @@ from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse
-from stlc.native import never
 from stlc.source import Source
 
 POINT = """
@@ -70,15 +69,16 @@ def test_the_cause_and_the_time_of_a_failure(
 ) -> None:
     task, recording, runs = driven(tmp_path, rules, calm)
     assert [each.rules for each in runs.broken] == [{"there": time}] * 2
-    assert causes(task, recording, runs.broken, never) == {0: cause, 1: cause}
+    found = losses(task, recording, runs.broken, runs.safety)
+    assert [found[row].why for row in (0, 1)] == [cause, cause]
 
 
 def test_rules_that_ask_for_more_than_the_plans_are_the_cause(tmp_path: Path) -> None:
     task, recording, runs = driven(tmp_path, "require here: always[0, T] x < 3 m", "calm")
     assert runs.broken == ()
-    assert causes(task, recording, [Broken(1, {"more": 2.0})], never) == {1: "rules"}
+    assert losses(task, recording, [Broken(1, {"more": 2.0})], ()) == {1: Lost("rules", 2.0)}
 
 
 def test_a_search_that_is_ended_too_early_names_no_cause(tmp_path: Path) -> None:
     task, recording, runs = driven(tmp_path, "require there: eventually@[0 s, 2 s] x > 1 m", "calm")
-    assert causes(task, recording, runs.broken, lambda: True) == {}
+    assert losses(task, recording, runs.broken, (), lambda: True) == {}
