@@ -183,6 +183,12 @@ def proposed(task: Task, network: PlanProposer, state: Mapping[str, Value]) -> V
     folded, swapped = _folded(task, network, state)
     raw = _layers(network, _observed(task, folded).T.cast("float32"))
     raw = raw.reshaped(BATCH, network.plans, task.horizon, raw_width(task.system.decl.controls))
+    if network.clock is not None:  # outputs are a plan for the whole mission: what is left of it now
+        begun = list(state.values())[network.clock].reshaped(BATCH, 1, 1, 1)
+        steps = raw.sheet.constant([[[[float(k)] for k in range(task.horizon)]]])
+        index = ONNX_OPS.clamp(begun + steps, 0.0, task.horizon - 1.0).cast("int64")
+        index = index.expand(*raw.shape, like=next(iter(state.values())))
+        (raw,) = raw.sheet.emit("GatherElements", (raw, index), [raw.shape], raw.kind, {"axis": 2})
     columns = iter(raw.transposed(3, 0, 1, 2).rows())
     controls = {each.name: _squashed(each, columns) for each in task.system.decl.controls}
     if swapped is not None:

@@ -120,9 +120,24 @@ def agreement(
     Raises:
         RunError: R105, policy and export disagree.
     """
-    x = policy.task.sample(states, seed=seed, dtype=torch.float64)
+    x = _visited(policy, states, seed)
     with torch.no_grad():
         return _compared(policy.task, x, policy.plan(x), decide(x), within)
+
+
+def _visited(policy: Policy, count: int, seed: int) -> Tensor:
+    """Random initial states, (count, n); every other one is followed by a plan of the policy for some steps.
+
+    So the timers of a specification, such as the clock of a mission, have other values than at the start.
+    """
+    task = policy.task
+    x = task.sample(count, seed=seed, dtype=torch.float64)
+    moved = x[1::2]
+    path = task.rollout(moved, policy.plan(moved))
+    at = torch.randint(task.horizon + 1, (len(moved),), generator=torch.Generator().manual_seed(seed))
+    reached = path[torch.arange(len(moved)), at]
+    x[1::2] = torch.where(torch.isfinite(reached).all(1, keepdim=True), reached, moved)
+    return x
 
 
 def _compared(task: Task, x: Tensor, plan: Tensor, answer: Answer, within: Closeness = EXACT) -> Agreement:
@@ -192,7 +207,7 @@ def backup_agreement(
         RunError: R105, they disagree.
     """
     task = policy.task
-    x = task.sample(states, seed=seed, dtype=torch.float64)
+    x = _visited(policy, states, seed)
     with torch.no_grad():
         wanted, told = StagedSearch(task, policy, PAPER).search(x, policy.plan(x)), decide(x)
     assert told.source is not None

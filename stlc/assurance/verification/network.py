@@ -20,6 +20,7 @@ from torch import nn
 from stlc.assurance.verification.forms import FORMS, SLACK, Floats, Forms, arctan, picked, tanh
 from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import Task
+from stlc.diagnostics import usage
 from stlc.dynamics.model.controls import EPS, raw_width
 
 UNIT = 2.0**-24
@@ -178,21 +179,31 @@ class PlanBounds:
         )
         self._centre, self._spread = _array(network.centre), _array(network.spread)
         self._low, self._high = _array(task.system.control_low), _array(task.system.control_high)
-        self._steps, self._width = task.horizon, raw_width(self._controls)
+        self._steps, self._width, self._clock = task.horizon, raw_width(self._controls), network.clock
 
     def plan(self, observed: Sequence[Forms], index: int, symbols: int) -> list[list[Forms]]:
         """Forms of proposal number `index`: one list per step with one form (batch,) per control.
 
         `symbols` is the number of symbols in use by all states, observed or not; those of the plan are new.
+
+        Raises:
+            UsageError: U101, plans reach to the end of a mission, and the boxes hold several times of it.
         """
+        begun = 0
+        if self._clock is not None:
+            now = observed[self._clock].range
+            begun = round(float(now.low.min()))
+            if now.low.min() < begun - 0.5 or now.high.max() > begun + 0.5:
+                raise usage("boxes of states at several times of a mission cannot be verified together")
         width = self._steps * self._width
         rows = slice(index * width, (index + 1) * width)
         raw = reduced(self._network.outputs(self._inputs(observed, symbols), rows), symbols, _KEPT)
         first = len(raw.generators)
         outputs = [each.with_symbol(first + i) for i, each in enumerate(columns(raw))]
         return [
-            self._squashed(outputs[step * self._width : (step + 1) * self._width])
+            self._squashed(outputs[at * self._width : (at + 1) * self._width])
             for step in range(self._steps)
+            for at in (min(begun + step, self._steps - 1),)
         ]
 
     def _squashed(self, raw: Sequence[Forms]) -> list[Forms]:

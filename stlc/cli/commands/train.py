@@ -177,7 +177,7 @@ def train(
     drawn = parse_seeds(seeds) if seeds is not None else (seed,)
     if len(specs) < 2:  # errors of a single specification are reported once, before the first of several runs
         with one_voice():
-            task = _task(specs, system, launch.overrides)
+            task = _task(specs, system, launch.overrides, config.method)
             if seeds is None and cluster is None:
                 return _train(task, config, launch, logger).conclude(pictures=pictures)
     return train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures))
@@ -253,13 +253,17 @@ def _rate(value: float) -> float:
     return value
 
 
-def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str]) -> Task:
+def _task(
+    specs: Sequence[Path], system: str | None, overrides: Mapping[str, str], method: str | None
+) -> Task:
     """Read and compile the specification for its system, and print which system file is used.
 
-    `overrides` gives new values of constants and of fields of the system file.
+    `overrides` gives new values of constants and of fields of the system file. If the training `method` can
+    do so, plans reach to the end of missions.
     """
     from stlc.compile.analysis.deadlines import beyond_plans
     from stlc.controller.problem.load import load_task, require_controls
+    from stlc.controller.training.config import method_name
     from stlc.dynamics.model.feedback import unstable
     from stlc.grammar.allow import not_allowed
 
@@ -272,7 +276,10 @@ def _task(specs: Sequence[Path], system: str | None, overrides: Mapping[str, str
         overrides,
         hint="stlc train SPEC --system FILE",
         found=lambda path: say(f"system {path}"),
+        whole=True,
     )
+    if task.compiled.grid.end is not None and not METHODS.get(method_name(task, method)).whole:
+        task = load_task(specs[0], system or None, overrides)
     require_controls(task)
     late = not_allowed(beyond_plans(task.compiled))
     show_diagnostics([*task.compiled.warnings, *late, *unstable(task.plain.decl)])

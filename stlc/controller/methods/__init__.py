@@ -48,11 +48,13 @@ class Method(ABC):
         learns: class of the learner; None if the method plans without training, or if the subclass defines
             the function `learner` itself.
         falsifies: whether the method can train on states of failing closed-loop drives (`--falsify`).
+        whole: whether plans of its policies reach to the end of a mission that has deadlines.
         version: number that rises with every change of the policies that the method trains; measurements of
             older versions are repeated.
     """
 
     falsifies: ClassVar[bool] = False
+    whole: ClassVar[bool] = False
     version: ClassVar[int] = 0
     options: ClassVar[type[ResolvedConfig]] = ResolvedConfig
     learns: ClassVar[type[Learner] | None] = None

@@ -32,6 +32,7 @@ class Guided(NetworkMethod):
     """
 
     searches = True
+    whole = True
     mirrored = True
 
     def resolve(self, task: Task, config: TrainConfig) -> ResolvedConfig:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from stlc.controller.problem.environments import observe
 from stlc.controller.problem.task import PlanVerdicts, rank, satisfied
-from stlc.dynamics.model.controls import raw_width, squash
+from stlc.dynamics.model.controls import raw_width, squash, unsquash
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -196,11 +196,14 @@ class PlanProposer(nn.Module, ABC):
         plans: number of plans per state.
         changes: changes that `BestOfKPolicy` adds to a plan that fails, (V, T, m) float64; V may be 0.
         mirror: mirror symmetry of the system; None if the system has none or the network does not use it.
+        clock: index of the state that counts the steps of a mission, negative, as the timers come last in
+            states and observations; None if the plans do not reach to its end.
     """
 
     plans: int
     changes: Tensor
     mirror: Mirror | None = None
+    clock: int | None = None
 
     def __init__(self, task: Task) -> None:
         super().__init__()
@@ -228,24 +231,21 @@ class PlanProposer(nn.Module, ABC):
         return torch.cat((plans[:, None], changed.clamp(low, high)), 1)
 
 
-def blocks(steps: int, count: int) -> Tensor:
-    """Block of each step of a plan whose controls change `count` times at most: (steps,) int64.
+FAINT = 0.1
+"""Factor of the last layer's weights in a network that begins at given plans."""
 
-    The first blocks are single steps, and later ones ever longer: move blocking, by which the number of
-    outputs of a network does not grow with the plan.
-    """
-    if steps <= count:
-        return torch.arange(steps)
-    share = torch.arange(1, count + 1, dtype=torch.float64) / count
-    ends = torch.round(torch.arange(1, count + 1) + (steps - count) * share**2)
-    return torch.searchsorted(ends, torch.arange(steps, dtype=torch.float64), right=True)
+
+def _clock(task: Task) -> int:
+    """Index, from the last, of the state that counts the steps of a mission; among observations as well."""
+    names = [timer.kind for timer in task.compiled.timers]
+    return names.index("clock") - len(names)
 
 
 class PlanNetwork(PlanProposer):
     """MLP from the observation to `plans` open-loop plans over the horizon.
 
-    It has an output for each step of the horizon of the system. If plans reach further, to the end of a
-    mission, later outputs stand for several steps (`blocks`).
+    If plans reach to the end of a mission, its outputs are a plan for the whole mission, and what is left of
+    it at the state's clock is proposed. So a plan that is followed stays what the network proposes.
 
     If the system declares a mirror symmetry, states on one side of it are mirrored before the network is
     evaluated, and their plans are mirrored back.
@@ -257,7 +257,6 @@ class PlanNetwork(PlanProposer):
 
     centre: Tensor
     spread: Tensor
-    block: Tensor
 
     def __init__(
         self,
@@ -276,10 +275,9 @@ class PlanNetwork(PlanProposer):
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise(widths):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-        self._count = min(task.horizon, task.window)
-        layers.append(nn.Linear(widths[-1], plans * self._count * self._width))
+        layers.append(nn.Linear(widths[-1], plans * task.horizon * self._width))
         self.body = nn.Sequential(*layers)
-        self.register_buffer("block", blocks(task.horizon, self._count), persistent=False)
+        self.clock = None if task.compiled.grid.end is None else _clock(task)
         self.register_buffer("centre", torch.zeros(widths[0]))
         self.register_buffer("spread", torch.ones(widths[0]))
         changes = variations(task) if varied else variations(task)[:0].clone()
@@ -301,25 +299,29 @@ class PlanNetwork(PlanProposer):
 
     @property
     def layers(self) -> DenseLayers:
-        """Weights of the feed-forward network, with an output for each step of a plan."""
-        normalisation = self.centre, self.spread
-        found = DenseLayers.of(list(self.body), normalisation=normalisation, activation="relu")
-        weights, biases = found.weights[-1], found.biases[-1]
-        rows = torch.arange(len(biases), device=biases.device).view(self.plans, self._count, self._width)
-        each = rows[:, self.block].flatten()
-        return replace(
-            found,
-            weights=(*found.weights[:-1], weights[each]),
-            biases=(*found.biases[:-1], biases[each]),
-        )
+        """Weights of the feed-forward network."""
+        return DenseLayers.of(list(self.body), normalisation=(self.centre, self.spread), activation="relu")
+
+    @torch.no_grad()
+    def begin_at(self, plans: Tensor) -> None:
+        """Set the weights so that `plans`, (plans, T, m), are nearly what is proposed from any state."""
+        last = self.body[-1]
+        assert isinstance(last, nn.Linear)
+        last.weight.mul_(FAINT)
+        last.bias.copy_(unsquash(plans, self._task.system.decl.controls).flatten())
 
     def forward(self, x0: Tensor) -> Tensor:
         """All plans, within the control bounds: (B, n) -> (B, plans, T, m)."""
         x0, swapped = self._folded(x0)
         observed = self._task.system.observe(x0).to(self.centre.dtype)
         raw = self.body((observed - self.centre) / self.spread)
-        raw = raw.view(-1, self.plans, self._count, self._width)
-        plans = squash(raw, self._task.system.decl.controls)[:, :, self.block]
+        steps = self._task.horizon
+        raw = raw.view(-1, self.plans, steps, self._width)
+        plans = squash(raw, self._task.system.decl.controls)
+        if self.clock is not None:
+            begun = x0[:, self.clock].round().long()[:, None] + torch.arange(steps, device=x0.device)
+            index = begun.clamp(0, steps - 1)[:, None, :, None].expand_as(plans)
+            plans = plans.gather(2, index)
         if self.mirror is None or swapped is None:
             return plans
         return torch.where(swapped[:, None, None, None], self.mirror.plans(plans), plans)

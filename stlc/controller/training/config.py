@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -160,6 +161,7 @@ class ResolvedConfig:
     ranks: int = 1
     drives: int = DRIVES
     falsify: bool = False
+    whole: bool = False
 
 
 _MOST = {
@@ -213,6 +215,12 @@ def checked_config(config: ResolvedConfig) -> ResolvedConfig:
     return config
 
 
+def method_name(task: Task, given: str | None) -> str:
+    """Name of the training method: the given one, or that of the system file, or the default."""
+    chosen = METHODS.chosen(given) if given else None
+    return chosen or task.system.decl.train.method or METHODS.default
+
+
 def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     """Resolve the options of a run.
 
@@ -221,8 +229,7 @@ def resolve_config(task: Task, config: TrainConfig) -> ResolvedConfig:
     Raises:
         UsageError: U101, there is no such method or option, or a value is invalid.
     """
-    given = METHODS.chosen(config.method) if config.method else None
-    name = given or task.system.decl.train.method or METHODS.default
+    name = method_name(task, config.method)
     method = METHODS.get(name)
     found: ResolvedConfig = method.resolve(task, config)
     if config.falsify and not method.falsifies:
@@ -298,7 +305,7 @@ def base_config(
         seed=declared.seed if config.seed is None else config.seed,
         hidden=task.system.decl.policy.hidden,
         plans=plans,
-        batch=config.batch or declared.batch or batch,
+        batch=config.batch or declared.batch or math.ceil(batch * task.window / task.horizon),
         hard=0,
         lr=config.lr or declared.lr or rate,
         hold=MISSION_HOLD if mission else 0.0,
@@ -308,6 +315,7 @@ def base_config(
         threads=config.threads or _threads(searching=searches and config.device == "cpu"),
         clock=config.clock,
         drives=config.drives,
+        whole=task.compiled.grid.end is not None,
     )
 
 

@@ -36,6 +36,7 @@ from stlc.controller.training.local_search import (
     SearchResult,
     remainders,
 )
+from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.objective import loss
 from stlc.controller.training.run import load_weights
 from stlc.controller.training.samplers import Draws, FixedSet, Missions, ReplayBuffer, Supply
@@ -79,8 +80,40 @@ EXPLORED = 4
 """Number of initial states from which the planner `search` searches before a validation."""
 EFFORTS = 20_000, 80_000, 320_000
 """Plans that it judges for each of them at first, and after each search that found none."""
+HUGE, STEEPEST = 1e15, 4.0
+"""Entries of a gradient that count as infinite; greatest norm of a plan's gradient, in medians."""
 RISE = 30
 """Steps over which the learning rate rises if its peak is held; independent of the total number of steps."""
+
+
+def _margin(reached: Tensor) -> float:
+    """Margin of the loss for plans that reach the robustness `reached`, (k,)."""
+    return min(max(MARGIN_SHARE * float(reached.median()), MARGIN_RANGE[0]), MARGIN_RANGE[1])
+
+
+def _mean(losses: Tensor) -> Tensor:
+    """Mean of the losses that are finite, (); NaN if none is.
+
+    A plan under which a state overflows, or which no number describes, does not end the training.
+    """
+    finite = torch.isfinite(losses.detach())
+    return losses.mean() if bool(finite.all()) else losses[finite].mean()
+
+
+def _bounded_slopes(slopes: Tensor) -> Tensor:
+    """Gradient by plans, (B, plans, T, m), in which no plan outweighs the others.
+
+    Along a mission the gradient of some plans grows beyond bounds. If one is not finite, it becomes 0; its
+    norm is limited to `STEEPEST` times the median of the others.
+    """
+    slopes = torch.where(slopes.abs() < HUGE, slopes, 0.0)
+    norms = slopes.flatten(2).norm(dim=2)
+    pulled = norms[norms > 0.0]
+    if not len(pulled):
+        return slopes
+    limit = STEEPEST * pulled.median()
+    bounded: Tensor = slopes * (limit / norms.clamp(min=limit))[:, :, None, None]
+    return bounded
 
 
 class Trainer(Learner):
@@ -109,7 +142,8 @@ class Trainer(Learner):
         )
         self.searches = self.method.searches
         if self.searches:
-            self.margin = ranks.agree(self._feasible_margin())
+            whole = task.compiled.grid.end is not None
+            self.margin = ranks.agree(self._begin_at_plans() if whole else self._feasible_margin())
         self.objective = self.method.objective(self)
         self.searcher = self._searcher(ENOUGH * self.margin)
         self.repairing: Search | None = None
@@ -348,16 +382,17 @@ class Trainer(Learner):
             x0 = torch.cat((fresh, states))
         self.learnt = x0
         plans: Tensor = self.network(x0)
+        if self.task.compiled.grid.end is not None:
+            plans.register_hook(_bounded_slopes)  # type: ignore[no-untyped-call]
         winner, good = self._winner(x0, plans)
         rows = torch.arange(len(x0), device=self.device)
         chosen = plans[rows, winner]
-        value = loss(self.task, self.objective, x0, chosen).mean()
+        value = _mean(loss(self.task, self.objective, x0, chosen))
         if config.share:
             some = rows[:: config.plans]
             other = torch.randint(config.plans, (len(some),), generator=self.generator).to(self.device)
-            value = (
-                value + config.share * loss(self.task, self.objective, x0[some], plans[some, other]).mean()
-            )
+            others = loss(self.task, self.objective, x0[some], plans[some, other])
+            value = value + config.share * _mean(others)
         if self.failures is not None and self.safety is not None:
             value = value + self._unsafe(self.safety, x0[: config.batch], plans[: config.batch])
         if hard:
@@ -418,14 +453,24 @@ class Trainer(Learner):
         """
         native = self.task.native is not None
         count, tries = (MARGIN_STATES, THOROUGH) if native else (TORCH_MARGIN_STATES, TORCH_TRIES)
-        x0 = self.supply.take(math.ceil(count * self.task.window / self.task.horizon))
+        x0 = self.supply.take(count)
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
         start = middle.to(self.device).expand(len(x0), self.task.horizon, -1)
         rho = self._searcher(math.inf).repair(x0, start, self.buffer.bank, tries=tries).rho
         reached = rho[satisfied(rho)]
-        if reached.numel() == 0:
+        return _margin(reached) if reached.numel() else MARGIN_RANGE[0]
+
+    def _begin_at_plans(self) -> float:
+        """Let the network begin at plans for whole missions; return the margin that these plans reach."""
+        begun = mission_plans(self.task, self.config.plans, self.generator)
+        found = begun.found.to(self.device)
+        if not len(found.rho):
             return MARGIN_RANGE[0]
-        return min(max(MARGIN_SHARE * float(reached.median()), MARGIN_RANGE[0]), MARGIN_RANGE[1])
+        for network in (self.network, self.average):
+            network.begin_at(begun.best.to(self.device))
+        found = remainders(self.task, found, TAILS)
+        self.buffer.add(found.states, found.plans)
+        return _margin(begun.found.rho)
 
     def _searcher(self, enough: float) -> Searcher:
         return Searcher(self.task, self.generator, enough=enough, device=self.device)

@@ -167,7 +167,7 @@ def task_of_run(
 ) -> Task:
     """Compile the specification and the system in a run's folder.
 
-    Plans of a run that plans instead of training reach to the end of a deployment (`Task.of`).
+    Plans reach to the end of a deployment (`Task.of`) as they did in the run.
 
     Args:
         folder: folder of the run, whose own `--set` changes are applied first.
@@ -182,8 +182,8 @@ def task_of_run(
     values = {name: text for name, text in changed.items() if name in drawn}
     constants = {name: text for name, text in changed.items() if name not in drawn}
     config = folder.read_json(CONFIG) if folder.has(CONFIG) else {}
-    planned = isinstance(config, dict) and "planner" in config
-    return Task.of(spec, System(decl), overrides=constants, values=values, whole=planned)
+    whole = isinstance(config, dict) and ("planner" in config or config.get("whole") is True)
+    return Task.of(spec, System(decl), overrides=constants, values=values, whole=whole)
 
 
 def declaration_of_run(

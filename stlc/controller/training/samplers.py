@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, ClassVar, TypeAlias
 import torch
 from torch import Tensor
 
+from stlc.controller.deployment.disturbance import Events
 from stlc.controller.problem.task import satisfied
 
 if TYPE_CHECKING:
@@ -168,10 +169,13 @@ class Missions(Supply):
         if not len(self.pool):
             self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self.device)
         judged = self._plan(self.pool)
-        legs = self._legs(len(self.pool))
+        now = self._now()
+        legs = self._legs(len(self.pool)).minimum(self._until_due(now))
         shares = [self._rand(len(legs)) for _ in range(GLIMPSES - 1)]
         glimpses = [self._at(judged, (legs * share).long()) for share in shares]
         self.pool, self.age = self._at(judged, legs), self.age + legs
+        if self.task.system.decl.test.events:
+            self.pool = self._surprised(self._at(judged, legs - 1), self.pool, now + legs)
         seen = torch.cat((*glimpses, self.pool))
         seen = seen[self.task.alive(seen)]
         failing = ~satisfied(judged.rho)
@@ -190,6 +194,36 @@ class Missions(Supply):
         """
         most = max(self.task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self.generator).to(self.device)
+
+    def _now(self) -> Tensor:
+        """Step of each mission, (POOL,) int64: by its clock if it has one, else by its age."""
+        names = [timer.name for timer in self.task.compiled.timers if timer.kind == "clock"]
+        found = self.pool[:, self.task.system.names.index(names[0])] if names else self.age
+        return found.round().long()
+
+    def _until_due(self, now: Tensor) -> Tensor:
+        """Steps after `now`, (POOL,), until the next event that is due at given steps, (POOL,) int64."""
+        left = torch.full_like(now, self.task.horizon)
+        for event in self.task.system.decl.test.events:
+            if event.every is not None:
+                left = left.minimum(event.every - now % event.every)
+            if event.at is not None:
+                left = torch.where(now < event.at, left.minimum(event.at - now), left)
+        return left
+
+    def _surprised(self, before: Tensor, x: Tensor, steps: Tensor) -> Tensor:
+        """Apply the events of a deployment, which no plan foresees, to the states `x`, (POOL, n).
+
+        `before`: states one step earlier. `steps`: step of each mission, (POOL,).
+        """
+        own, x = self.task.plain.names, x.clone()
+        for step in set(steps.tolist()):
+            rows = (steps == step).nonzero()[:, 0]
+            events = Events(self.task.system.decl.test.events, own, self.task.system.dt)
+            for number, states in ((step - 1, before), (step, x)):
+                found, _ = events.apply(states[rows, : len(own)], number, self.generator)
+            x[rows, : len(own)] = found
+        return x
 
     def _at(self, judged: PlanVerdicts, steps: Tensor) -> Tensor:
         """Predicted states of the judged plans: the state of plan i after `steps[i]` steps, (n, dim)."""

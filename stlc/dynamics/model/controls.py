@@ -12,6 +12,9 @@ from stlc.dynamics.schema.names import ControlDecl
 EPS = 1e-6
 """Offset that keeps the gradient of an angle finite where both components are 0."""
 
+NEAR_END = 0.98
+"""Share of a control's half range up to which outputs stand for given controls."""
+
 
 def raw_width(controls: tuple[ControlDecl, ...]) -> int:
     """Number of network outputs per step: two (a planar vector) for an angle, one for any other control."""
@@ -32,6 +35,24 @@ def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
     if kinds == {"clip"}:
         return torch.addcmul(middle, torch.clamp(raw, -1.0, 1.0), half)
     return torch.addcmul(middle, torch.stack(_units(raw, controls), -1), half)
+
+
+def unsquash(plans: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
+    """Network outputs that `squash` maps to controls in physical units: (…, m) -> (…, raw_width).
+
+    The ends of a range, which `tanh` reaches nowhere, are approached up to `NEAR_END`.
+    """
+    middle, half = _affine(controls, plans.dtype, plans.device)
+    found: list[Tensor] = []
+    for control, unit in zip(controls, ((plans - middle) / half).unbind(-1), strict=True):
+        match control.squash:
+            case "tanh":
+                found.append(torch.atanh(unit.clamp(-NEAR_END, NEAR_END)))
+            case "clip":
+                found.append(unit)
+            case "angle":
+                found += [torch.cos(torch.pi * unit), torch.sin(torch.pi * unit)]
+    return torch.stack(found, -1)
 
 
 def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:

@@ -12,7 +12,7 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, 
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
 from stlc.controller.planning.planner import FIRST, PlanBudget, PlannerPolicy, plan, planner_named
-from stlc.controller.policies.policy import PlanNetwork, blocks
+from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import LONGEST, Task
 from stlc.controller.training.local_search import SearchResult, remainders
 from stlc.controller.world import ModelWorld
@@ -132,32 +132,20 @@ def test_safety_goes_on_where_another_requirement_is_lost(task: Task) -> None:
 # --------------------------------------------------------------------------- policies
 
 
-def test_blocks_are_single_steps_first_and_longer_later() -> None:
-    assert blocks(8, 10).tolist() == list(range(8))
-    block = blocks(150, 40)
-    assert block[0] == 0
-    assert block[-1] == 39
-    assert block.unique().tolist() == list(range(40))
-    lengths = torch.bincount(block)
-    assert lengths[:3].max() <= 2
-    assert bool((lengths.diff() >= -1).all())
-    assert lengths[-1] > lengths[0]
-
-
-def test_a_network_has_outputs_for_the_horizon_and_plans_for_the_mission(task: Task) -> None:
+def test_a_network_proposes_what_is_left_of_a_plan_for_the_mission(task: Task) -> None:
     network = PlanNetwork(task, hidden=[8], plans=2)
-    x = task.sample(5, seed=0)
     network.normalise(task.sample(64, seed=1))
+    wanted = torch.linspace(-0.9, 0.9, 120).view(2, 60, 1)
+    network.begin_at(wanted)
+    x = task.sample(3, seed=0)
+    x[1:, task.system.names.index("clock")] = torch.tensor([20.0, 90.0])
     plans = network(x)
-    assert plans.shape == (5, 2, 60, 1)
-    assert network.body[-1].out_features == 2 * 10
-    layers = network.layers
-    hidden = torch.relu(
-        (task.system.observe(x) - layers.centre) / layers.spread @ layers.weights[0].T + layers.biases[0]
-    )
-    raw = (hidden @ layers.weights[1].T + layers.biases[1]).view(5, 2, 60, 1)
-    assert bool((raw[:, :, -2] == raw[:, :, -1]).all())
-    assert torch.allclose(torch.sign(raw), torch.sign(plans)), "exports write an output for each step"
+    assert plans.shape == (3, 2, 60, 1)
+    assert torch.allclose(plans[0], wanted, atol=0.1), "nearly the given plans, from any state"
+    raw = network.body((task.system.observe(x) - network.centre) / network.spread).view(3, 2, 60, 1)
+    assert torch.equal(torch.sign(plans[1, :, :40]), torch.sign(raw[1, :, 20:]))
+    assert bool((plans[1, :, 40:] == plans[1, :, 39:40]).all())
+    assert bool((plans[2] == plans[2, :, :1]).all()), "the last control, after the end"
 
 
 def test_remainders_of_a_plan_satisfy_from_the_states_on_its_way(task: Task) -> None:
