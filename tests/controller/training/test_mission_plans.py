@@ -109,3 +109,21 @@ def test_runs_plan_as_far_as_their_method_does(
     small = ["--steps", "2", "--held-out", "8", "--drives", "0", "--batch", "8", "--no-pictures"]
     assert main(["train", "way.stl", "--method", method, "--name", "r", *small]) == 0
     assert task_of_run(RunDir.open("latest")).horizon == steps
+
+
+@pytest.mark.apart
+@pytest.mark.parametrize("target", ["c", "onnx"])
+def test_exports_propose_what_is_left_at_the_clock(
+    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exports are compared with their runs in states at several times of a mission."""
+    pytest.importorskip("onnxruntime" if target == "onnx" else "torch")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "line.yaml").write_text(LINE)
+    (tmp_path / "way.stl").write_text(WAY)
+    small = ["--steps", "2", "--held-out", "8", "--drives", "0", "--batch", "8", "--no-pictures"]
+    assert main(["train", "way.stl", "--name", "r", *small]) == 0
+    assert main(["export", "latest", "--to", target]) == 0
+    assert "checked in 64 random states" in capsys.readouterr().err
+    name = "stlc_controller.h" if target == "c" else "controller.json"
+    assert list(tmp_path.glob(f"runs/way/*/export/{target}/{name}"))
