@@ -1,4 +1,4 @@
-"""Training for whole missions: it begins at plans that a search found, and meets the events of deployments."""
+"""Training for whole missions: it begins at plans that a search found, and events happen in it."""
 
 from __future__ import annotations
 
