@@ -308,7 +308,10 @@ PLANNERS: PackageRegistry[Any] = PackageRegistry(
     default="search",
     group="stlc.planners",
     accepts="stlc.controller.planning.planner:is_planner",
-    moved={name: f"benchmarks/methods/planners/{name}.py" for name in ("cem", "cma", "mpc")},
+    moved={
+        name: f"benchmarks/methods/planners/{name}.py"
+        for name in ("cem", "cma", "gradient", "halving", "mpc")
+    },
 )
 """Planners, `stlc.controller.planning.planner.Planner` each, named by `stlc plan --method`."""
 

@@ -48,7 +48,7 @@ def test_verdicts_in_c_and_torch(task: Task) -> None:
     torch.testing.assert_close(task.rollout(x0, nothing), task.system.rollout(x0, nothing))
 
 
-@pytest.mark.parametrize("method", ["search", "gradient"])
+@pytest.mark.parametrize("method", ["search", "schedule"])
 def test_planners_judge_the_only_plan(task: Task, method: str) -> None:
     x0 = task.sample(20, seed=1, dtype=torch.float64)
     rho = task.judge(x0, torch.zeros(20, 10, 0, dtype=torch.float64)).rho

@@ -110,7 +110,7 @@ class Mpc:
         except NotSmoothError as what:
             raise usage(
                 f"planner `mpc` cannot plan through jumps: {what}",
-                "search and gradient plan for any system, milp for piecewise linear ones",
+                "search plans for any system, milp for piecewise linear ones",
             ) from None
 
     def _run(self, search: PlanSearch, shooting: Shooting, solve: Callable[..., Any]) -> None:

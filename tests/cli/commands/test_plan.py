@@ -29,7 +29,7 @@ def planned(*options: str) -> int:
         (("--target", "-inf"), "`--target -inf` is no robustness"),
         (("--seed", str(2**63)), "should be less than or equal to 9223372036854775807"),
         (("--from", ""), "there is no file `` with initial states"),
-        (("--method", "gradient", "--option", "starts=0"), "a whole number from 1 to 1,000,000, not `0`"),
+        (("--method", "schedule", "--option", "starts=0"), "a whole number from 1 to 1,000,000, not `0`"),
     ],
 )
 def test_what_makes_no_sense(
@@ -61,8 +61,10 @@ def test_plans_found_before_a_signal_are_kept_and_counted(
 ) -> None:
     offer = PlanSearch.offer
 
-    def interrupted(search: PlanSearch, rows: torch.Tensor, plans: torch.Tensor) -> torch.Tensor:
-        found = offer(search, rows[:2], plans[:2])
+    def interrupted(
+        search: PlanSearch, rows: torch.Tensor, plans: torch.Tensor, **counted: int
+    ) -> torch.Tensor:
+        found = offer(search, rows[:2], plans[:2], **counted)
         for _ in range(signals):
             signal.raise_signal(number)
         return found
@@ -70,7 +72,7 @@ def test_plans_found_before_a_signal_are_kept_and_counted(
     before = signal.getsignal(number)
     monkeypatch.setattr(PlanSearch, "offer", interrupted)
     trace = tmp_path / "plan.npz"
-    options = ["--method", "gradient", "--option", "starts=1", "--starts", "5", "--output", str(trace)]
+    options = ["--starts", "5", "--output", str(trace)]
     assert planned(*options, "--json") == code
     captured = capsys.readouterr()
     assert "interrupted: 2 of 5 initial states were planned for" in captured.err

@@ -30,7 +30,7 @@ def test_plans_are_judged_exactly_and_within_bounds(car_task: Task, planner: str
 
 def test_the_same_seed_gives_the_same_plans(car_task: Task) -> None:
     x0 = car_task.sample(3, seed=5, dtype=torch.float64)
-    for name in ("search", "gradient"):
+    for name in ("search", "schedule"):
         first, second = planned(car_task, name, x0), planned(car_task, name, x0)
         assert torch.equal(first.plans, second.plans), name
 
@@ -139,15 +139,13 @@ def test_starts_that_make_no_sense(car_task: Task, text: str, message: str) -> N
         starts_of(car_task, text, None, 0)
 
 
-def test_options_are_checked(car_task: Task) -> None:
+def test_options_are_checked() -> None:
     with pytest.raises(UsageError, match="a whole number, not `many`"):
-        planner_named("gradient", steps="many")
-    assert planner_named("gradient", steps="7", rate="1") == planner_named("gradient", steps=7, rate=1.0)
-    for wrong in ({"steps": 2.5}, {"steps": True}, {"objective": 3}, {"rate": None}):
-        with pytest.raises(UsageError, match="of planner `gradient` is"):
-            planner_named("gradient", **wrong)
-    with pytest.raises(UsageError, match="neither `exact` nor `paper`"):
-        plan(car_task, car_task.sample(1), "gradient", objective="smooth")
+        planner_named("schedule", steps="many")
+    assert planner_named("schedule", steps="7", greed="1") == planner_named("schedule", steps=7, greed=1.0)
+    for wrong in ({"steps": 2.5}, {"steps": True}, {"greed": None}):
+        with pytest.raises(UsageError, match="of planner `schedule` is"):
+            planner_named("schedule", **wrong)
     with pytest.raises(UsageError, match="unknown planner `serach`"):
         planner_named("serach")
 

@@ -258,7 +258,7 @@ def _encoded(
         finding = Diagnostic(
             "U101",
             f"planner `milp` cannot encode {what}",
-            help=("search and gradient plan for any system",),
+            help=("search plans for any system",),
         )
         raise UsageError(finding) from None
     return encoding, rho.times(-1.0) if maximise else ZERO

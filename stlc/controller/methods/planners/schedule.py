@@ -119,7 +119,7 @@ class ScheduleRounds:
         conditions = self._scheduler(self._obligations.first).conditions
         if not conditions:
             message = "planner `schedule` needs a condition on states, at one sample, in the specification"
-            raise UsageError(Diagnostic("U101", message, help=("search and gradient plan for any task",)))
+            raise UsageError(Diagnostic("U101", message, help=("search plans for any task",)))
         blank = torch.zeros(1, task.horizon + 1, len(task.system.names), dtype=torch.float64)
         for states in (blank, blank[:, :1]):  # so that the programs of the conditions are built
             values_of(task, conditions, states)

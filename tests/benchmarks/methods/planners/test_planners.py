@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[4]
 SMALL = ["--seeds", "0", "--agents", "2", "--steps", "3", "--no-pictures"]
 
 
-@pytest.fixture(params=["cem", "cma", "halving"])
+@pytest.fixture(params=["cem", "cma", "gradient", "halving"])
 def planner(request: pytest.FixtureRequest) -> str:
     return laws.available(request.param)
 
@@ -58,13 +58,15 @@ def test_plans_of_a_single_number(tmp_path: Path, name: str) -> None:
     laws.plans_a_single_number(tmp_path, laws.available(name))
 
 
-def test_options_are_checked() -> None:
+def test_options_are_checked(car_task: Task) -> None:
     assert planner_named("cem", physical="true", population="7") == planner_named(
         "cem", physical=True, population=7
     )
     for wrong in ({"population": 2.5}, {"population": True}, {"physical": 1}, {"over": 3}, {"floor": None}):
         with pytest.raises(UsageError, match="of planner `cem` is"):
             planner_named("cem", **wrong)
+    with pytest.raises(UsageError, match="neither `exact` nor `paper`"):
+        planner_named("gradient", objective="smooth").prepare(car_task)
 
 
 @pytest.mark.parametrize("name", ["cem", "cma", "mpc"])
