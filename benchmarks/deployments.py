@@ -24,11 +24,11 @@ from stlc.controller.evaluation.deployment import decided, feasible_states
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, is_progress, measure
 from stlc.controller.guard.candidates import Limits
-from stlc.controller.guard.feasibility import viable
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kind import GuardKind, compared_guards
 from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.margins import AUTO, MarginRequest, parse_margins
+from stlc.controller.search.feasibility import viable
 from stlc.controller.training.run import Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError

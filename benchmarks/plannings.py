@@ -22,8 +22,8 @@ from benchmarks.store import Key, Result, ResultStore, inputs_of, load
 from benchmarks.timing import WARM, Times, one_thread
 from benchmarks.training import pack, unpack
 from stlc.controller.evaluation.held_out import wilson
-from stlc.controller.planning.planner import PLANNING_VERSION, PlanBudget, PlanSearch, Solver, planner_named
 from stlc.controller.problem.task import Task
+from stlc.controller.search.planner import PLANNING_VERSION, PlanBudget, PlanSearch, Solver, planner_named
 from stlc.diagnostics import UsageError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir

@@ -11,20 +11,20 @@ from time import process_time
 from typing import TypeAlias
 
 import torch
+from stlc.controller.search.ascent import SEED, GradientAscent
 from torch import Tensor
 
 from benchmarks.deployments import sampled_states
 from benchmarks.timing import Times, after_warm_up
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import TO_SPARE, Limits
-from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
-from stlc.controller.guard.stages.gradient_refine import SEED, GradientAscent
 from stlc.controller.problem.task import Task
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.feasibility import solvable, viable
+from stlc.controller.search.local_search import Searcher
 from stlc.controller.training.run import Run
 
 SHORT, LONG = 2000, 32_000

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from stlc.assurance.verification.tubes import tube
-    from stlc.controller.planning.planner import PlanResult, plan
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanResult, plan
     from stlc.controller.training.launch import train_here as train
     from stlc.controller.training.run import Run
     from stlc.diagnostics import SpecError, StlcError
@@ -60,14 +60,14 @@ __all__ = [
 
 _HOMES = {
     "Monitor": "stlc.monitor.verdict:Monitor",
-    "PlanResult": "stlc.controller.planning.planner:PlanResult",
+    "PlanResult": "stlc.controller.search.planner:PlanResult",
     "Run": "stlc.controller.training.run:Run",
     "SpecError": "stlc.diagnostics:SpecError",
     "StlcError": "stlc.diagnostics:StlcError",
     "System": "stlc.dynamics.model.system:System",
     "Task": "stlc.controller.problem.task:Task",
     "Trace": "stlc.trace:Trace",
-    "plan": "stlc.controller.planning.planner:plan",
+    "plan": "stlc.controller.search.planner:plan",
     "train": "stlc.controller.training.launch:train_here",
     "tube": "stlc.assurance.verification.tubes:tube",
 }

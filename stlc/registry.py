@@ -307,13 +307,13 @@ PLANNERS: PackageRegistry[Any] = PackageRegistry(
     "PLANNER",
     default="search",
     group="stlc.planners",
-    accepts="stlc.controller.planning.planner:is_planner",
+    accepts="stlc.controller.search.planner:is_planner",
     moved={
         name: f"benchmarks/methods/planners/{name}.py"
         for name in ("cem", "cma", "gradient", "halving", "mpc")
     },
 )
-"""Planners, `stlc.controller.planning.planner.Planner` each, named by `stlc plan --method`."""
+"""Planners, `stlc.controller.search.planner.Planner` each, named by `stlc plan --method`."""
 
 SEMANTICS: PackageRegistry[Any] = PackageRegistry(
     "semantics", "stlc.compile.semantics.kinds", "SEMANTICS", default="exact"

@@ -52,7 +52,7 @@ def pytest_collection_finish() -> None:
 
 SMALL = {
     "stlc.controller.training.learner.MARGIN_STATES": 8,
-    "stlc.controller.guard.feasibility.TRIES": 1000,
+    "stlc.controller.search.feasibility.TRIES": 1000,
     "stlc.controller.evaluation.deployment.LATENCY_SECONDS": 0.01,
 }
 """Sizes of searches in tests; with the usual ones the least training takes .5 s, and a simulation 5 s."""

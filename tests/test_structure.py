@@ -18,7 +18,6 @@ CIRCLES = {
     ("controller/deployment", "controller/evaluation"),
     ("controller/deployment", "controller/guard"),
     ("controller/evaluation", "controller/training"),
-    ("controller/guard", "controller/training"),
     ("controller/methods", "controller/training"),
     ("dynamics/declaration", "dynamics/model"),
     ("dynamics/declaration", "dynamics/robots"),

@@ -280,7 +280,7 @@ def _nodes(package: Package, within: str, *kinds: type[ast.AST]) -> Iterator[tup
 
 
 _SEARCHES = (
-    "GradientAscent|Searcher|Exploration|GaussNewton|StagedSearch|RelaxedSearch|CertifiedSearch|SearchPlanner"
+    "GradientAscent|Searcher|GaussNewton|StagedSearch|RelaxedSearch|CertifiedSearch|SearchPlanner"
 )
 MEANINGS = (
     Meaning("numbers of one step", "dynamics/model/schedule.py", written("dict(_.lets) | _")),

@@ -25,7 +25,7 @@ from benchmarks.table import Columns, Table, show
 from benchmarks.timing import one_thread
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.program import command
-from stlc.controller.planning.planner import PlanBudget, PlanResult, plan
+from stlc.controller.search.planner import PlanBudget, PlanResult, plan
 from stlc.diagnostics import StlcError, UsageError
 from stlc.files import find_system
 from stlc.provenance import sha256

@@ -20,7 +20,7 @@ from benchmarks.store import Key, Result, ResultStore
 from benchmarks.table import Columns, Table, listed, provenance, publish
 from stlc.cli.framework.options import SeedsOption, parse_seeds
 from stlc.cli.framework.program import command
-from stlc.controller.planning.planner import PLANNING_VERSION
+from stlc.controller.search.planner import PLANNING_VERSION
 from stlc.controller.training.config import ENGINE_VERSION
 from stlc.registry import GUARDS as KINDS
 

@@ -20,10 +20,10 @@ from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns as columns_read_by
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.planning.planner import PlanResult
 from stlc.controller.planning.traces import trace_of
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
+from stlc.controller.search.planner import PlanResult
 from stlc.diagnostics import usage
 from stlc.dynamics.init.quantiles import InitialPoints
 from stlc.monitor.instants import rule_bounds

@@ -14,8 +14,8 @@ from benchmarks.circles import KINDS, STEPS, draw
 from benchmarks.store import ResultStore, load
 from benchmarks.table import text_of
 from benchmarks.tables.planning import COLUMNS, PROBLEMS, Problem, measured
-from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import Task
+from stlc.controller.search.planner import PlanBudget, plan
 from stlc.dynamics.model.system import System
 
 pytestmark = pytest.mark.apart

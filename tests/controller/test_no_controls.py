@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from stlc.controller.planning.policy import PlannerPolicy
 
 import stlc
 from stlc.cli.framework.app import main
-from stlc.controller.guard.feasibility import solve
-from stlc.controller.planning.planner import PlanBudget, PlannerPolicy, plan, planner_named
 from stlc.controller.problem.task import Task
+from stlc.controller.search.feasibility import solve
+from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.loop import train
 from stlc.diagnostics import UsageError

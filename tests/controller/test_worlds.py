@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.controller.guard.feasibility import solvable, viable
 from stlc.controller.problem.task import Task
+from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import RunError, SystemFileError
 from stlc.dynamics.model.system import System

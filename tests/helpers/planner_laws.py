@@ -10,8 +10,8 @@ import torch
 
 import stlc
 from stlc.controller.options import FINITE, bounds_of
-from stlc.controller.planning.planner import PlanBudget, plan, planner_named
 from stlc.controller.problem.task import Task
+from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.diagnostics import UsageError
 from stlc.registry import PLANNERS
 

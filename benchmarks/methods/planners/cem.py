@@ -17,8 +17,8 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 MOST = 4_000_000
 """Maximum number of plan entries that are judged at a time."""

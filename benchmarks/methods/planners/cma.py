@@ -13,8 +13,8 @@ from stlc.controller.options import bounded
 from stlc.diagnostics import not_installed
 
 if TYPE_CHECKING:
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 
 @dataclass(frozen=True, slots=True)

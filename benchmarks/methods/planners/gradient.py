@@ -15,8 +15,8 @@ from stlc.diagnostics import usage
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.local_search import Searcher
 
 if TYPE_CHECKING:
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 
 @dataclass(frozen=True, slots=True)

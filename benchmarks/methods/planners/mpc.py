@@ -19,14 +19,14 @@ from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.local_search import Searcher
 from stlc.diagnostics import not_installed, usage
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
     from benchmarks.methods.planners._shooting import Shooting
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 PIECES = 5
 """Number of constant pieces of a random guess."""

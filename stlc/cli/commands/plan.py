@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from stlc.assurance.verification.tubes import TubeModel
-    from stlc.controller.planning.planner import PlanResult
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanResult
     from stlc.controller.training.config import PlannerChoice
 
 
@@ -92,9 +92,9 @@ def plan(
     plan does not satisfy the specification.
     """
     from stlc.assurance.verification.tubes import TubeModel
-    from stlc.controller.planning.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.controller.planning.traces import following, starts_of, trace_of
     from stlc.controller.problem.load import load_task
+    from stlc.controller.search.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.stopping import leaving
     from stlc.trace import check_writable, save_trace
 

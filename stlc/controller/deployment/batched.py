@@ -19,7 +19,7 @@ from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.deployment.tape import Tape
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
 from stlc.controller.guard.candidates import Limits, RobustnessMargins
-from stlc.controller.guard.feasibility import solvable, viable
+from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import Charting, Choosing, Redrawing
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
 

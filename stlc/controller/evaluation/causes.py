@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from stlc.controller.evaluation.executed import model_consistent
-from stlc.controller.guard.feasibility import safety_task, solve
 from stlc.controller.problem.task import satisfied
+from stlc.controller.search.feasibility import safety_task, solve
 from stlc.native import never
 
 if TYPE_CHECKING:

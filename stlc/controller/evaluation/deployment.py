@@ -19,9 +19,9 @@ from stlc.controller.evaluation.metrics import measure
 from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, judge_runs_by_plans, runs_json
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.guard.candidates import SOURCES
-from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.planner import PlannerPolicy, SearchUse
+from stlc.controller.planning.policy import PlannerPolicy, SearchUse
+from stlc.controller.search.feasibility import solvable
 from stlc.controller.world import world_type
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
-from stlc.controller.guard.feasibility import viable as search_safe
 from stlc.controller.problem.task import satisfied
+from stlc.controller.search.feasibility import viable as search_safe
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement

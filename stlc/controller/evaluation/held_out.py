@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.feasibility import solve
-from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import satisfied
+from stlc.controller.search.feasibility import solve
+from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.training.samplers import mission_steps
 from stlc.files import write_atomic

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import REPAIRED, SAFEST, Candidates, Deadline, Limits, finite, grid_of
-from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.stages import STAGES, Rejected, Setup
-from stlc.controller.guard.stages.gradient_refine import SEED
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.ascent import SEED
+from stlc.controller.search.feasibility import safety_task
+from stlc.controller.search.local_search import Searcher
 
 if TYPE_CHECKING:
     from stlc.controller.guard.kind import GuardKind

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from stlc.controller.methods import Method
-from stlc.controller.planning.planner import PlanBudget, Planner, PlannerPolicy, planner_named
+from stlc.controller.planning.policy import PlannerPolicy
+from stlc.controller.search.planner import PlanBudget, Planner, planner_named
 from stlc.controller.training.config import PlannerChoice, ResolvedConfig, base_config
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.registry import PLANNERS

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import satisfied
+from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import StlcError
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from stlc.units import parse_quantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
-    from stlc.controller.planning.planner import PlanResult
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanResult
 
 RANDOM = "random"
 

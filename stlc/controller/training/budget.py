@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
+from stlc.native import cores
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -41,15 +43,6 @@ ROUNDS = 3
 """Number of search rounds over which their duration is averaged."""
 FIRST_SEARCH = 1.0
 """Expected duration of the first search, in intervals between search rounds."""
-
-
-def cores() -> int:
-    """Number of cores that this process may use.
-
-    Processes that `torchrun` started on this machine share the cores evenly.
-    """
-    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, found // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def processor() -> float:

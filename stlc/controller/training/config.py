@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 import torch
 
 from stlc.controller.options import MOST, Bounds, bounds_of
-from stlc.controller.training.budget import Clock, StepSchedule, cores
+from stlc.controller.training.budget import Clock, StepSchedule
 from stlc.diagnostics import usage
+from stlc.native import cores
 from stlc.registry import METHODS, PLANNERS, did_you_mean
 
 if TYPE_CHECKING:

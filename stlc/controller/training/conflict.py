@@ -21,17 +21,17 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.feasibility import ENOUGH, solve
 from stlc.controller.planning.missed import better_planner, missed
-from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import Task
+from stlc.controller.search.feasibility import ENOUGH, solve
+from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import Diagnostic, Label
 from stlc.native import never
 
 if TYPE_CHECKING:
     from stlc.compile.ir.functions import Bounds
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.training.local_search import SearchResult
+    from stlc.controller.search.local_search import SearchResult
     from stlc.native import Stop
 
 STARTS = 64

@@ -10,7 +10,7 @@ from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.methods.plan import planner_of
-from stlc.controller.planning.planner import prepared
+from stlc.controller.search.planner import prepared
 from stlc.controller.training.config import ENGINE_VERSION, ResolvedConfig, TrainConfig, resolve_config
 from stlc.controller.training.loop import prepare, run
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash

@@ -19,23 +19,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.methods import Learner, Method, Validation
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import rank, satisfied
+from stlc.controller.search.feasibility import safety_task
+from stlc.controller.search.local_search import TAILS, THOROUGH, Search, Searcher, SearchResult, remainders
+from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.training.checkpoint import below
 from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.failures import FailureBank
-from stlc.controller.training.local_search import (
-    TAILS,
-    THOROUGH,
-    Search,
-    Searcher,
-    SearchResult,
-    remainders,
-)
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.objective import loss
 from stlc.controller.training.run import load_weights

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from stlc.controller.planning.planner import PlanBudget, plan
-from stlc.controller.training.local_search import THOROUGH, Searcher, SearchResult
+from stlc.controller.search.local_search import THOROUGH, Searcher, SearchResult
+from stlc.controller.search.planner import PlanBudget, plan
 
 if TYPE_CHECKING:
     from torch import Tensor

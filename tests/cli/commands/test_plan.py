@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from stlc.cli.framework.app import main
-from stlc.controller.planning.planner import PlanSearch
+from stlc.controller.search.planner import PlanSearch
 from stlc.trace import load_trace
 
 ROOT = Path(__file__).parents[3]
@@ -86,7 +86,7 @@ def test_without_any_plan_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        "stlc.controller.planning.planner.prepared",
+        "stlc.controller.search.planner.prepared",
         lambda *_: lambda _search: signal.raise_signal(signal.SIGTERM),
     )
     trace = tmp_path / "plan.npz"

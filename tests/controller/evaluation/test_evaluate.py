@@ -23,10 +23,10 @@ from stlc.controller.evaluation.deployment import (
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, measure
 from stlc.controller.evaluation.stats import MeanInterval, student
-from stlc.controller.guard.feasibility import solvable
 from stlc.controller.guard.guard import Guard, GuardDecision
 from stlc.controller.policies.policy import BestOfKPolicy, Policy
 from stlc.controller.problem.task import Task
+from stlc.controller.search.feasibility import solvable
 from stlc.controller.training.run import Run
 from stlc.diagnostics import MissingError, RunError, SystemFileError
 from stlc.monitor.verdict import Monitor

@@ -7,9 +7,9 @@ from pathlib import Path
 import torch
 
 from stlc.controller.evaluation.held_out import save_states, score
-from stlc.controller.guard.feasibility import solvable
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.search.feasibility import solvable
 from stlc.controller.training.config import HELD_OUT_SEED, TrainConfig, resolve_config
 from stlc.dynamics.model.system import System
 from stlc.files import read_source

@@ -6,16 +6,16 @@ import math
 
 import pytest
 import torch
+from stlc.controller.search.ascent import GradientAscent
 from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, SOURCES, Limits
-from stlc.controller.guard.feasibility import safety_task, viable
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
-from stlc.controller.guard.stages.gradient_refine import GradientAscent
 from stlc.controller.problem.task import Task
+from stlc.controller.search.feasibility import safety_task, viable
 from tests.controller.guard.test_prefix_shooting import F64, Constant, failing, grid
 
 QUICK = Limits(seconds=None, tries=256, drawn=30, places=2)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from stlc.controller.search.ascent import APART, KEPT, GradientAscent
 from torch import Tensor
 
 from stlc.controller.guard.stages import gradient_refine as ascent
-from stlc.controller.guard.stages.gradient_refine import APART, KEPT, GradientAscent
 from stlc.controller.problem.task import Task
 from stlc.dynamics.model.system import System
 from stlc.files import read_source

@@ -11,8 +11,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from stlc.controller.methods.planners import milp
-from stlc.controller.planning.planner import PlanBudget, PlanSearch, plan
 from stlc.controller.problem.task import Task
+from stlc.controller.search.planner import PlanBudget, PlanSearch, plan
 from stlc.diagnostics import UsageError
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stlc
-from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task, rank, satisfied
+from stlc.controller.search.planner import PlanBudget, plan
 from stlc.monitor.verdict import Monitor
 
 

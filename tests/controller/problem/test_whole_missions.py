@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from stlc.controller.planning.policy import FIRST, PlannerPolicy
 
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.planner import FIRST, PlanBudget, PlannerPolicy, plan, planner_named
 from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import LONGEST, Task
-from stlc.controller.training.local_search import SearchResult, remainders
+from stlc.controller.search.local_search import SearchResult, remainders
+from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse

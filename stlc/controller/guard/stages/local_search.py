@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline, rank
-from stlc.controller.guard.feasibility import safety_task
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.feasibility import safety_task
+from stlc.controller.search.local_search import Searcher
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
-from stlc.controller.guard.feasibility import safety_task, solve
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
+from stlc.controller.search.feasibility import safety_task, solve
 
 if TYPE_CHECKING:
     from torch import Tensor

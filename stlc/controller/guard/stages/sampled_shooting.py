@@ -16,7 +16,7 @@ from torch import Tensor
 from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite, rank
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.guard.stages.local_search import climbed_from
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.local_search import Searcher
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy

@@ -22,17 +22,17 @@ import torch
 from stlc.compile.backends.milp.encode import MARGIN, Demand, Encoding
 from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.feasibility import extremes
 from stlc.controller.options import bounded
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.local_search import Searcher
+from stlc.controller.search.starts import extremes
 from stlc.diagnostics import Diagnostic, UsageError, not_installed
 from stlc.native import Stop
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 FOUND, IMPOSSIBLE, UNKNOWN = "found", "impossible", "unknown"
 FINEST = 1e-9

@@ -11,9 +11,9 @@ from stlc.controller.training.run import Run
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
-from stlc.controller.planning.newton import GaussNewton, Pull, state_gradient, values_of
-from stlc.controller.planning.obligations import Obligations
-from stlc.controller.planning.schedules import GoalScheduler, tempo
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.local_search import Searcher
+from stlc.controller.search.newton import GaussNewton, Pull, state_gradient, values_of
+from stlc.controller.search.schedules import GoalScheduler, tempo
+from stlc.controller.search.sequences.obligations import Obligations
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 PIECES = 12
 """Maximum number of constant pieces of a random plan."""

@@ -2,7 +2,7 @@
 
 Local search runs in C if a compiler is installed. Where it finds no plan, and the mission needs several
 steps, two searches alternate with it that look at the requirements: for sequences of phases
-(`stlc.controller.planning.sequences`), and by schedules of the goals (the planner `schedule`).
+(`stlc.controller.search.sequences.sequences`), and by schedules of the goals (the planner `schedule`).
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.feasibility import extremes
 from stlc.controller.methods.planners.schedule import SchedulePlanner, ScheduleRounds
 from stlc.controller.options import bounded
-from stlc.controller.planning.sequences import Sequences
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.local_search import Searcher
+from stlc.controller.search.sequences.sequences import Sequences
+from stlc.controller.search.starts import extremes
 from stlc.diagnostics import TraceError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from stlc.controller.planning.planner import PlanSearch, Solver
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner import PlanSearch, Solver
 
 
 SEVERAL = 2

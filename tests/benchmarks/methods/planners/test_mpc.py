@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.methods.planners.mpc import Mpc
-from stlc.controller.planning.planner import PlanBudget, PlanSearch, plan
 from stlc.controller.problem.task import Task
-from stlc.controller.training.local_search import Searcher
+from stlc.controller.search.local_search import Searcher
+from stlc.controller.search.planner import PlanBudget, PlanSearch, plan
 from stlc.diagnostics import UsageError
 from stlc.dynamics.model.system import System
 from stlc.grammar.parse.parser import parse

@@ -10,8 +10,8 @@ import torch
 from helpers import planner_laws as laws
 
 from stlc.cli.framework.app import main
-from stlc.controller.planning.planner import PlanBudget, plan, planner_named
 from stlc.controller.problem.task import Task
+from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.diagnostics import UsageError
 from stlc.rundir import RunDir
 from stlc.trace import load_trace

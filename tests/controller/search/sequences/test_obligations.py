@@ -12,12 +12,12 @@ import stlc
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.text import show_formula
-from stlc.controller.planning.obligations import Obligations
-from stlc.controller.planning.planner import PlanBudget, plan
 from stlc.controller.problem.task import Task
+from stlc.controller.search.planner import PlanBudget, plan
+from stlc.controller.search.sequences.obligations import Obligations
 from stlc.dynamics.model.system import System
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 HEAD = "spec goals\nstate signal x, y [m]\n"
 
 

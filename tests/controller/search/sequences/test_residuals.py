@@ -11,7 +11,7 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.text import show_formula
-from stlc.controller.planning.residuals import Progression
+from stlc.controller.search.sequences.residuals import Progression
 
 P, Q = ir.Predicate(ir.Signal("p")), ir.Predicate(ir.Signal("q"))
 STEPS = 9

@@ -10,10 +10,10 @@ import torch
 
 import stlc
 from stlc.compile.ir import nodes as ir
-from stlc.controller.planning.newton import GaussNewton, _pulled_by_torch, state_gradient, values_of
-from stlc.controller.planning.planner import PlanBudget, plan
-from stlc.controller.planning.schedules import GoalScheduler, tempo
 from stlc.controller.problem.task import Task
+from stlc.controller.search.newton import GaussNewton, _pulled_by_torch, state_gradient, values_of
+from stlc.controller.search.planner import PlanBudget, plan
+from stlc.controller.search.schedules import GoalScheduler, tempo
 from stlc.diagnostics import UsageError
 from stlc.dynamics.model.system import System
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stlc.controller.planning.phases import Ask
-from stlc.controller.planning.planner import PlanBudget, plan
-from stlc.controller.planning.sequences import Sequences
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
+from stlc.controller.search.planner import PlanBudget, plan
+from stlc.controller.search.sequences.phases import Ask
+from stlc.controller.search.sequences.sequences import Sequences
 
-MISSIONS = Path(__file__).parents[2] / "data/sequences"
+MISSIONS = Path(__file__).parents[3] / "data/sequences"
 
 
 @pytest.fixture(scope="module")

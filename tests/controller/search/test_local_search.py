@@ -8,7 +8,7 @@ import torch
 from stlc import native
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
-from stlc.controller.training.local_search import Searcher, SearchResult
+from stlc.controller.search.local_search import Searcher, SearchResult
 from stlc.controller.training.samplers import CAPACITY, ReplayBuffer
 from stlc.dynamics.model.system import System
 

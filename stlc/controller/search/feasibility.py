@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from typing import TYPE_CHECKING
 
 import torch
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
-from stlc.controller.training.local_search import THOROUGH, Searcher, SearchResult
+from stlc.controller.search.local_search import THOROUGH, Searcher, SearchResult
+from stlc.controller.search.starts import extremes
 from stlc.native import never
 
 if TYPE_CHECKING:
@@ -23,9 +23,6 @@ TRIES = 20_000
 """Number of plans judged per state and pass if native code judges them."""
 ENOUGH = 1e-4
 """Target robustness at which the search from a state ends."""
-PIECES = 3
-MOST = 2048
-"""Maximum size of the plan library."""
 
 
 @torch.no_grad()
@@ -105,19 +102,3 @@ def viable(task: Task, x0: Tensor) -> Tensor:
 def safety_task(task: Task) -> Task:
     """The task with the requirements tagged `@safety` as its only specification."""
     return Task(replace(task.compiled, requirements=task.compiled.safety), task.plain)
-
-
-def extremes(task: Task, generator: torch.Generator) -> Tensor:
-    """Plans of 3 constant pieces, each control at the low end, middle or high end of its range: (k, T, m).
-
-    If there are too many of these plans, `generator` draws some of them.
-    """
-    low, high = task.system.control_low, task.system.control_high
-    levels = torch.stack((low, 0.5 * (low + high), high))
-    shape = (PIECES, len(low))
-    if 3 ** (PIECES * len(low)) <= MOST:
-        pick = torch.tensor(list(product(range(3), repeat=PIECES * len(low)))).view(-1, *shape)
-    else:
-        pick = torch.randint(3, (MOST, *shape), generator=generator)
-    pieces = levels.gather(0, pick.flatten(0, 1)).view(-1, *shape)
-    return pieces.repeat_interleave(-(-task.horizon // PIECES), 1)[:, : task.horizon]

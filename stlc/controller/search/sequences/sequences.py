@@ -24,12 +24,12 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined, pieces
 from stlc.compile.ir.support import reach
 from stlc.compile.ir.traverse import nodes
-from stlc.controller.guard.feasibility import extremes
-from stlc.controller.planning.newton import values_of
-from stlc.controller.planning.obligations import Obligations
-from stlc.controller.planning.phases import Ask, Phase, Phases
-from stlc.controller.planning.relaxation import Relaxation, RelaxedState
-from stlc.controller.planning.residuals import NO, YES, Progression, looks_ahead
+from stlc.controller.search.newton import values_of
+from stlc.controller.search.sequences.obligations import Obligations
+from stlc.controller.search.sequences.phases import Ask, Phase, Phases
+from stlc.controller.search.sequences.relaxation import Relaxation, RelaxedState
+from stlc.controller.search.sequences.residuals import NO, YES, Progression, looks_ahead
+from stlc.controller.search.starts import extremes
 
 if TYPE_CHECKING:
     from numpy.random import Generator

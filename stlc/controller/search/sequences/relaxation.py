@@ -28,7 +28,7 @@ from stlc.compile.ir.normal_form import joined, negate
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
 from stlc.compile.semantics.tolerance import satisfied
-from stlc.controller.planning.phases import levels
+from stlc.controller.search.sequences.phases import levels
 from stlc.dynamics.model.algebra import names_in, substitute
 
 if TYPE_CHECKING:

@@ -22,8 +22,7 @@ from torch import Tensor
 from stlc.compile.backends.c.emit import LANES
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import satisfied
-from stlc.controller.training.budget import cores
-from stlc.native import never
+from stlc.native import cores, never
 
 if TYPE_CHECKING:
     from collections.abc import Callable
