@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from stlc.controller.planning.policy import FIRST, PlannerPolicy
 
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import judge_executed
+from stlc.controller.evaluation.rules import judge_runs_by_plans
 from stlc.controller.guard.guard import Guard
+from stlc.controller.planning.policy import FIRST, PlannerPolicy
 from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import LONGEST, Task
 from stlc.controller.search.local_search import SearchResult, remainders
@@ -116,6 +117,18 @@ def test_a_thousand_drives_keep_their_plans(task: Task) -> None:
         known = recording.rho >= -1e-6
         assert known[known[:, 0]].all()
         assert known[:, 0].mean() > 0.9
+
+
+@pytest.mark.parametrize("seeds", [1, pytest.param(50, marks=pytest.mark.slow)])
+def test_drives_that_lose_a_requirement_keep_the_others(tmp_path: Path, seeds: int) -> None:
+    held = {}
+    hopeless = "require soon: eventually@[0 s, 1 s] x > 5 m\n"
+    for name, text in (("with", ERRAND), ("without", ERRAND + hopeless)):
+        task = task_of(tmp_path, text=text)
+        runs = judge_runs_by_plans(judge_executed(task, driven(task, seeds, 20_000)), task.system.dt)
+        held[name] = {rule: int((each == "satisfied").sum()) for rule, each in runs.rules.items()}
+    assert held["without"].pop("soon") == 0
+    assert held["without"] == held["with"] == dict.fromkeys(held["with"], 4 * seeds)
 
 
 def test_safety_goes_on_where_another_requirement_is_lost(task: Task) -> None:

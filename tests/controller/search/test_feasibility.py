@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import torch
-from stlc.controller.search.starts import MOST, extremes
 
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import viable
+from stlc.controller.search.starts import MOST, extremes
 
 
 def states(task: Task, **columns: list[float]) -> torch.Tensor:
