@@ -279,9 +279,7 @@ def _nodes(package: Package, within: str, *kinds: type[ast.AST]) -> Iterator[tup
                 yield from ((module, node) for node in module.nodes.get(kind, ()))
 
 
-_SEARCHES = (
-    "GradientAscent|Searcher|GaussNewton|StagedSearch|RelaxedSearch|CertifiedSearch|SearchPlanner"
-)
+_SEARCHES = "GradientAscent|Searcher|GaussNewton|StagedSearch|RelaxedSearch|CertifiedSearch|SearchPlanner"
 MEANINGS = (
     Meaning("numbers of one step", "dynamics/model/schedule.py", written("dict(_.lets) | _")),
     Meaning(
