@@ -125,7 +125,7 @@ def test_drives_that_lose_a_requirement_keep_the_others(tmp_path: Path, seeds: i
     hopeless = "require soon: eventually@[0 s, 1 s] x > 5 m\n"
     for name, text in (("with", ERRAND), ("without", ERRAND + hopeless)):
         task = task_of(tmp_path, text=text)
-        runs = judge_runs_by_plans(judge_executed(task, driven(task, seeds, 20_000)), task.system.dt)
+        runs = judge_runs_by_plans(judge_executed(task, driven(task, seeds, 6_000)), task.system.dt)
         held[name] = {rule: int((each == "satisfied").sum()) for rule, each in runs.rules.items()}
     assert held["without"].pop("soon") == 0
     assert held["without"] == held["with"] == dict.fromkeys(held["with"], 4 * seeds)
