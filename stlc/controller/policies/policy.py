@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 VARIATIONS = (0.01, 0.05)
 """Sizes of the changes in `variations`, as shares of half the range of a control."""
+MOST_STEPS = 1_000_000
+"""Maximum number of steps of changed plans that are judged at a time, which bounds the memory."""
 
 
 def variations(task: Task) -> Tensor:
@@ -428,5 +430,8 @@ class BestOfKPolicy(Policy):
         failing = (~satisfied(judged.rho)).nonzero()[:, 0]
         if not len(self.network.changes) or not len(failing):
             return plans, judged
-        better, found = self._best(x0[failing], self.network.with_changes(plans[failing]))
-        return plans.index_copy(0, failing, better), judged.put(failing, found)
+        size = max(1, MOST_STEPS // (plans.shape[1] * (1 + len(self.network.changes))))
+        for rows in torch.split(failing, size):
+            better, found = self._best(x0[rows], self.network.with_changes(plans[rows]))
+            plans, judged = plans.index_copy(0, rows, better), judged.put(rows, found)
+        return plans, judged
