@@ -299,17 +299,13 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
     broken = (
         Broken(
             row,
-            {name: _seconds(executed.decided[name][row], dt) for name in each},
+            {name: None if np.isnan(at := executed.decided[name][row]) else float(at) * dt for name in each},
             None if viable[row] else Lost("start", 0.0),
         )
         for row, each in names.items()
         if each
     )
     return RunVerdicts(rules, tuple(broken), viable | obeying(rules, len(viable)), executed.safety)
-
-
-def _seconds(sample: float, dt: float) -> float | None:
-    return None if np.isnan(sample) else float(sample) * dt
 
 
 def _broken(verdict: Verdict, rules: Mapping[str, NDArray[np.str_]]) -> Iterator[Broken]:

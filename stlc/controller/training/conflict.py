@@ -113,6 +113,8 @@ def _told(
     row = int(nearest.rho.argmax())
     columns = zip(task.system.signature.columns, nearest.states[row].tolist(), strict=True)
     start = ", ".join(f"{column.name} = {value:.4g}" for column, value in columns)
+    rho = float(nearest.rho[row])
+    missing = f"{-rho:.4g}" if math.isfinite(rho) else "a deadline that was over before the plan"
     if proved:
         message, label = f"no plan satisfies {names[0]}", "out of reach whatever a plan does"
     elif len(core) == 1:
@@ -135,13 +137,9 @@ def _told(
         ),
         note=(
             PROOF if proved else _tried(core),
-            f"the nearest misses by {_miss(float(nearest.rho[row]))}, from {start}",
+            f"the nearest misses by {missing}, from {start}",
         ),
     )
-
-
-def _miss(rho: float) -> str:
-    return f"{-rho:.4g}" if math.isfinite(rho) else "a deadline that was over before the plan"
 
 
 def _tried(core: Sequence[CompiledRequirement]) -> str:
