@@ -1,43 +1,126 @@
-"""Gauss-Newton steps that change a plan so that its states meet conditions at given samples.
+"""Gauss-Newton steps that change plans so that their states meet conditions at given samples.
 
-An example of a condition is `x > 1` at sample 5. Each step linearises the predicted states of a plan and the
-conditions on them. Then it makes the smallest change of the controls for which the linearised conditions hold
-(a damped least-squares problem with bounds). The derivatives of the conditions are approximated by
-differences.
+An example of a condition is `x > 1` at sample 5. A step linearises the dynamics and the conditions along the
+trajectory of a plan. Then it minimises the squared distances by which the linearised conditions are missed.
+This is a linear-quadratic problem, and a Riccati recursion solves it (Li and Todorov 2004). It gives feedback
+gains besides the changes of the controls: where the true trajectory departs from the linear prediction, the
+controls are corrected, so that early changes do not grow along the trajectory of an unstable system. A
+logarithmic barrier keeps the controls within their bounds (Pavlov et al. 2021).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.c.adjoint import emit_adjoint
-from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir.support import columns as columns_read
-from stlc.controller.problem.native import motion_of, sizes_of
-from stlc.native import Adjoint, ObjectiveSlopes, load
+from stlc.controller.problem.native import NativeStep
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from stlc.compile.ir import nodes as ir
     from stlc.controller.problem.task import Task
-    from stlc.dynamics.model.system import System
+
+    Numbers = NDArray[np.float64]
 
 PROBE = 1e-6
 """Difference of a state or control for its derivative, as a share of its range."""
+UNIFORM = 12.0**-0.5
+"""Standard deviation of a uniform distribution, as a share of its range."""
 TINY = 1e-9
-SLOPE = 1.0
-"""Slope, per unit, that replaces the derivative of jumps and conditions."""
-Pull: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Derivative by plans of linear forms of states, see `state_gradient`."""
+FAR = 1e6
+"""Value that stands for an infinite state."""
+FLAT = 0.1
+"""Least slope of a condition, as a share of its greatest slope along the trajectory, by which its distance is
+measured: at the top of a hill, a condition has no slope, but the distance is not infinite."""
+INSIDE = 0.01
+"""Least distance of a control from its bounds, at first as a share of its range; later, of the distance that
+it had before."""
+BARRIER = 0.3
+"""Weight of the barrier, as a multiple of the cost for each control of the plan."""
+LENGTHS = np.array([1.0, 0.4, 0.1])
+"""Shares of the changes of the controls that are tried."""
+MARGIN = 0.03
+"""Greatest margin of a condition."""
+DEPTHS = 2.0 * MARGIN * np.array([1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01])
+"""Distances from the boundary of a condition at which it may hold. Its margin is half of the greatest."""
 PROJECTIONS = 10
 """Steps of a projection onto a condition."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectories:
+    """Trajectories of B plans, and the conditions along them.
+
+    Attributes:
+        shares: controls of the plans as shares of their ranges, (B, T, m).
+        states: states under them, (B, T + 1, all states).
+        distance: distance of each state from the boundary of each condition, negative if the condition is
+            violated, (B, conditions, T + 1).
+    """
+
+    shares: Numbers
+    states: Numbers
+    distance: Numbers
+
+    def cost(self, needed: NDArray[np.bool_], margin: Numbers) -> Numbers:
+        """Cost of the distances that are less than a margin, (B,): half their squares, linear beyond 1.
+
+        Args:
+            needed: True where a condition must hold at a sample, (B, conditions, T + 1).
+            margin: distance that states should keep from the boundary of each condition, (B, conditions).
+        """
+        short = np.where(needed, margin[..., None] - self.distance, 0.0).clip(0.0, FAR)
+        cost: Numbers = np.where(short < 1.0, 0.5 * short**2, short - 0.5).sum((1, 2))
+        return cost
+
+    def barrier(self) -> Numbers:
+        """Barrier of the bounds of the controls, with weight 1, (B,)."""
+        found: Numbers = -np.log(self.shares * (1.0 - self.shares)).sum((1, 2))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Linearised(Trajectories):
+    """Trajectories of B plans, with the conditions linearised along them.
+
+    Attributes:
+        size: slopes of the conditions, by which their values are divided to give distances,
+            (B, conditions, T + 1).
+        slopes: derivative of the distance with respect to the states that move, (B, conditions, T + 1, n).
+    """
+
+    size: Numbers
+    slopes: Numbers
+
+    def put(self, index: NDArray[np.int64], other: Linearised) -> None:
+        """Replace the plans `index`, (k,), by the k others."""
+        for field in fields(self):
+            getattr(self, field.name)[index] = getattr(other, field.name)
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """States that meet conditions.
+
+    Attributes:
+        states: a state for each condition, (conditions, n).
+        violated: True for each condition that the state from which they were sought violates, (conditions,).
+        margins: distance from its boundary that each condition allows there, at most `MARGIN`,
+            (conditions,).
+    """
+
+    states: Tensor
+    violated: Tensor
+    margins: Numbers
 
 
 class GaussNewton:
@@ -51,73 +134,126 @@ class GaussNewton:
         spread: typical range of each state, (n,).
     """
 
-    def __init__(
-        self,
-        task: Task,
-        conditions: Sequence[ir.Formula],
-        spread: Tensor,
-        pull: Pull,
-        *,
-        rows: int = 16,
-        margin: float = 0.03,
-        damping: float = 1e-3,
-    ) -> None:
+    def __init__(self, task: Task, conditions: Sequence[ir.Formula], spread: Tensor) -> None:
         """Prepare the steps.
 
         Args:
             task: specification and system.
             conditions: formulas over the states of one sample.
             spread: typical range of each state, (n,).
-            pull: function that `state_gradient` returned for the system.
-            rows: a step considers at most this many pairs of condition and sample per plan, the most violated
-                ones.
-            margin: distance that states should keep from the boundaries of the conditions.
-            damping: damping of the least-squares problem, relative to the mean of its diagonal.
         """
-        self.task, self.spread = task, spread.clamp(min=TINY)
-        self._conditions, self._rows, self._margin, self._damping = conditions, rows, margin, damping
+        self.task, self.spread = task, spread
+        self._conditions = conditions
+        names, timers = task.system.names, {timer.name for timer in task.system.timers}
         read = frozenset().union(*map(columns_read, conditions))
-        self._read = torch.tensor([i for i, name in enumerate(task.system.names) if name in read])
+        self._read = torch.tensor([i for i, name in enumerate(names) if name in read])
         self._scale = self.spread[self._read]
-        self._pull = pull
-        self._low, self._high = task.system.control_low.double(), task.system.control_high.double()
-        self._span = (self._high - self._low).clamp(min=TINY)
+        moving = task.system.exact_step.next.keys() - timers
+        self._moving = [i for i, name in enumerate(names) if name in moving]
+        self._low = task.system.control_low.double().numpy()
+        self._span = np.maximum(task.system.control_high.double().numpy() - self._low, TINY)
+        self._native = NativeStep.of(task.system, rewarded=False)
 
-    @torch.no_grad()
-    def step(self, x0: Tensor, plans: Tensor, needed: Tensor) -> tuple[Tensor, Tensor]:
-        """Improve plans by one step.
+    def begin(self, x0: Tensor, plans: Tensor) -> Linearised:
+        """Linearise the conditions along plans (B, T, m) from x0 (n,), with controls off their bounds."""
+        shares = ((plans.numpy() - self._low) / self._span).clip(INSIDE, 1.0 - INSIDE)
+        states = self.task.rollout(x0.expand(len(plans), -1), self.plans(shares))
+        return self.linearised(shares, states.nan_to_num(FAR, FAR, -FAR).numpy())
+
+    def linearised(self, shares: Numbers, states: Numbers) -> Linearised:
+        """Linearise the conditions along plans, given as shares of the ranges, and the states under them."""
+        values, slopes = self._linear(torch.from_numpy(states))
+        size = slopes.mul(self._scale[:, None]).square().sum(2).sqrt()
+        size = torch.maximum(size, FLAT * size.amax(1, keepdim=True)).clamp(min=TINY)
+        rows = slopes.new_zeros(*values.shape, states.shape[2])
+        rows[..., self._read] = (slopes / size[:, :, None]).permute(0, 1, 3, 2)
+        distance, sizes = ((part.permute(2, 0, 1)).numpy() for part in (values / size, size))
+        moving = rows[..., self._moving].permute(2, 0, 1, 3).numpy()
+        return Linearised(shares, states, distance, sizes, moving)
+
+    def plans(self, shares: Numbers) -> Tensor:
+        """Return the plans whose controls are given as shares of their ranges."""
+        return torch.from_numpy(self._low + self._span * shares)
+
+    def step(
+        self, now: Linearised, needed: NDArray[np.bool_], margin: Numbers, damping: Numbers
+    ) -> Trajectories:
+        """Change plans by one step, in each of the `LENGTHS`.
 
         Args:
-            x0: initial states, (B, n).
-            plans: plans, (B, T, m).
+            now: the plans, all from the same initial state.
             needed: True where a condition must hold at a sample, (B, conditions, T + 1).
+            margin: distance that states should keep from the boundary of each condition, (B, conditions).
+            damping: weights of squared changes of the controls, relative to their mean effect, (B,).
 
         Returns:
-            The changed plans, (B, T, m); and the sum of the distances by which the states under each plan
-            missed the needed conditions before the change, (B,).
+            The changed plans, (B * lengths); distances are by the slopes along the present ones.
         """
-        states = self.task.rollout(x0, plans)
-        values, slopes = self._linear(states)
-        size = slopes.mul(self._scale[:, None]).square_().sum(2).sqrt_().clamp_(min=TINY)
-        lost = torch.where(needed.permute(1, 2, 0), values / size, torch.inf).flatten(0, 1)
-        distance, index = lost.t().topk(min(self._rows, len(lost)), 1, largest=False)
-        near = distance < 2.0 * self._margin  # also those that just hold, so that they go on holding
-        missing = torch.where(near, self._margin - distance, 0.0).clamp(min=0.0)
-        picked = index, torch.arange(len(plans))[:, None]
-        share = near / size.flatten(0, 1)[picked]
-        rows = states.new_zeros(*index.shape, states.shape[2])
-        rows[..., self._read] = slopes.flatten(0, 1).transpose(1, 2)[picked] * share[..., None]
-        effect = self._effects(x0, plans, rows, index % states.shape[1]) * self._span.repeat(plans.shape[1])
-        return plans + self._change(plans, effect, missing), missing.sum(1)
+        least = margin[..., None]
+        near = needed & (now.distance < 1.5 * least)  # also those that just hold, so that they go on
+        rows = np.where(near[..., None], now.slopes, 0.0)
+        rest = np.where(near, least - now.distance, 0.0).clip(0.0)
+        weight = 1.0 / np.maximum(rest, 1.0)  # far from its boundary, a condition costs its distance
+        curve = np.einsum("bcki,bckj,bck->kbij", rows, rows, weight, optimize=True)
+        pull = -np.einsum("bcki,bck->kbi", rows, weight * rest)
+        by_state, by_control = self._jacobians(now)
+        effect = _mean_effect(by_state, by_control, curve) / np.maximum(1, near.sum((1, 2)))
+        weight = barrier_weight(now.cost(needed, margin), now.shares)[:, None, None]
+        below, above = now.shares, 1.0 - now.shares
+        own = weight / below**2 + weight / above**2 + (effect * damping + TINY**2)[:, None, None]
+        push = weight / above - weight / below
+        change, gain = _riccati(by_state, by_control, curve, pull, own.swapaxes(0, 1), push.swapaxes(0, 1))
+        return self._followed(now, change, gain)
+
+    def _followed(self, now: Linearised, change: Numbers, gain: Numbers) -> Trajectories:
+        """Apply changes of the controls, (T, B, m), with feedback gains, (T, B, m, n), in all lengths."""
+        many = len(LENGTHS)
+        about, path = (part.swapaxes(0, 1).repeat(many, 1) for part in (now.shares, now.states))
+        gains = gain.repeat(many, 1)
+        aim = about + change.repeat(many, 1) * np.tile(LENGTHS, len(now.shares))[:, None]
+        low, high = INSIDE * about, 1.0 - INSIDE * (1.0 - about)
+        shares, states, x = np.empty_like(aim), path.copy(), path[0]
+        for k in range(len(aim)):
+            apart = (x - path[k])[:, self._moving, None]
+            share = np.minimum(np.maximum(aim[k] + (gains[k] @ apart)[..., 0], low[k]), high[k])
+            shares[k] = np.where(np.isfinite(share), share, about[k])
+            x = states[k + 1] = self._stepped(x, self._low + self._span * shares[k])
+        found = np.nan_to_num(states.swapaxes(0, 1), nan=FAR, posinf=FAR, neginf=-FAR)
+        values = values_of(self.task, self._conditions, torch.from_numpy(found)).permute(2, 0, 1).numpy()
+        return Trajectories(shares.swapaxes(0, 1), found, values / np.repeat(now.size, many, 0))
+
+    def _jacobians(self, now: Linearised) -> tuple[Numbers, Numbers]:
+        """Derivatives of each step by states and controls, (T, B, n, n) and (T, B, n, m), by differences.
+
+        Controls are in shares of their ranges; n is the number of states that move.
+        """
+        count, batch, steps = len(self._moving), len(now.shares), now.shares.shape[1]
+        scale = self.spread.numpy()[self._moving]
+        probes = PROBE * np.concatenate((scale, self._span))
+        x = now.states[:, :-1].reshape(-1, now.states.shape[2])
+        u = (self._low + self._span * now.shares).reshape(-1, len(self._span))
+        x, u = (np.repeat(part[None], 2 * len(probes), 0) for part in (x, u))
+        for number, probe in enumerate(probes):
+            part, column = (x, self._moving[number]) if number < count else (u, number - count)
+            part[2 * number, :, column] += 0.5 * probe
+            part[2 * number + 1, :, column] -= 0.5 * probe
+        after = self._stepped(x.reshape(-1, now.states.shape[2]), u.reshape(-1, len(self._span)))[
+            :, self._moving
+        ]
+        ends = after.reshape(len(probes), 2, batch, steps, count)
+        slopes = np.nan_to_num((ends[:, 0] - ends[:, 1]) / probes[:, None, None, None])
+        each = slopes.transpose(2, 1, 3, 0)
+        return np.ascontiguousarray(each[..., :count]), each[..., count:] * self._span
+
+    def _stepped(self, x: Numbers, u: Numbers) -> Numbers:
+        """States after one step from states (rows, n) under controls (rows, m)."""
+        if self._native is None:
+            return self.task.system.step(torch.from_numpy(x), torch.from_numpy(u)).numpy()
+        return self._native.compiled.advance(np.ascontiguousarray(x), np.ascontiguousarray(u), 0.0)[0]
 
     @torch.no_grad()
-    def nearest(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """For each condition, find a state near `state`, (n,), that meets it; dynamics are ignored.
-
-        Returns:
-            The states, (conditions, n); and True for each condition that `state` itself violates,
-            (conditions,).
-        """
+    def nearest(self, state: Tensor) -> Places:
+        """For each condition, find a state near `state`, (n,), that meets it; dynamics are ignored."""
         count = len(self._conditions)
         places, index = state.repeat(count, 1), torch.arange(count)
         violated = torch.zeros(count, dtype=torch.bool)
@@ -128,7 +264,12 @@ class GaussNewton:
             along = slope * self._scale**2
             share = -1.05 * value / (along * slope).sum(1).clamp(min=TINY**2)
             places[:, self._read] += torch.where(value < 0.0, share, 0.0)[:, None] * along
-        return places, violated
+        size = (slope * self._scale).norm(dim=1, keepdim=True).clamp(min=TINY)
+        moved, depths = places[:, None].repeat(1, len(DEPTHS), 1), torch.from_numpy(DEPTHS)
+        moved[..., self._read] += depths[:, None] * (slope * self._scale**2 / size)[:, None]
+        reached = values_of(self.task, self._conditions, moved)[index, :, index] / size
+        margins = torch.where(reached >= 0.5 * depths, 0.5 * depths, 0.5 * DEPTHS[-1]).amax(1)
+        return Places(places, violated, margins.numpy())
 
     def _linear(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Values of the conditions at states (B, T + 1, n), and derivatives of these values.
@@ -145,55 +286,71 @@ class GaussNewton:
         values = values.view(*values.shape[:2], len(moves), len(states))
         return values[:, :, 0], (values[:, :, 1:] - values[:, :, :1]) / probe[:, None]
 
-    def _effects(self, x0: Tensor, plans: Tensor, rows: Tensor, when: Tensor) -> Tensor:
-        """Derivatives of weighted sums of state components with respect to the controls of the plans.
 
-        Args:
-            x0: initial states, (B, n).
-            plans: plans, (B, T, m).
-            rows: weights of K sums per plan, (B, K, n).
-            when: sample at which the state of each sum is taken, (B, K).
+def barrier_weight(cost: Numbers, shares: Numbers) -> Numbers:
+    """Weight of the barrier of plans, (B, T, m), by their cost, (B,): it falls with the cost."""
+    found: Numbers = (BARRIER / max(1, shares[0].size) * cost).clip(TINY, 0.1)
+    return found
 
-        Returns:
-            Derivatives of each sum with respect to all controls of its plan, (B, K, T * m).
-        """
-        batch, count, size = rows.shape
-        columns = rows.new_zeros(size, plans.shape[1] + 1, batch * count)
-        columns[:, when.flatten(), torch.arange(batch * count)] = rows.flatten(0, 1).t()
-        each = x0.repeat_interleave(count, 0), plans.repeat_interleave(count, 0)
-        return self._pull(*each, columns).view(batch, count, -1)
 
-    def _change(self, plans: Tensor, effect: Tensor, missing: Tensor) -> Tensor:
-        """Smallest change of each plan after which K linearised conditions hold, within the control bounds.
+def _mean_effect(by_state: Numbers, by_control: Numbers, curve: Numbers) -> Numbers:
+    """Sum over the conditions of the squared effect that the controls before them have on them, (B,)."""
+    reach = np.zeros_like(curve[0])
+    total = np.zeros(len(reach))
+    for k, (a, b) in enumerate(zip(by_state, by_control, strict=True)):
+        reach = a @ reach @ a.swapaxes(1, 2) + b @ b.swapaxes(1, 2)
+        total += np.einsum("bij,bij->b", reach, curve[k + 1])
+    return np.nan_to_num(total, nan=1.0, posinf=1e12)
 
-        A control that would leave its bounds is set to the nearest bound. The change of the other controls is
-        then computed again, to compensate for this.
 
-        Args:
-            plans: plans, (B, T, m).
-            effect: derivative of each condition's distance with respect to the controls, (B, K, T * m).
-            missing: distance by which each condition is missed, (B, K).
+def _riccati(
+    by_state: Numbers, by_control: Numbers, curve: Numbers, pull: Numbers, own: Numbers, push: Numbers
+) -> tuple[Numbers, Numbers]:
+    """Changes of the controls that minimise a quadratic cost of linear dynamics.
 
-        Returns:
-            The change, (B, T, m).
-        """
-        span = self._span
-        now = (plans / span).flatten(1)
-        low, high = ((end / span).repeat(plans.shape[1]) - now for end in (self._low, self._high))
-        fixed, free = torch.zeros_like(now), torch.ones_like(now)
-        one = torch.eye(missing.shape[1], dtype=torch.float64)
-        for _ in range(2):
-            own = effect * free[:, None]
-            normal = own @ effect.mT
-            level = self._damping * normal.diagonal(dim1=1, dim2=2).mean(1) + TINY
-            rest = missing - (effect @ fixed[..., None])[..., 0]
-            weights, _ = torch.linalg.solve_ex(normal + level[:, None, None] * one, rest[..., None])
-            change = (own.mT @ weights)[..., 0].nan_to_num(0.0, 0.0, 0.0) + fixed
-            inside = change.clamp(low, high)
-            free = free * (inside == change)
-            fixed = torch.where(free > 0.0, 0.0, inside)
-        changed: Tensor = inside.view_as(plans) * span
-        return changed
+    Args:
+        by_state: derivatives of each step by the states, (T, B, n, n).
+        by_control: derivatives of each step by the controls, (T, B, n, m).
+        curve: second derivatives of the cost by the states, (T + 1, B, n, n).
+        pull: derivatives of the cost by the states, (T + 1, B, n).
+        own: second derivatives of the cost by each control, (T, B, m).
+        push: derivatives of the cost by each control, (T, B, m).
+
+    Returns:
+        The changes, (T, B, m), and the gains of the feedback, (T, B, m, n).
+    """
+    steps, batch, states, controls = by_control.shape
+    found = np.empty((steps, batch, controls, 1 + states))
+    bend, slope, each = curve[-1], pull[-1][..., None], np.arange(controls)
+    turned, turned_control = by_state.swapaxes(2, 3), by_control.swapaxes(2, 3)
+    for k in range(steps - 1, -1, -1):
+        back = turned_control[k] @ bend
+        inner = back @ by_control[k]
+        inner[:, each, each] += own[k]
+        mixed = back @ by_state[k]
+        first = turned_control[k] @ slope + push[k][..., None]
+        found[k] = -np.linalg.solve(inner, np.concatenate((first, mixed), 2))
+        cross = mixed.swapaxes(1, 2)
+        slope = pull[k][..., None] + turned[k] @ slope + cross @ found[k][..., :1]
+        bend = curve[k] + turned[k] @ bend @ by_state[k] + cross @ found[k][..., 1:]
+        bend = 0.5 * (bend + bend.swapaxes(1, 2))
+    return found[..., 0], found[..., 1:]
+
+
+def spread_of(task: Task, states: Tensor) -> Tensor:
+    """Typical range of each state, (n,): its standard deviation, at most that over its declared range.
+
+    On an unstable system, the states of random plans say little about those of good ones.
+
+    Args:
+        task: specification and system.
+        states: trajectories under random plans, (k, T + 1, n).
+    """
+    found = states.nan_to_num(0.0, 0.0, 0.0).flatten(0, 1).std(0)
+    for i, column in enumerate(task.system.signature.columns):
+        if column.low is not None and column.high is not None and column.high > column.low:
+            found[i] = found[i].clamp(max=(column.high - column.low) * UNIFORM)
+    return found.clamp(min=TINY)
 
 
 @torch.no_grad()
@@ -203,36 +360,3 @@ def values_of(task: Task, conditions: Sequence[ir.Formula], states: Tensor) -> T
     env = {name: states[..., i].t().contiguous() for i, name in enumerate(names)}
     found = evaluate(conditions, env, ops=TORCH, count=samples)
     return torch.stack([each.expand(samples, len(states)) for each in found]).nan_to_num(nan=-1e9)
-
-
-def state_gradient(system: System) -> Pull:
-    """Return a function that computes the derivative of a weighted sum of predicted states.
-
-    The derivative is taken with respect to the controls of the plan. The arguments of the returned function,
-    all float64, are B initial states (B, n), B plans (B, T, m), and the weight of every state at every
-    sample, (n, T + 1, B). It returns one derivative per plan, (B, T, m). It runs in C if a compiler is
-    installed.
-    """
-    try:
-        fixed = [timer.name for timer in system.timers]
-        library = load(emit_adjoint(motion_of(system), [], fixed=fixed))
-    except Untranslatable:
-        library = None
-    if library is None:
-        return partial(_pulled_by_torch, system)
-    adjoint = Adjoint(library, sizes_of(system, []))
-
-    def pull(x0: Tensor, plans: Tensor, columns: Tensor) -> Tensor:
-        none = np.zeros((len(x0), 0))
-        slopes = ObjectiveSlopes(none, columns.numpy(), SLOPE)
-        return torch.from_numpy(adjoint.pull(x0.numpy(), plans.numpy(), slopes))
-
-    return pull
-
-
-def _pulled_by_torch(system: System, x0: Tensor, plans: Tensor, columns: Tensor) -> Tensor:
-    with torch.enable_grad():
-        plans = plans.detach().requires_grad_()
-        total = (system.rollout(x0, plans) * columns.permute(2, 1, 0)).sum()
-        gradient: Tensor = torch.autograd.grad(total, plans)[0]
-    return gradient

@@ -25,7 +25,7 @@ from stlc.registry import PLANNERS, closest
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
-PLANNING_VERSION = 2
+PLANNING_VERSION = 3
 """Version of the planners, raised with every change of the plans that they find within a budget."""
 SECONDS = 1.0
 """Default budget per initial state, in seconds of processor time."""

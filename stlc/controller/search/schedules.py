@@ -24,6 +24,8 @@ Flags = NDArray[np.bool_]
 
 MOST_INSTANTS = 16
 """Longest window of an `always` whose operand has choices of its own; of longer ones, the first sample."""
+MOST_ALTERNATIVES = 8
+"""Largest number of alternatives in conditions among which a schedule chooses."""
 
 
 class GoalScheduler:
@@ -36,6 +38,8 @@ class GoalScheduler:
 
     Attributes:
         conditions: the conditions in the formulas. A conjunction is split into its parts.
+        choices: the conditions that are an `or` of which a schedule may choose one operand, which is a
+            condition, too; none if there are many.
     """
 
     def __init__(self, formulas: Sequence[ir.Formula], states: Sequence[str], steps: int) -> None:
@@ -45,6 +49,11 @@ class GoalScheduler:
         self._decidable: dict[int, bool] = {}
         for formula in formulas:
             self._collect(formula)
+        choices = [each for each in self._numbers if isinstance(each, ir.BoolOp)]
+        few = sum(len(each.items) for each in choices) <= MOST_ALTERNATIVES
+        self.choices = frozenset(choices if few else ())
+        for item in (item for choice in choices if few for item in choice.items):
+            self._collect(item)
         self.conditions = tuple(self._numbers)
         self._opposed = {
             i: self._numbers[_opposite(condition)]
@@ -71,6 +80,21 @@ class GoalScheduler:
         for i, j in self._opposed.items():
             possible &= ~(drawing.needed[:, i] & drawing.needed[:, j]).any(1)
         return drawing.needed[possible]
+
+    def nearest(self, distance: NDArray[np.float64]) -> Flags:
+        """Select for each trajectory the schedule that it meets, or is nearest to.
+
+        Args:
+            distance: distance of each sample from the boundary of each condition, negative where the
+                condition is violated, (trajectories, conditions, T + 1).
+
+        Returns:
+            True where a schedule needs a condition at a sample, (trajectories, conditions, T + 1).
+        """
+        choice = _Nearest(self, distance)
+        for formula in self._formulas:
+            choice.need(formula, np.zeros(len(distance), np.int64), np.ones(len(distance), np.bool_))
+        return choice.needed
 
     @property
     def steps(self) -> int:
@@ -182,10 +206,7 @@ class _Drawing:
                 for i in self._random.permutation(len(items)):
                     self.need(items[i], now, on)
             case ir.BoolOp("or", items):
-                each = np.arange(len(on))
-                free = np.stack([self._free(item)[each, now] for item in items])
-                known = np.stack([(now == 0) & self._known(item) for item in items])
-                chosen = (self._random.random(free.shape) + free + known).argmax(0)
+                chosen = self._alternative(items, now)
                 for i, item in enumerate(items):
                     self.need(item, now, on & (chosen == i))
             case ir.AtStart(body):
@@ -198,6 +219,18 @@ class _Drawing:
             case ir.Temporal() | ir.Until():
                 self._window(formula, now, on)
 
+    def _alternative(self, items: Sequence[ir.Formula], now: Instants) -> Instants:
+        """Choose at random, in each schedule, the operand of an `or` that shall hold at the sample `now`."""
+        each = np.arange(len(now))
+        free = np.stack([self._free(item)[each, now] for item in items])
+        known = np.stack([(now == 0) & self._known(item) for item in items])
+        chosen: Instants = (self._random.random(free.shape) + free + known).argmax(0)
+        return chosen
+
+    def _released(self, formula: ir.Until, now: Instants, within: Flags) -> Flags:  # noqa: ARG002
+        """Choose at random the schedules in which `left` releases `right` at a sample of the window."""
+        return within.any(1) & (self._random.random(len(within)) < 0.5)
+
     def _window(self, formula: ir.Temporal | ir.Until, now: Instants, on: Flags) -> None:
         window = formula.window
         first = now + window.lo
@@ -207,21 +240,27 @@ class _Drawing:
             case ir.Temporal("always", _, body):
                 self._always(body, first, last, on)
             case ir.Temporal("eventually", _, body):
-                chosen, on = self._chosen(formula, within & self._free(body), on)
+                chosen, on = self._chosen(formula, now, within & self._free(body), on)
                 self.need(body, chosen, on)
             case ir.Until("until", _, left, right):
                 before = np.where(self._samples < now[:, None], True, self._free(left))
                 within &= np.logical_and.accumulate(before, axis=1)
-                chosen, on = self._chosen(formula, within & self._free(right), on)
+                chosen, on = self._chosen(formula, now, within & self._free(right), on)
                 self._always(left, now, chosen, on)
                 self.need(right, chosen, on)
             case ir.Until("release", _, left, right):  # released by `left`, or `right` over the whole window
-                released = on & within.any(1) & (self._random.random(len(on)) < 0.5)
-                chosen, released = self._chosen(formula, within, released)
+                released = on & self._released(formula, now, within)
+                chosen, released = self._chosen(formula, now, within, released)
                 self.need(left, chosen, released)
                 self._always(right, first, np.where(released, chosen, last), on)
 
-    def _chosen(self, formula: ir.Formula, allowed: Flags, on: Flags) -> tuple[Instants, Flags]:
+    def _chosen(
+        self,
+        formula: ir.Temporal | ir.Until,
+        now: Instants,  # noqa: ARG002
+        allowed: Flags,
+        on: Flags,
+    ) -> tuple[Instants, Flags]:
         """Choose at random, in each schedule selected by `on`, one of the allowed samples.
 
         If further choices are nested in the formula, early samples are more likely, so that time is left for
@@ -229,6 +268,7 @@ class _Drawing:
 
         Args:
             formula: formula for which the sample is chosen.
+            now: sample at which the formula shall hold, (schedules,).
             allowed: True at the allowed samples, (schedules, T + 1).
             on: True for the schedules in which a sample is to be chosen, (schedules,).
 
@@ -282,12 +322,119 @@ class _Drawing:
 
         `formula`: a condition. `first`, `last`: indices of samples, one per schedule, (schedules,).
         """
-        within = (self._samples >= first[:, None]) & (self._samples <= last[:, None]) & on[:, None]
+        within = (self._samples >= first[:, None]) & (self._samples <= last[:, None])
+        self._demand(formula, within & on[:, None])
+
+    def _demand(self, formula: ir.Formula, within: Flags) -> None:
+        """Demand that a condition holds at samples, (schedules, T + 1)."""
         for part in self._scheduler.parts(formula):
             if isinstance(part, ir.Truth):
                 self.possible &= part.value | ~within.any(1)
             else:
                 self.needed[:, self._scheduler.number(part)] |= within
+                if part in self._scheduler.choices:
+                    self._prefer(part, within)
+
+    def _prefer(self, condition: ir.BoolOp, within: Flags) -> None:
+        """Demand, in some schedules, one alternative of an `or` of comparisons in a part of the samples.
+
+        On average, one such `or` is chosen for each schedule.
+        """
+        count, random = len(within), self._random
+        begin, end = np.sort(random.integers(self._last + 1, size=(2, count)), axis=0)
+        end[random.random(count) < 0.5] = self._last
+        piece = within & (self._samples >= begin[:, None]) & (self._samples <= end[:, None])
+        chosen = random.integers(len(self._scheduler.choices) * len(condition.items), size=count)
+        for i, item in enumerate(condition.items):
+            self._demand(item, piece & (chosen == i)[:, None])
+
+
+class _Nearest(_Drawing):
+    """The schedule that each of several trajectories meets, or is nearest to."""
+
+    def __init__(self, scheduler: GoalScheduler, distance: NDArray[np.float64]) -> None:
+        super().__init__(scheduler, len(distance), np.random.default_rng(0), None)
+        self._distance = distance
+        self._worths: dict[int, NDArray[np.float64]] = {}
+
+    def _alternative(self, items: Sequence[ir.Formula], now: Instants) -> Instants:
+        there = np.arange(len(now)), now.clip(0, self._last)
+        best: Instants = np.stack([self._worth(item)[there] for item in items]).argmax(0)
+        return best
+
+    def _prefer(self, condition: ir.BoolOp, within: Flags) -> None:
+        pass
+
+    def _released(self, formula: ir.Until, now: Instants, within: Flags) -> Flags:
+        left, right = self._worth(formula.left), self._worth(formula.right)
+        both = np.minimum(left, self._since(right, now + formula.window.lo))
+        released: Flags = np.where(within, both, -np.inf).max(1) > np.where(within, right, np.inf).min(1)
+        return released
+
+    def _chosen(
+        self, formula: ir.Temporal | ir.Until, now: Instants, allowed: Flags, on: Flags
+    ) -> tuple[Instants, Flags]:
+        match formula:
+            case ir.Until("until", _, left, right):
+                worth = np.minimum(self._worth(right), self._since(self._worth(left), now))
+            case ir.Until(_, window, left, right):
+                worth = np.minimum(self._worth(left), self._since(self._worth(right), now + window.lo))
+            case _:
+                worth = self._worth(formula.body)
+        chosen: Instants = np.where(allowed, worth, -np.inf).argmax(1)
+        return chosen, on & allowed.any(1)
+
+    def _since(self, worth: NDArray[np.float64], first: Instants) -> NDArray[np.float64]:
+        """Least worth from the sample `first` to each sample, (trajectories, T + 1)."""
+        after = np.where(self._samples >= first[:, None], worth, np.inf)
+        least: NDArray[np.float64] = np.minimum.accumulate(after, axis=1)
+        return least
+
+    def _worth(self, formula: ir.Formula) -> NDArray[np.float64]:
+        """Least distance that decides a formula at each sample, (trajectories, T + 1); inf where unknown."""
+        found = self._worths.get(id(formula))
+        if found is None:
+            found = self._worths[id(formula)] = self._combined(formula)
+        return found
+
+    def _combined(self, formula: ir.Formula) -> NDArray[np.float64]:
+        whole = np.full_like(self._distance[:, 0], np.inf)
+        if self._scheduler.decidable(formula):
+            for part in self._scheduler.parts(formula):
+                if isinstance(part, ir.Truth):
+                    whole = whole if part.value else -whole
+                else:
+                    whole = np.minimum(whole, self._distance[:, self._scheduler.number(part)])
+            return whole
+        match formula:
+            case ir.BoolOp(op, items):
+                found: NDArray[np.float64] = np.stack([*map(self._worth, items)])
+                decided: NDArray[np.float64] = found.min(0) if op == "and" else found.max(0)
+                return decided
+            case ir.AtStart(body):
+                return np.broadcast_to(self._worth(body)[:, :1], whole.shape)
+            case ir.Temporal("always", window, body):
+                return -self._reached(np.full_like(whole, np.inf), -self._worth(body), window)
+            case ir.Temporal("eventually", window, body):
+                return self._reached(whole, self._worth(body), window)
+            case ir.Until("until", window, left, right):
+                return self._reached(self._worth(left), self._worth(right), window)
+            case ir.Until(_, window, left, right):
+                return -self._reached(-self._worth(left), -self._worth(right), window)
+            case _:
+                return whole
+
+    def _reached(
+        self, left: NDArray[np.float64], right: NDArray[np.float64], window: ir.Window
+    ) -> NDArray[np.float64]:
+        """Worth of `left until right` at each sample, (trajectories, T + 1)."""
+        found, kept = np.full_like(right, -np.inf), left.copy()
+        for k in range((self._last if window.hi is None else min(window.hi, self._last)) + 1):
+            end = self._last + 1 - k
+            kept[:, :end] = np.minimum(kept[:, :end], left[:, k:])
+            if k >= window.lo:
+                found[:, :end] = np.maximum(found[:, :end], np.minimum(kept[:, :end], right[:, k:]))
+        return found
 
 
 def tempo(needed: Flags, apart: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,6 +10,8 @@ import torch
 
 import stlc
 from stlc.compile.ir import nodes as ir
+from stlc.controller.search.planner import PlanBudget, plan
+from stlc.controller.search.schedules import GoalScheduler, tempo
 from stlc.controller.problem.task import Task
 from stlc.controller.search.newton import GaussNewton, _pulled_by_torch, state_gradient, values_of
 from stlc.controller.search.planner import PlanBudget, plan
@@ -91,47 +93,53 @@ def test_schedules_that_contradict_themselves_are_dropped() -> None:
     assert not len(scheduler.draw(50, np.random.default_rng(0)))
 
 
+def test_the_nearest_schedule_keeps_the_choices_that_a_trajectory_makes() -> None:
+    task = task_of("require goal: (eventually[0, 20 steps] at_a) and (always[30 steps, 32 steps] at_b)")
+    scheduler = scheduler_of(task)
+    distance = np.full((1, 2, 65), -2.0)
+    distance[0, 0, 17], distance[0, 0, 40] = -0.5, 1.0
+    needed = scheduler.nearest(distance)[0]
+    assert [row.nonzero()[0].tolist() for row in needed] == [[17], [30, 31, 32]]
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "at_a or eventually[0, 9 steps] at_b",
+        "at_b until[0, 9 steps] at_a",
+        "at_b release[0 steps, 9 steps] at_a",
+        "at_a or always[1 steps, 3 steps] (at_a until[0, 4 steps] at_b)",
+        "eventually[0, 9 steps] always[0, 2 steps] at_a",
+    ],
+)
+def test_a_trajectory_that_satisfies_a_formula_meets_its_nearest_schedule(formula: str) -> None:
+    task = task_of(f"require goal: {formula}")
+    scheduler = scheduler_of(task)
+    random = np.random.default_rng(0)
+    shape = 200, len(scheduler.conditions), 65
+    distance = random.choice([-1.0, 1.0], shape, p=[0.4, 0.6]) * random.random(shape)
+    needed = scheduler.nearest(distance)
+    meets = ~(needed & (distance < 0.0)).any((1, 2))
+    for each, met in zip(distance, meets, strict=True):
+        signals = {f"c{i}": row for i, row in enumerate(each)}
+        assert met == holds(task.rules[0].formula, scheduler, signals, 0)
+
+
+def test_a_schedule_may_ask_for_one_alternative_of_an_or_of_comparisons() -> None:
+    task = task_of("require goal: always[0, 20 steps] (x > 1 m or y > 2 m)")
+    scheduler = scheduler_of(task)
+    assert len(scheduler.conditions) == 3
+    drawn = scheduler.draw(64, np.random.default_rng(0))
+    assert drawn[:, 0, :21].all()
+    assert drawn[:, 1:].any((0, 2)).all()
+    assert not drawn[:, 1:, 21:].any()
+
+
 def test_the_tempo_is_the_greatest_speed_between_goals() -> None:
     needed = np.zeros((2, 2, 11), np.bool_)
     needed[0, 0, 2:4] = needed[0, 1, 5] = needed[1, 1, 10] = True
     apart = np.array([[0.0, 4.0, 1.0], [4.0, 0.0, 6.0], [1.0, 6.0, 0.0]])
     assert tempo(needed, apart).tolist() == [3.0, 0.1]
-
-
-@pytest.mark.parametrize("system", ["linear", "dubins"])
-def test_derivatives_of_states_equal_differences(system: str) -> None:
-    task = task_of("require goal: eventually at_a", system)
-    random = torch.Generator().manual_seed(0)
-    size, controls = len(task.system.names), len(task.system.control_names)
-    x0 = torch.zeros(3, size, dtype=torch.float64)
-    x0[:, 2:] = 0.5
-    plans = 0.1 * torch.randn(3, 64, controls, generator=random).double()
-    columns = torch.zeros(size, 65, 3, dtype=torch.float64)
-    columns[0, 40] = columns[1, 20] = 1.0
-    slopes = state_gradient(task.system)(x0, plans, columns)
-    assert torch.allclose(slopes, _pulled_by_torch(task.system, x0, plans, columns), atol=1e-9)
-    move = 1e-5 * torch.randn(3, 64, controls, generator=random).double()
-    ahead, back = (task.rollout(x0, plans + sign * move) for sign in (1.0, -1.0))
-    change = ((ahead - back) * columns.permute(2, 1, 0)).sum((1, 2)) / 2.0
-    assert torch.allclose(change, (slopes * move).sum((1, 2)), rtol=1e-3)
-
-
-def test_steps_reach_a_goal_and_projections_lie_in_it() -> None:
-    task = task_of("require goal: eventually[20 steps, 20 steps] at_a")
-    scheduler = scheduler_of(task)
-    x0 = torch.zeros(1, 2, dtype=torch.float64)
-    spread, pull = torch.full((2,), 5.0, dtype=torch.float64), state_gradient(task.system)
-    newton = GaussNewton(task, scheduler.conditions, spread, pull)
-    places, violated = newton.nearest(x0[0])
-    assert violated.tolist() == [True]
-    assert float(values_of(task, scheduler.conditions, places[None, :])[0, 0, 0]) > 0.0
-    needed = torch.from_numpy(scheduler.draw(1, np.random.default_rng(0)))
-    plans, missing = torch.zeros(1, 64, 2, dtype=torch.float64), []
-    for _ in range(6):
-        plans, short = newton.step(x0, plans, needed)
-        missing.append(float(short))
-    assert missing[-1] < 1e-3 < missing[0]
-    assert float(task.judge(x0, plans, states=False).rho) > 0.0
 
 
 def test_goals_in_an_order_are_reached() -> None:

@@ -1,15 +1,14 @@
-"""`search`: local search on exact robustness with restarts, and searches by the order of the goals.
+"""`search`: local search on exact robustness with restarts, and searches that look at the requirements.
 
-Local search runs in C if a compiler is installed. Where it finds no plan, and the mission needs several
-steps, two searches alternate with it that look at the requirements: for sequences of phases
-(`stlc.controller.search.sequences.sequences`), and by schedules of the goals (the planner `schedule`).
+Local search runs in C if a compiler is installed. Where it finds no plan, two other searches take turns with
+it: for sequences of phases, if the mission needs several steps (`stlc.controller.search.sequences.sequences`), and by
+schedules of the goals, towards which Gauss-Newton steps lead (the planner `schedule`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +16,8 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.methods.planners.schedule import SchedulePlanner, ScheduleRounds
+from stlc.controller.search.starts import extremes
+from stlc.controller.methods.planners.schedule import SchedulePlanner, Schedules
 from stlc.controller.options import bounded
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.sequences.sequences import Sequences
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 SEVERAL = 2
 """Least number of jumps, waits and goals of a mission for which their order is searched."""
-PHASES = 8
-"""Number of phases that are tried for each round of schedules."""
-DOUBLED = 5
-"""Number of rounds in which the searches by the order of the goals get twice as much as before."""
+SHARE = 2.0
+"""Processor time of the searches that look at the requirements, as a multiple of that of the local search."""
+LEAD = 0.02
+"""Processor time of the search for phases before schedules are searched for as long, in seconds."""
 RESTARTS = 4
 """Number of searches for sequences of phases from one state. Each ends when no prefix is left to extend; the
 next makes twice the effort for each phase."""
@@ -71,6 +71,7 @@ class SearchPlanner:
 
     def _run(self, search: PlanSearch, library: Tensor, orders: _Orders) -> None:
         begun: dict[int, Iterator[None]] = {}
+        spent = [0.0] * len(search.states)
         budget, tries, number = search.budget, self.tries, 0
         target = budget.target if budget.target else TOLERANCE
         searcher = Searcher(search.task, search.generator, enough=target)
@@ -93,12 +94,15 @@ class SearchPlanner:
                 for row in search.open().tolist():
                     if row not in begun:
                         begun[row] = orders.tries(search, torch.tensor([row]))
-                    for _ in islice(begun[row], 2 ** min(number - self.rounds, DOUBLED)):
-                        pass
+                    local = float(search.seconds[row]) - spent[row]
+                    for _ in begun[row]:
+                        if float(search.seconds[row]) >= (1.0 + SHARE) * local:
+                            break
+                    spent[row] = float(search.seconds[row]) - local
 
 
 class _Orders:
-    """Searches by the order of the goals of one task; they are built when they are first needed."""
+    """Searches that look at the requirements of one task; they are built when they are first needed."""
 
     def __init__(self, task: Task) -> None:
         self._task = task
@@ -108,31 +112,36 @@ class _Orders:
         return Sequences(self._task, self._task.sample(1, seed=0)[0].double())
 
     @cached_property
-    def _schedules(self) -> ScheduleRounds | None:
+    def _schedules(self) -> Schedules | None:
         try:
-            return ScheduleRounds(SchedulePlanner(first=1), self._task)
+            return Schedules(SchedulePlanner(first=1), self._task)
         except UsageError:
             return None
 
     def tries(self, search: PlanSearch, row: Tensor) -> Iterator[None]:
-        """Search for a plan from the initial state `row`, (1,), if several steps are needed from there.
+        """Search for a plan from the initial state `row`, (1,), by phases and by schedules.
 
-        An item is yielded after `PHASES` phases and one round of schedules.
+        An item is yielded after each phase that is tried, and each step towards schedules.
         """
-        searches: list[tuple[Iterator[None], int]] = []
+        searches: list[Iterator[None]] = []
         try:
             root = self._sequences.root(search.states[row][0])
         except TraceError:  # bounds on the robustness of a prefix need too many instants
             moves = True
         else:
-            if root is None or root.missing < SEVERAL:
-                return
-            searches.append((self._by_phases(search, row), PHASES))
-            moves = not root.steps
+            if root is not None and root.missing >= SEVERAL:
+                searches.append(self._by_phases(search, row))
+            moves = root is None or not root.steps
         if moves and self._schedules is not None:  # a schedule moves states, not modes
-            searches.append((self._schedules.of(search, row), 1))
-        while searches:
-            searches = [(each, share) for each, share in searches if sum(1 for _ in islice(each, share))]
+            searches.append(self._schedules.of(search, row))
+        spent = {each: LEAD * i for i, each in enumerate(searches)}
+        while spent:
+            least = min(spent, key=spent.__getitem__)
+            before = float(search.seconds[row])
+            if next(least, search) is search:
+                del spent[least]
+            else:
+                spent[least] += float(search.seconds[row]) - before
             yield
 
     def _by_phases(self, search: PlanSearch, row: Tensor) -> Iterator[None]:
