@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from stlc.controller.planning.policy import PlannerPolicy
 
 from benchmarks.deployments import recorded
 from benchmarks.measured import Measured, has_changed, measured, reason
@@ -29,6 +28,7 @@ from stlc.controller.evaluation.metrics import METRICS, measure
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
+from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PLANNING_VERSION, PlanBudget, planner_named

@@ -11,7 +11,6 @@ from time import process_time
 from typing import TypeAlias
 
 import torch
-from stlc.controller.search.ascent import SEED, GradientAscent
 from torch import Tensor
 
 from benchmarks.deployments import sampled_states
@@ -23,6 +22,7 @@ from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import Task
+from stlc.controller.search.ascent import SEED, GradientAscent
 from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.training.run import Run

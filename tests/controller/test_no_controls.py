@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from stlc.controller.planning.policy import PlannerPolicy
 
 import stlc
 from stlc.cli.framework.app import main
+from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import solve
 from stlc.controller.search.planner import PlanBudget, plan, planner_named

@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from stlc.controller.search.ascent import GradientAscent
 from torch import Tensor
 
 from stlc.controller.guard.candidates import REPAIRED, SOURCES, Limits
@@ -15,6 +14,7 @@ from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import Task
+from stlc.controller.search.ascent import GradientAscent
 from stlc.controller.search.feasibility import safety_task, viable
 from tests.controller.guard.test_prefix_shooting import F64, Constant, failing, grid
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from stlc.controller.search.ascent import APART, KEPT, GradientAscent
 from torch import Tensor
 
 from stlc.controller.guard.stages import gradient_refine as ascent
 from stlc.controller.problem.task import Task
+from stlc.controller.search.ascent import APART, KEPT, GradientAscent
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stlc
+from stlc.controller.problem.load import load_task
+from stlc.controller.problem.task import Task
 from stlc.controller.search.descent import Descent
 from stlc.controller.search.newton import GaussNewton, _riccati, values_of
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.schedules import GoalScheduler
-from stlc.controller.problem.load import load_task
-from stlc.controller.problem.task import Task
 from stlc.dynamics.model.system import System
 
 ROOT = Path(__file__).parents[3]

@@ -8,9 +8,9 @@ import pytest
 import torch
 from helpers import planner_laws as laws
 from helpers.planner_laws import line_task, planned
-from stlc.controller.planning.policy import PlannerPolicy
 
 import stlc
+from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.planning.traces import following, starts_of, trace_of
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, PlanSearch, plan, planner_named

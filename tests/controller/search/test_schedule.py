@@ -10,10 +10,7 @@ import torch
 
 import stlc
 from stlc.compile.ir import nodes as ir
-from stlc.controller.search.planner import PlanBudget, plan
-from stlc.controller.search.schedules import GoalScheduler, tempo
 from stlc.controller.problem.task import Task
-from stlc.controller.search.newton import GaussNewton, _pulled_by_torch, state_gradient, values_of
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.schedules import GoalScheduler, tempo
 from stlc.diagnostics import UsageError

@@ -20,10 +20,10 @@ from torch import Tensor
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.search.descent import Descent
-from stlc.controller.search.newton import GaussNewton, spread_of, values_of
-from stlc.controller.search.sequences.obligations import Obligations
-from stlc.controller.search.schedules import GoalScheduler, tempo
 from stlc.controller.search.local_search import Searcher
+from stlc.controller.search.newton import GaussNewton, spread_of, values_of
+from stlc.controller.search.schedules import GoalScheduler, tempo
+from stlc.controller.search.sequences.obligations import Obligations
 from stlc.diagnostics import Diagnostic, UsageError
 
 if TYPE_CHECKING:

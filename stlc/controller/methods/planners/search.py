@@ -1,7 +1,7 @@
 """`search`: local search on exact robustness with restarts, and searches that look at the requirements.
 
 Local search runs in C if a compiler is installed. Where it finds no plan, two other searches take turns with
-it: for sequences of phases, if the mission needs several steps (`stlc.controller.search.sequences.sequences`), and by
+it: for sequences of phases, if the mission needs several steps (`stlc.controller.search.sequences`), and by
 schedules of the goals, towards which Gauss-Newton steps lead (the planner `schedule`).
 """
 
@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.search.starts import extremes
 from stlc.controller.methods.planners.schedule import SchedulePlanner, Schedules
 from stlc.controller.options import bounded
 from stlc.controller.search.local_search import Searcher
