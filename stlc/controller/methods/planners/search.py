@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 SEVERAL = 2
 """Least number of jumps, waits and goals of a mission for which their order is searched."""
 SHARE = 2.0
-"""Processor time of the searches that look at the requirements, as a multiple of that of the local search."""
+"""Processor time of the searches that look at the requirements, as a multiple of that of the local search. It
+grows up to this with the time of the local search."""
+EQUAL = 0.05
+"""Processor time of the local search at which the others have had as much, in seconds."""
 LEAD = 0.02
 """Processor time of the search for phases before schedules are searched for as long, in seconds."""
 RESTARTS = 4
@@ -95,7 +98,7 @@ class SearchPlanner:
                         begun[row] = orders.tries(search, torch.tensor([row]))
                     local = float(search.seconds[row]) - spent[row]
                     for _ in begun[row]:
-                        if float(search.seconds[row]) >= (1.0 + SHARE) * local:
+                        if float(search.seconds[row]) >= (1.0 + min(SHARE, local / EQUAL)) * local:
                             break
                     spent[row] = float(search.seconds[row]) - local
 
