@@ -8,7 +8,8 @@ that count from the state at hand: 5 s into the mission, `p until[0 s, 20 s] q`.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeGuard
 
@@ -20,7 +21,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined, normal
 from stlc.compile.ir.support import columns
-from stlc.compile.ir.traverse import nodes
+from stlc.compile.ir.traverse import map_children, nodes
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.tolerance import satisfied
@@ -28,6 +29,7 @@ from stlc.compile.semantics.tolerance import satisfied
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import NDArray
     from torch import Tensor
 
     from stlc.controller.problem.task import Task
@@ -36,8 +38,9 @@ if TYPE_CHECKING:
 class Obligations:
     """The obligations of plans of one task.
 
-    What began before the state at hand is left out: of `eventually@[0 s, 9 s] always[0 s, 3 s] p`, the first
-    second of p that has passed already. So a plan may miss an obligation and satisfy the requirement.
+    Answers that are due for what happened before the state at hand are obligations of their own. Anything
+    else that began before is left out: of `eventually@[0 s, 9 s] always[0 s, 3 s] p`, the first second of p
+    that has passed already. So a plan may miss an obligation and satisfy the requirement.
     """
 
     def __init__(self, task: Task) -> None:
@@ -53,6 +56,13 @@ class Obligations:
             for part in _progressed(written, rule.lowered)
         ]
         self._known = lru_cache(maxsize=64)(self._formulas)
+        own = frozenset(self._names) - {timer.name for timer in task.compiled.timers}
+        self._responses = [
+            response
+            for written, rule in zip(self._written, absolute, strict=True)
+            for part, form in zip(_absolute(written), _progressed(written, rule.lowered), strict=True)
+            for response in _responses(part, form, own)
+        ]
 
     @property
     def first(self) -> tuple[ir.Formula, ...]:
@@ -67,7 +77,37 @@ class Obligations:
         env = {name: np.array([[float(value)]]) for name, value in zip(self._names, state, strict=True)}
         bounds = evaluate(self._progressed, env, ops=NUMPY, end="lower", stop=self._horizon + 1)
         met = tuple(bool(satisfied(np.broadcast_to(bound[0], 1))[0]) for bound in bounds)
-        return self._known(clock, met)
+        pending = (self._pending(response, env, clock) for response in self._responses)
+        return (*self._known(clock, met), *(each for each in pending if each is not None))
+
+    def _pending(
+        self, response: _Response, env: Mapping[str, NDArray[np.float64]], clock: int
+    ) -> ir.Formula | None:
+        """Return the answer that is due for what happened up to the state `env`; None if there is none.
+
+        The latest sample at which it may come is looked up: the requirement is judged on plans on which
+        nothing is asked for any more, and which answer at one sample after another, or never.
+        """
+        samples = np.arange(self._horizon + 1.0)[:, None]
+
+        def good(answers: NDArray[np.float64]) -> NDArray[np.bool_]:
+            shape = len(samples), len(answers)
+            whole = {name: np.broadcast_to(value, shape) for name, value in env.items()}
+            if self._clock is not None:
+                whole[self._clock] = np.broadcast_to(clock + samples, shape)
+            for name, part in response.parts.items():
+                now = evaluate([ir.Predicate(part.num)], env, ops=NUMPY)[0]
+                later = np.where(samples < answers, -part.value, part.value) if part.answers else part.value
+                whole[name] = np.where(samples == 0.0, now, later)
+            judged = evaluate([response.form], whole, ops=NUMPY, end="truncate")[0]
+            return np.broadcast_to(satisfied(judged[0]), len(answers)).astype(np.bool_)
+
+        if good(np.array([np.inf]))[0]:
+            return None
+        last = good(np.arange(1.0, response.latest + 1.0)).nonzero()[0]
+        if not len(last) or last[-1] + 1 == response.latest:  # asked for at this sample
+            return None
+        return ir.Temporal("eventually", ir.Window(0, int(last[-1]) + 1), response.answer)
 
     def within(self, formula: ir.Formula) -> ir.Formula:
         """Return a state formula without alternatives that hold at no sample of the mission.
@@ -113,6 +153,67 @@ class Obligations:
                 return ir.Temporal("always", ir.Window(0, None), formula.left)
             return ir.Truth(True)
         return replace(formula, window=ir.Window(lo, last))
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A number of a requirement that a signal stands for.
+
+    Attributes:
+        num: the number.
+        value: value of the signal with which the predicate on the number holds.
+        answers: whether the predicate is a part of the answer.
+    """
+
+    num: ir.Num
+    value: float
+    answers: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Response:
+    """A requirement such as `always@[a, b] (p -> eventually[c, d] q)`.
+
+    Attributes:
+        answer: what is due, q.
+        latest: number of samples after which it is due, d.
+        form: the requirement on plans, with a signal for the number in each predicate.
+        parts: the numbers, by the names of these signals.
+    """
+
+    answer: ir.Formula
+    latest: int
+    form: ir.Formula
+    parts: Mapping[str, _Part]
+
+
+def _responses(written: ir.Formula, form: ir.Formula, own: frozenset[str]) -> Iterator[_Response]:
+    """Yield the responses that an absolute formula asks for; `form`: its form for plans."""
+    formula = written.body if isinstance(written, ir.AtStart) else written
+    if not (isinstance(formula, ir.Temporal) and formula.op == "always"):
+        return
+    asked = [node for node in nodes(formula) if isinstance(node, ir.Predicate) and columns(node) & own]
+    names = {node.num: f"#{i}" for i, node in enumerate(asked)}
+
+    def named(node: ir.Formula) -> ir.Formula:
+        if isinstance(node, ir.Predicate) and node.num in names:
+            return replace(node, num=ir.Signal(names[node.num]))
+        return map_children(node, formulas=named)
+
+    for goal in nodes(formula.body):
+        if isinstance(goal, ir.Temporal) and goal.op == "eventually" and goal.window.hi:
+            inside = {node.num for node in nodes(goal.body) if isinstance(node, ir.Predicate)}
+            order = sorted(asked, key=lambda node: node.num in inside)
+            parts = {names[node.num]: _Part(node.num, float(node.sign), node.num in inside) for node in order}
+            yield _Response(goal.body, goal.window.hi, named(form), parts)
+
+
+def _absolute(written: ir.Formula) -> Iterator[ir.Formula]:
+    """Yield the absolute formulas that a requirement joins by `and` and `or`."""
+    for item in written.items if _is_branch(written) else ():
+        yield from _absolute(item)
+    if not _is_branch(written):
+        yield written
 
 
 def _progressed(written: ir.Formula, progressed: ir.Formula) -> Iterator[ir.Formula]:

@@ -93,3 +93,28 @@ def test_goals_in_an_order_are_reached_in_either_form() -> None:
         task = task_of(text.format(f"(not {near[0]})", window, near[1], window, near[0]))
         found = plan(task, task.sample(2, seed=3), "schedule", budget=PlanBudget(10.0, 4_000))
         assert bool(found.satisfied.all()), window
+
+
+@pytest.mark.parametrize(("first", "last", "late"), [(0, 9, 6), (2, 8, 4)])
+def test_answers_that_are_due_for_earlier_questions_are_obligations(first: int, last: int, late: int) -> None:
+    task = task_of(
+        f"require goal: always@[{first} steps, {last} steps] (y > 0 m -> eventually[0, {late} steps] x > 0 m)"
+    )
+    x0 = task.sample(60, seed=1).double()
+    low, high = task.system.control_low.double(), task.system.control_high.double()
+    random = torch.Generator().manual_seed(2)
+    level = torch.rand(60, 4, len(low), generator=random).double().repeat_interleave(5, 1)
+    states = task.rollout(x0, low + (high - low) * level)
+    x, y = (states[..., task.system.names.index(name)].numpy() for name in "xy")
+    dues = set[bool]()
+    for row, now in ((row, now) for row in range(60) for now in (3, 7, 11)):
+        asked = [k for k in range(first, last + 1) if y[row, k] > 0.0]
+        answered = [(x[row, k : k + late + 1] > 0.0).any() for k in asked]
+        if any(k + late <= now and not good for k, good in zip(asked, answered, strict=True)):
+            continue  # lost already
+        obligations = Obligations(task).at(states[row, now])
+        env = {name: states[row, now:, i : i + 1].numpy() for i, name in enumerate(task.system.names)}
+        values = evaluate(obligations, env, ops=NUMPY, end="truncate") if obligations else []
+        assert all(float(np.ravel(each)[0]) >= 0.0 for each in values) == all(answered)
+        dues.add(any(show_formula(each).startswith("eventually") for each in obligations))
+    assert dues == {True, False}
