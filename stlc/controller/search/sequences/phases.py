@@ -1,20 +1,25 @@
 """Phases: short plans that reach a target while all safety requirements hold.
 
-A phase is found by the local search of the native kernel, on the robustness of `safe until[0, L] target`. One
-kernel serves all targets of a task. Further states, constant along a phase, say which target is asked for and
-at which samples it counts.
+A phase is found by its switches: plans that keep one level of the controls after another. From the best of
+them, Gauss-Newton steps meet the target at each of several samples, and the earliest that does is kept; where
+they fail, the local search of the native kernel goes on. The kernel computes the robustness of
+`safe until[0, L] (target and safe for a while)`. It serves all targets of a task. Further states, constant
+along a phase, say which target is asked for and at which samples it counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import product
+from itertools import chain, islice, product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.c.emit import LANES, emit
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
@@ -37,20 +42,50 @@ TARGET, FIRST, LAST = "#target", "#first", "#last"
 OPEN, WEIGHT = "#open{}", "#weight{}"
 WEIGHTS = 4
 """Number of groups of predicates whose shortfalls are weighed differently in different plans."""
-GENERATIONS = 16
+GENERATIONS = 8
 """Generations of a local search in a round of the search for a phase."""
 CLIMBED = 5
 """Number of plans that it improves."""
+STEERED = 3
+"""Number of plans that Gauss-Newton steps improve."""
+NEWTON = 6
+"""Largest number of these steps."""
+SAMPLES = 12
+"""Largest number of samples at which each of them tries to meet the target."""
+BLOCKS = 24
+"""Largest number of parts of a phase in each of which a step changes a control by one amount."""
+PASSES = 4
+"""Number of times that each step is computed, to keep within bounds and what has been met."""
+SHARES = 1.0, 0.5
+"""Parts of a step that are tried."""
+PROBE = 1e-5
+"""Difference of a control for derivatives, as a share of its range."""
+DAMPING = 1e-6
+"""Damping of the least-squares problem, relative to the mean of its diagonal."""
+SWITCHES = 20
+"""Largest number of samples at which a plan may switch to another level."""
+SHORT = 3
+"""Number of samples of a phase that is not made shorter."""
+GROWTH = 1.5
+"""Exponent by which the parts of a phase in which its plan may change grow with the time."""
 KEPT = 3
-"""Number of plans that are kept from a round to the next."""
+"""Number of plans that are kept from a round to the next, and of those remembered for each target."""
 MOST_HELD = 81
 """Largest number of constant plans that the search for a phase may switch to."""
-ROUNDS = 4
-"""Rounds of the search for a phase: all plans with one more switch, then a local search from the best."""
+ROUNDS = 2, 4
+"""Least and greatest number of rounds of the search for a phase: all plans with one more switch, Gauss-Newton
+steps, and a local search."""
+TAIL = 6
+"""The part of a phase's length for which it stays safe after the target: one of so many."""
 SPREAD = 1.5
 """Standard deviation of the logarithm of the weights of shortfalls."""
 SPARE = 1e-6
 """Margin that a strict predicate shall have."""
+UNSURE = 1e-3
+"""Shortfall of a target that is reached in a state in which safety is not known to last."""
+TINY = 1e-9
+OPTIONS = 4
+"""Largest number of alternatives of a target for which Gauss-Newton steps are made."""
 SHORTER = 0.7, 0.85
 """Shares of its length in which a phase that was found is tried again, until it fails in each."""
 
@@ -64,12 +99,14 @@ class Ask:
         first: first sample at which the target counts.
         last: last sample at which the target counts.
         open: indices of the `until`s whose left side must hold.
+        after: number of samples after the target that belong to the phase.
     """
 
     target: int
     first: int
     last: int
     open: frozenset[int] = frozenset()
+    after: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,19 +131,30 @@ class Phases:
 
     Args:
         kernel: the compiled code.
-        system: system of the task.
+        task: specification and system.
         steps: number of steps of a phase, L.
         untils: number of `until`s of which a request names the open ones.
+        targets: the targets.
     """
 
-    def __init__(self, kernel: Kernel, system: System, steps: int, untils: int) -> None:
+    def __init__(
+        self, kernel: Kernel, system: System, steps: int, untils: int, targets: Sequence[ir.Formula]
+    ) -> None:
         self._kernel, self.steps, self._untils = kernel, steps, untils
+        self._names = system.names
         low, high = (end.double().numpy() for end in (system.control_low, system.control_high))
         turns = np.array([float(control.squash == "angle") for control in system.decl.controls])
         self._bounds = np.stack((low, high, turns))
         self._middle = 0.5 * (low + high)
         held = levels(low, self._middle, high, most=MOST_HELD)
         self._bank = np.repeat(held[:, None], steps, 1)
+        self._switches = _begins(steps, SWITCHES)
+        self._known = [deque["Numbers"](maxlen=KEPT) for _ in targets]
+        names = frozenset(system.names)
+        self._demands = [[each for each in _demands(target, names) if each] for target in targets]
+        number = np.searchsorted(_begins(steps, BLOCKS), np.arange(steps), side="right")
+        blocks = number == np.unique(number)[:, None]
+        self._moves = (blocks[:, None, :, None] * np.eye(len(low))[:, None]).reshape(-1, steps, len(low))
         self.tried = 0
 
     @classmethod
@@ -115,7 +163,6 @@ class Phases:
         system: System,
         safe: ir.Formula,
         targets: Sequence[ir.Formula],
-        late: Collection[int],
         untils: Sequence[ir.Formula],
         steps: int,
         scale: Callable[[ir.Formula], float],
@@ -126,7 +173,6 @@ class Phases:
             system: system of the task.
             safe: formula that holds at every sample of a phase.
             targets: formulas, one of which a request asks for; they look less than `steps` samples ahead.
-            late: indices of the targets after which one more sample must be safe.
             untils: formulas that hold at every sample of a phase while they are open.
             steps: number of steps of a phase.
             scale: function that returns the typical size of the margin of a predicate.
@@ -141,20 +187,22 @@ class Phases:
         shortfall = _Shortfall(scale)
         held = _decisive(joined("and", (safe, *kept), ir.Truth(True)))
         chosen = (
-            joined(
-                "and",
-                (
-                    _equal(ir.Signal(TARGET), float(i)),
-                    shortfall.of(target),
-                    *[ir.Temporal("always", ir.Window(1, 1), held)] * (i in late),
-                ),
-                ir.Truth(True),
-            )
+            ir.BoolOp("and", (_equal(ir.Signal(TARGET), float(i)), shortfall.of(target)))
             for i, target in enumerate(targets)
         )
         now = ir.Signal(ir.ELAPSED)
         times = _at_least(now, ir.Signal(FIRST)), _at_least(ir.Signal(LAST), now)
-        reached = ir.BoolOp("and", (*times, joined("or", chosen, ir.Truth(False))))
+        tail = (
+            ir.Temporal("always", ir.Window(1, 1), held),
+            ir.BoolOp(
+                "or",
+                (
+                    ir.Temporal("always", ir.Window(1, max(1, steps // TAIL)), held),
+                    ir.Predicate(ir.Const(-UNSURE)),
+                ),
+            ),
+        )
+        reached = ir.BoolOp("and", (*times, joined("or", chosen, ir.Truth(False)), *tail))
         formula = simplify(ir.Until("until", ir.Window(0, steps), held, reached))
         try:
             library = load(emit(motion, [formula], "truncate"))
@@ -163,7 +211,7 @@ class Phases:
         if library is None:
             return None
         sizes = Sizes(len(motion.states), len(motion.controls), steps, 1)
-        return cls(Kernel(library, sizes), system, steps, len(untils))
+        return cls(Kernel(library, sizes), system, steps, len(untils), targets)
 
     def reach(self, state: Numbers, ask: Ask, random: Generator, effort: int = 1) -> Phase:
         """Search for a phase from `state`, (n,), and make it shorter if it is found.
@@ -171,57 +219,214 @@ class Phases:
         `effort` is a factor of the generations of local searches.
         """
         row = self._row(state, ask)
-        plans = np.broadcast_to(self._middle, (1, *self._bank[0].shape))
-        for _ in range(ROUNDS):
-            plans, rho = self._improved(row, plans, random, effort)
+        plans = np.stack((np.broadcast_to(self._middle, self._bank[0].shape), *self._known[ask.target]))
+        rho = self._judged(np.repeat(row, len(plans), 0), plans)
+        for _ in range(min(ROUNDS[0] + effort - 1, ROUNDS[1])):
+            if rho.max() < 0.0:
+                plans, rho = self._improved(row, ask, plans, random, effort)
             found = (
                 max((self._phase(row, plan) for plan in plans), key=lambda phase: phase.margin)
                 if rho.max() < 0
                 else self._phase(row, plans[int(rho.argmax())])
             )
-            if found.margin >= 0.0:
+            if found.margin >= -UNSURE:
                 break
-            plans = plans[(-rho).argsort()[:KEPT]]
-        shares = iter(SHORTER)
-        share = next(shares)
-        while found.margin >= 0.0 and found.sample > ask.first + 1:
-            row = self._row(state, replace(ask, last=max(ask.first, int(share * found.sample))))
-            plans, rho = self._improved(row, found.plan[None], random, effort)
-            better = self._phase(row, plans[int(rho.argmax())])
-            if better.margin >= 0.0:
-                found = better
-            elif (share := next(shares, 0.0)) == 0.0:
-                break
+            plans = plans[(-rho).argsort(kind="stable")[:KEPT]]
+        if found.margin < -UNSURE:
+            plans, rho = self._steered(
+                row, ask, np.broadcast_to(self._middle, (1, *self._bank[0].shape)), NEWTON
+            )
+            found = max(found, self._phase(row, plans[0]), key=lambda phase: phase.margin)
+        shares = deque(SHORTER)
+        while shares and found.margin >= 0.0 and found.sample > ask.first + SHORT:
+            shorter = replace(ask, last=max(ask.first, int(shares[0] * found.sample)))
+            row = self._row(state, shorter)
+            plans, rho = self._switched(row, shorter, found.plan[None], random)
+            if rho.max() < 0.0:
+                plans, rho = self._steered(row, shorter, plans[(-rho).argsort(kind="stable")[:2]], 2)
+            if rho.max() < 0.0:
+                shares.popleft()
+            else:
+                found = self._phase(row, plans[int(rho.argmax())])
+        if found.margin >= -UNSURE:
+            found = self._calm(state, ask, found)
+            self._known[ask.target].append(found.plan)
         return found
 
-    def _improved(
-        self, row: Numbers, plans: Numbers, random: Generator, effort: int
-    ) -> tuple[Numbers, Numbers]:
-        """Improve plans, (k, L, m), and return those that result, with their robustness.
+    def _calm(self, state: Numbers, ask: Ask, found: Phase) -> Phase:
+        """Return a phase without the controls that it does not need: they keep the middle of their ranges."""
+        row, plan = self._row(state, replace(ask, last=found.sample)), found.plan
+        for control, middle in enumerate(self._middle):
+            calmer = np.where(np.arange(len(self._middle)) == control, middle, plan)
+            if self._judged(row, calmer[None])[0] >= found.margin:
+                plan = calmer
+        return found if plan is found.plan else self._phase(row, plan)
 
-        First, all plans are judged that follow one of the given plans up to some step, and keep one level
-        from there. If none reaches the target, the best for each level is improved by local search.
-        """
-        steps, levels = self.steps, len(self._bank)
-        before = np.arange(steps) < np.arange(steps)[:, None]
-        switched = np.where(before[None, None, :, :, None], plans[:, None, None], self._bank[:, None])
-        whole = switched.swapaxes(0, 1).reshape(levels, -1, *plans.shape[1:])
-        rows, own = np.repeat(row, levels, 0), row.shape[1] - self._untils - WEIGHTS
-        rows[1:, own : own + WEIGHTS] = np.exp(SPREAD * random.standard_normal((levels - 1, WEIGHTS)))
-        rho, _ = self._kernel.judge(np.repeat(rows, whole.shape[1], 0), whole.reshape(-1, *plans.shape[1:]))
-        rho = np.nan_to_num(rho[:, 0], nan=-np.inf).reshape(levels, -1)
-        best = whole[np.arange(levels), rho.argmax(1)]
-        self.tried += rho.size
+    def _improved(
+        self, row: Numbers, ask: Ask, plans: Numbers, random: Generator, effort: int
+    ) -> tuple[Numbers, Numbers]:
+        """Improve plans, (k, L, m), and return those that result, with their robustness."""
+        best, rho = self._switched(row, ask, plans, random)
         if rho.max() >= 0.0:
-            return best, rho.max(1)
-        kept = (-rho.max(1)).argsort()[:CLIMBED]
-        best, rows = best[kept], rows[kept]
+            return best, rho
+        kept = (-rho).argsort(kind="stable")[:CLIMBED]
+        steered, found = self._steered(row, ask, best[kept[:STEERED]], NEWTON)
+        if found.max() >= 0.0:
+            return steered, found
+        best[kept[:STEERED]] = steered
+        rows = np.repeat(row, len(kept), 0)
+        own = len(self._names) + 3
+        rows[1:, own : own + WEIGHTS] = np.exp(SPREAD * random.standard_normal((len(kept) - 1, WEIGHTS)))
         options = SearchOptions(
             self._bounds, np.ones(1), self._bank, effort * GENERATIONS, 0.0, int(random.integers(2**62))
         )
-        self.tried += len(best) * effort * GENERATIONS * LANES
-        best, rho = self._kernel.climb(rows, best, options)
+        self.tried += len(kept) * effort * GENERATIONS * LANES
+        best, rho = self._kernel.climb(rows, best[kept], options)
         return best, np.nan_to_num(rho, nan=-np.inf)
+
+    def _switched(self, row: Numbers, ask: Ask, plans: Numbers, random: Generator) -> tuple[Numbers, Numbers]:
+        """Return plans that follow one of `plans`, (k, L, m), up to some sample and keep a level from there.
+
+        Those are the best for each level or, if some reach the target, one of those that do so first.
+        """
+        steps, levels = self.steps, len(self._bank)
+        before = np.arange(steps) < self._switches[:, None]
+        switched = np.where(before[None, None, :, :, None], plans[:, None, None], self._bank[:, None])
+        whole = switched.swapaxes(0, 1).reshape(levels, -1, *plans.shape[1:])
+        rows, own = np.repeat(row, levels, 0), len(self._names) + 3
+        rows[1:, own : own + WEIGHTS] = np.exp(SPREAD * random.standard_normal((levels - 1, WEIGHTS)))
+        rho = self._judged(np.repeat(rows, whole.shape[1], 0), whole.reshape(-1, *plans.shape[1:]))
+        if rho.max() >= 0.0:
+            return self._first(row, ask, whole.reshape(-1, *plans.shape[1:])[rho >= 0.0]), np.zeros(1)
+        rho = rho.reshape(levels, -1)
+        return whole[np.arange(levels), rho.argmax(1)], rho.max(1)
+
+    def _first(self, row: Numbers, ask: Ask, plans: Numbers) -> Numbers:
+        """Return one of `plans`, (k, L, m), that reaches the target first, (1, L, m); all reach it."""
+        low, high = ask.first - 1, ask.last
+        while high - low > 1 and len(plans) > 1:
+            last = (low + high) // 2
+            shorter = np.repeat(self._row(row[0, : len(self._names)], replace(ask, last=last)), len(plans), 0)
+            if (good := self._judged(shorter, plans) >= 0.0).any():
+                plans, high = plans[good], last
+            else:
+                low = last
+        return plans[:1]
+
+    def _judged(self, rows: Numbers, plans: Numbers) -> Numbers:
+        self.tried += len(plans)
+        rho, _ = self._kernel.judge(rows, plans)
+        return np.nan_to_num(rho[:, 0], nan=-np.inf)
+
+    def _steered(self, row: Numbers, ask: Ask, plans: Numbers, most: int) -> tuple[Numbers, Numbers]:
+        """Change plans, (k, L, m), by Gauss-Newton steps that meet the target at one of several samples.
+
+        Derivatives are differences. Of each plan and those that result from it, the best is kept.
+        """
+        rho = self._judged(np.repeat(row, len(plans), 0), plans)
+        for _ in range(most):
+            tried = self._steps(row, ask, plans)
+            if not tried.shape[1]:
+                break
+            found = self._judged(
+                np.repeat(row, tried.shape[0] * tried.shape[1], 0), tried.reshape(-1, *plans.shape[1:])
+            )
+            if found.max() >= 0.0:
+                return self._first(row, ask, tried.reshape(-1, *plans.shape[1:])[found >= 0.0]), np.zeros(1)
+            found = found.reshape(tried.shape[:2])
+            best = found.argmax(1)
+            value = found[np.arange(len(plans)), best]
+            better = value > rho
+            plans = np.where(better[:, None, None], tried[np.arange(len(plans)), best], plans)
+            rho = np.maximum(value, rho)
+            if rho.max() >= 0.0 or not better.any():
+                break
+        return plans, rho
+
+    def _steps(self, row: Numbers, ask: Ask, plans: Numbers) -> Numbers:
+        """Return changed copies of plans, (k, L, m), as (k, tries, L, m); none without demands."""
+        count, moves = len(plans), len(self._moves)
+        span = self._bounds[1] - self._bounds[0]
+        inward = np.where(plans > self._middle, -1.0, 1.0)
+        moved = np.concatenate(
+            (plans[:, None], plans[:, None] + (PROBE * span) * inward[:, None] * self._moves), 1
+        )
+        self.tried += count * (moves + 1)
+        _, columns = self._kernel.judge(
+            np.repeat(row, count * (moves + 1), 0), moved.reshape(-1, *plans.shape[1:]), columns=True
+        )
+        assert columns is not None
+        env = dict(zip(self._names, columns, strict=False)) | {
+            ir.ELAPSED: np.broadcast_to(np.arange(self.steps + 1.0)[:, None], columns.shape[1:])
+        }
+        options = self._demands[ask.target]
+        literals = tuple(dict.fromkeys(each.literal for option in options for each in option))
+        if not literals:
+            return np.empty((count, 0, *plans.shape[1:]))
+        flat = {name: column.reshape(1, -1) for name, column in env.items()}
+        values = np.stack(
+            [
+                np.broadcast_to(each[0], (self.steps + 1) * count * (moves + 1))
+                for each in evaluate(literals, flat, ops=NUMPY)
+            ]
+        )
+        values = values.reshape(len(literals), self.steps + 1, count, moves + 1)
+        index = {literal: i for i, literal in enumerate(literals)}
+        whens = np.unique(np.linspace(ask.first, ask.last, SAMPLES).round().astype(np.int64))
+        now = values[..., 0]
+        slopes = (values[..., 1:] - now[..., None]) / PROBE  # per share of the range, inward
+        tried: list[Numbers] = []
+        for option in options:
+            numbers = [index[each.literal] for each in option]
+            at = np.minimum(whens[:, None] + [each.later for each in option], self.steps)
+            spare = np.array([each.spare for each in option])
+            missing = spare[:, None] - now[numbers, at]  # (whens, demands, k)
+            tried.append(
+                self._solved(
+                    plans, inward, missing.transpose(2, 0, 1), slopes[numbers, at].transpose(2, 0, 1, 3)
+                )
+            )
+        return np.concatenate(tried, 1)
+
+    def _solved(self, plans: Numbers, inward: Numbers, missing: Numbers, slopes: Numbers) -> Numbers:
+        """Return plans after the least changes by which linearised values grow by what is missing.
+
+        Args:
+            plans: plans, (k, L, m).
+            inward: signs of the changes of the controls, (k, L, m).
+            missing: what the values lack, (k, samples, demands).
+            slopes: derivatives by the changes, (k, samples, demands, moves).
+        """
+        slopes = np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
+        missing = np.nan_to_num(missing, nan=0.0, posinf=0.0, neginf=0.0)
+        size = np.sqrt((slopes**2).sum(-1)).max((0, 1)) + TINY
+        slopes, missing = slopes / size[:, None], missing / size
+        active = missing > 0.0
+        one = np.eye(missing.shape[-1])
+        low, high, span = self._bounds[0], self._bounds[1], self._bounds[1] - self._bounds[0]
+        touched = self._moves != 0.0
+        signed = self._moves * inward[:, None]
+        room_up = np.where(signed > 0, (high - plans[:, None]) / span, (plans[:, None] - low) / span)
+        room_down = np.where(signed > 0, (plans[:, None] - low) / span, (high - plans[:, None]) / span)
+        up = np.where(touched, room_up, np.inf).min((2, 3))[:, None]
+        down = -np.where(touched, room_down, np.inf).min((2, 3))[:, None]
+        free = np.ones(slopes.shape[:2] + slopes.shape[3:])
+        fixed = np.zeros_like(free)
+        for _ in range(PASSES):
+            own = slopes * active[..., None] * free[..., None, :]
+            normal = own @ own.swapaxes(-1, -2)
+            level = DAMPING * np.trace(normal, axis1=-2, axis2=-1)[..., None, None] + TINY
+            rest = (missing - (slopes @ fixed[..., None])[..., 0]) * active
+            weights = np.linalg.solve(normal + level * one, rest[..., None])
+            change = (own.swapaxes(-1, -2) @ weights)[..., 0] + fixed
+            inside = np.clip(change, down, up)
+            free = free * (inside == change)
+            fixed = np.where(free > 0.0, 0.0, inside)
+            active |= (slopes @ inside[..., None])[..., 0] < missing
+        change = np.einsum("ksj,kjlm->kslm", inside, signed) * span
+        tried = np.concatenate([plans[:, None] + share * change for share in SHARES], 1)
+        bounded: Numbers = np.clip(tried, low, high)
+        return bounded
 
     def margin(self, state: Numbers, ask: Ask) -> float:
         """Robustness of the target of a request in `state`, (n,), itself."""
@@ -235,7 +440,7 @@ class Phases:
 
     def _phase(self, row: Numbers, plan: Numbers) -> Phase:
         """Return the phase of a plan, up to the first sample at which it reaches the target."""
-        ends, own = np.repeat(row, self.steps + 1, 0), row.shape[1] - self._untils - 3 - WEIGHTS
+        ends, own = np.repeat(row, self.steps + 1, 0), len(self._names)
         ends[:, own + 2] = np.minimum(np.arange(self.steps + 1), row[0, own + 2])
         rho, columns = self._kernel.judge(ends, np.repeat(plan[None], self.steps + 1, 0), columns=True)
         assert columns is not None
@@ -244,6 +449,48 @@ class Phases:
         sample = int(good[0]) if len(good) else int(np.nan_to_num(margins, nan=-np.inf).argmax())
         margin = 0.0 if len(good) else float(margins[sample])
         return Phase(plan, columns[:own, :, 0].T, sample, margin)
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """Predicate that must hold some samples after a target is reached.
+
+    Attributes:
+        literal: the predicate.
+        later: number of samples.
+        spare: margin to aim at.
+    """
+
+    literal: ir.Predicate
+    later: int
+    spare: float
+
+
+def _demands(formula: ir.Formula, known: frozenset[str], later: int = 0) -> list[tuple[Demand, ...]]:
+    """Return alternatives of what a target demands, conjunctions; what cannot be said is left out.
+
+    Of an `always`, the first, the middle and the last sample count.
+    """
+    match formula:
+        case ir.Predicate() if columns(formula) <= known:
+            return [(Demand(formula, later, SPARE),)]
+        case ir.BoolOp("or", items):
+            return [each for item in items for each in _demands(item, known, later)][:OPTIONS]
+        case ir.BoolOp("and", items):
+            parts = [_demands(item, known, later) for item in items]
+            return [tuple(chain(*each)) for each in islice(product(*parts), OPTIONS)]
+        case ir.Temporal("always", ir.Window(lo, int(hi)), body):
+            whens = dict.fromkeys((lo, (lo + hi) // 2, hi))
+            each = zip(*(_demands(body, known, later + when) for when in whens), strict=True)
+            return [tuple(chain(*part)) for part in each]
+        case _:
+            return [()]
+
+
+def _begins(steps: int, most: int) -> NDArray[np.int64]:
+    """First samples of at most `most` parts of a phase, the later the longer."""
+    shares: NDArray[np.float64] = np.arange(most) / most
+    return np.unique((steps * shares**GROWTH).astype(np.int64))
 
 
 def levels(*ends: Numbers, most: int) -> Numbers:

@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice, product
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -29,6 +30,7 @@ from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.search.sequences.phases import levels
+from stlc.controller.search.sequences.residuals import looks_ahead
 from stlc.dynamics.model.algebra import names_in, substitute
 
 if TYPE_CHECKING:
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
 MOTION = 0.2
 """Cost of a motion in steps: less than that of a jump, so that jumps decide."""
+LONGEST = 16
+"""Largest number of samples for which a motion is asked to keep a timer running."""
 MOST_LEVELS = 64
 """Largest number of combinations of extreme controls under which the direction of a state is looked up."""
 PROBE = 1e-4
@@ -67,24 +71,51 @@ class Step:
     jump: JumpDecl | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """All of some parts, or one of them.
+
+    Attributes:
+        op: "and" or "or".
+        parts: each the index of a literal, a number of steps, or a choice.
+    """
+
+    op: Literal["and", "or"]
+    parts: list[Tree]
+
+
+Tree: TypeAlias = "int | float | Choice"
+
+
+def _sum(tree: Tree, costs: Sequence[float]) -> float:
+    """Number of steps that a tree needs, given those of the literals."""
+    if isinstance(tree, Choice):
+        each = [_sum(part, costs) for part in tree.parts]
+        return sum(each) if tree.op == "and" else min(each)
+    return costs[tree] if isinstance(tree, int) else tree
+
+
 class Relaxation:
     """Relaxed plans of one system.
 
     Args:
         system: the system.
         safe: formulas that must hold at every sample.
+        orders: `until`s, whose left sides must hold at every sample before the right ones have held.
         conditions: the conditions that a mission may ask for.
         state: a typical state, (n,), at which the direction of timers is looked up.
 
     Attributes:
         modes: names of the states that only jumps change.
         steps: the jumps of the system, and the waits for conditions on timers.
+        driven: names of the controls and of the states that they drive.
     """
 
     def __init__(
         self,
         system: System,
         safe: Sequence[ir.Formula],
+        orders: Sequence[ir.Until],
         conditions: Sequence[ir.Formula],
         state: Numbers,
     ) -> None:
@@ -97,16 +128,19 @@ class Relaxation:
         self._controls = system.control_names
         low, high = (end.double().numpy() for end in (system.control_low, system.control_high))
         self._levels = np.concatenate((levels(low, high, most=MOST_LEVELS), 0.5 * (low + high)[None]))
-        self._driven = {*self._controls} | {assign.name for assign in decl.updates}
+        self.driven = {*self._controls} | {assign.name for assign in decl.updates}
         while more := {
             name
             for name, value in self._flow.items()
-            if name not in self._driven and names_in(_settled(value, None)) & self._driven
+            if name not in self.driven and names_in(_settled(value, None)) & self.driven
         }:
-            self._driven |= more
-        clauses = [clause for formula in safe for clause in _clauses(formula)]
-        jumps = [self._step(jump, clauses) for jump in decl.jumps]
-        wanted = [*conditions, *(step.condition for step in jumps)]
+            self.driven |= more
+        clauses = [clause for formula in safe for clause in clauses_of(formula)]
+        jumps = [self._step(jump, clauses, orders) for jump in decl.jumps]
+        bounds = [clause[0] for clause in clauses if len(clause) == 1 and self._sort(clause[0]) == "timed"]
+        wanted = [*conditions, *(step.condition for step in jumps), *bounds]
+        self._stops: dict[ir.Formula, ir.Formula] = {}
+        self._falls: dict[ir.Formula, float] = {}
         self._ways: dict[ir.Formula, ir.Formula] = {}
         self._rates: dict[ir.Formula, float] = {}
         literals: dict[ir.Formula, None] = {}
@@ -117,18 +151,30 @@ class Relaxation:
                     if (way := self._way(literal, state)) is not None:
                         self._ways[literal] = way
                         wanted.append(way)
-        for way in tuple(self._ways.values()):  # what a timer runs on is a step of its own
-            for literal in self._literals_of(way):
-                if self._sort(literal) == "driven":
-                    self._ways.setdefault(literal, YES)
+        groups = dict.fromkeys(
+            group
+            for literal, way in self._ways.items()
+            for each in _conjunctions(way)
+            for group in self._group(each, self._duration(literal, state) / system.dt)
+        )
+        for stop in self._stops.values():
+            literals |= dict.fromkeys(self._literals_of(stop))
+        self._bounds = [bound for bound in dict.fromkeys(bounds) if bound in self._stops]
         self._literals = tuple(literals)
         self._number = {literal: i for i, literal in enumerate(self._literals)}
         self._known: dict[int, tuple[ir.Formula, int | None]] = {}
+        self._trees: dict[int, tuple[ir.Formula, Tree]] = {}
         self._sorts = [self._sort(literal) for literal in self._literals]
         self._jumps = len(jumps)
         waits = (Step(each, each) for each in self._ways)
-        self.steps = (*jumps, *waits)
-        self._wait = {step.condition: self._jumps + i for i, step in enumerate(self.steps[self._jumps :])}
+        self.steps = (*jumps, *groups, *waits)
+        self._first_wait = len(jumps) + len(groups)
+        self._wait = {step.condition: i for i, step in enumerate(self.steps) if i >= self._first_wait}
+        self._motions: dict[int, list[int]] = {}
+        for i, group in enumerate(groups):
+            for literal in self._literals_of(group.target):
+                if self._sort(literal) == "driven" and literal not in self._ways:
+                    self._motions.setdefault(self._number[literal], []).append(len(jumps) + i)
         reads = [columns(literal) for literal in self._literals]
         self._setters = [
             [
@@ -159,6 +205,27 @@ class Relaxation:
         better = met[:, 1:] | (growing & (values[:, 1:] > values[:, :1]))
         return RelaxedState(self, values[:, 0], met[:, 0], better)
 
+    def tree(self, formula: ir.Formula) -> Tree:
+        """Return what a formula needs, by identity where the same object was asked for before."""
+        found = self._trees.get(id(formula))
+        if found is None:
+            found = self._trees[id(formula)] = formula, self._as_tree(formula)
+        return found[1]
+
+    def _as_tree(self, formula: ir.Formula) -> Tree:
+        match formula:
+            case ir.Truth(value):
+                return 0.0 if value else math.inf
+            case ir.Predicate():
+                number = self.number(formula)
+                return 0.0 if number is None else number
+            case ir.BoolOp(op, items):
+                return Choice(op, [self._as_tree(item) for item in items])
+            case ir.Temporal(_, _, body) | ir.Until(_, _, _, body):
+                return self._as_tree(body)
+            case _:
+                return 0.0
+
     def number(self, literal: ir.Formula) -> int | None:
         """Index of a literal, by identity where the same object was asked for before."""
         found = self._known.get(id(literal))
@@ -174,10 +241,33 @@ class Relaxation:
 
     # ------------------------------------------------------------------------ preparation
 
-    def _step(self, jump: JumpDecl, clauses: Sequence[Sequence[ir.Formula]]) -> Step:
-        """Return a jump as a step, with what the clauses of the safety requirements ask when it happens."""
+    def _duration(self, literal: ir.Formula, state: Numbers) -> float:
+        """Seconds that a timer must run from `state`, (n,), until a literal holds."""
+        env = {name: np.full((1, 1), value) for name, value in zip(self._names, state, strict=True)}
+        lack = -float(_values([literal], env)[0, 0])
+        return max(lack, 0.0) / max(self._rates.get(literal, 0.0), PROBE)
+
+    def _group(self, formula: ir.Formula, samples: float) -> Iterator[Step]:
+        """Yield the motion that makes a conjunction true on which a timer runs; none if only modes do.
+
+        It stays true for the number of samples that the timer needs, unless these are many.
+        """
+        parts = list(self._literals_of(formula))
+        modes = [part for part in parts if self._sort(part) != "driven" or part in self._ways]
+        if len(modes) < len(parts):
+            last = math.ceil(samples - PROBE)
+            target = ir.Temporal("always", ir.Window(0, last), formula) if last <= LONGEST else formula
+            yield Step(joined("and", modes, YES), target, last if last <= LONGEST else 0)
+
+    def _step(
+        self, jump: JumpDecl, clauses: Sequence[Sequence[ir.Formula]], orders: Sequence[ir.Until]
+    ) -> Step:
+        """Return a jump as a step, with what safety requirements and orders ask when it happens."""
         fixed = {each.name: each.value for each in jump.resets if isinstance(each.value, ir.Const)}
         extra = [self._left(clause, fixed) for clause in clauses]
+        for order in orders:
+            asked = (self._left(clause, fixed) for clause in clauses_of(order.left))
+            extra.append(joined("or", (joined("and", asked, YES), present(order.right)), NO))
         condition = joined("and", (jump.guard, *extra), YES)
         controls = frozenset(self._controls)
         if not columns(jump.guard) & controls:
@@ -209,7 +299,7 @@ class Relaxation:
         read = columns(literal)
         if not read <= self._own:
             return "unknown"
-        if read & self._driven:
+        if read & self.driven:
             return "driven"
         return "timed" if read & self._flow.keys() else "mode"
 
@@ -251,6 +341,10 @@ class Relaxation:
         gains = [(mode, rate(mode, holds=True), rate(mode, holds=False)) for mode in modes]
         if sort == "driven" and not any((yes > 0.0) != (no > 0.0) for _, yes, no in gains):
             return None
+        if (least := min(min(yes, no) for _, yes, no in gains)) < 0.0:
+            stops = [negate(mode) for mode, yes, no in gains if yes < 0.0 <= no]
+            stops += [mode for mode, yes, no in gains if no < 0.0 <= yes]
+            self._stops[literal], self._falls[literal] = joined("or", stops, NO), -least
         ways = [mode for mode, yes, _ in gains if yes > 0.0]
         ways += [negate(mode) for mode, _, no in gains if no > 0.0]
         return joined("or", ways, NO)
@@ -270,42 +364,39 @@ class RelaxedState:
         setters = relaxation._setters
         self._ways = [[j for j in setters[i] if better[i, j]] for i in range(len(met))]
         self._costs = [0.0 if known else math.inf for known in met]
+        waited = {*relaxation._motions, *(relaxation._number[way] for way in relaxation._ways)}
         for i, sort in enumerate(relaxation._sorts):
             if sort == "unknown":
                 self._costs[i] = 0.0
-            elif sort == "driven" and not met[i] and relaxation._literals[i] not in relaxation._ways:
+            elif sort == "driven" and not met[i] and i not in waited:
                 self._costs[i] = MOTION
         wanted = [i for i, cost in enumerate(self._costs) if cost == math.inf]
+        jumps = [relaxation.tree(step.condition) for step in relaxation.steps[: relaxation._jumps]]
+        waits = {
+            i: relaxation.tree(way)
+            for i in wanted
+            if (way := relaxation._ways.get(relaxation._literals[i])) is not None
+        }
+        motions = {
+            i: [relaxation.tree(relaxation.steps[j].condition) for j in relaxation._motions.get(i, ())]
+            for i in wanted
+        }
         changed = True
         while changed:
             changed = False
-            steps = [1.0 + self.cost(step.condition) for step in relaxation.steps[: relaxation._jumps]]
+            steps = [1.0 + _sum(jump, self._costs) for jump in jumps]
             for i in wanted:
                 least = min((steps[j] for j in self._ways[i]), default=math.inf)
-                way = relaxation._ways.get(relaxation._literals[i])
-                if way is not None:
-                    least = min(least, 1.0 + self.cost(way))
+                for motion in motions[i]:
+                    least = min(least, 1.0 + _sum(motion, self._costs))
+                if i in waits:
+                    least = min(least, 1.0 + _sum(waits[i], self._costs))
                 if least < self._costs[i]:
                     self._costs[i], changed = least, True
 
     def cost(self, formula: ir.Formula) -> float:
         """Number of steps that a formula needs at least; the nested formulas of the future are added."""
-        match formula:
-            case ir.Truth(value):
-                return 0.0 if value else math.inf
-            case ir.Predicate():
-                number = self._of.number(formula)
-                return 0.0 if number is None else self._costs[number]
-            case ir.BoolOp("and", items):
-                return sum(map(self.cost, items))
-            case ir.BoolOp("or", items):
-                return min(map(self.cost, items))
-            case ir.Temporal(_, _, body):
-                return self.cost(body)
-            case ir.Until(_, _, _, right):
-                return self.cost(right)
-            case _:
-                return 0.0
+        return _sum(self._of.tree(formula), self._costs)
 
     def ready(self, formula: ir.Formula) -> bool:
         """True if a motion alone may make a formula true: its conditions on modes and timers hold."""
@@ -335,6 +426,7 @@ class RelaxedState:
                     if number is None or not MOTION < self._costs[number] < math.inf:
                         continue
                     ways = [(self.cost(of.steps[j].condition), j) for j in self._ways[number]]
+                    ways += [(self.cost(of.steps[j].condition), j) for j in of._motions.get(number, ())]
                     if (wait := of._wait.get(literal)) is not None:
                         ways.append((self.cost(of._ways[literal]), wait))
                     step = min(ways)[1]
@@ -352,19 +444,26 @@ class RelaxedState:
     def wait(self, step: int) -> float | None:
         """Seconds that a wait takes while its timers run; None for a jump."""
         literal = self._of.steps[step].condition
-        if step < self._of._jumps or self._of._sorts[self._of._number[literal]] != "timed":
+        if step < self._of._first_wait or self._of._sorts[self._of._number[literal]] != "timed":
             return None
         return float(-self._values[self._of._number[literal]]) / max(self._of._rates[literal], PROBE)
+
+    def due(self) -> Iterator[tuple[ir.Formula, float]]:
+        """Yield what must become true since a timer runs towards a bound of safety, and the seconds left."""
+        for bound in self._of._bounds:
+            number, stop = self._of._number[bound], self._of._stops[bound]
+            if self.met[number] and self.cost(stop) > 0.0:
+                yield stop, float(self._values[number]) / self._of._falls[bound]
 
     def possible(self, step: int) -> bool:
         """True if a motion alone may lead to a jump, or if a timer runs that is waited for."""
         before = self._before(step)
-        return self.ready(before) if step < self._of._jumps else not self.cost(before)
+        return self.ready(before) if step < self._of._first_wait else not self.cost(before)
 
     def _before(self, step: int) -> ir.Formula:
         """Return what must hold for a step: the condition of a jump, or the modes in which a timer runs."""
         condition = self._of.steps[step].condition
-        return condition if step < self._of._jumps else self._of._ways[condition]
+        return condition if step < self._of._first_wait else self._of._ways[condition]
 
 
 # ------------------------------------------------------------------------------- formulas
@@ -377,16 +476,25 @@ def _values(formulas: Sequence[ir.Formula], env: Mapping[str, Numbers]) -> Numbe
     return np.stack([np.broadcast_to(each[0], width) for each in found]) if found else np.empty((0, width))
 
 
-def _clauses(formula: ir.Formula) -> Iterator[tuple[ir.Formula, ...]]:
+def clauses_of(formula: ir.Formula) -> Iterator[tuple[ir.Formula, ...]]:
     """Yield the disjunctions of a conjunction, each as the tuple of its items."""
     match formula:
         case ir.BoolOp("and", items):
             for item in items:
-                yield from _clauses(item)
+                yield from clauses_of(item)
         case ir.BoolOp("or", items):
             yield tuple(part for item in items for part in _disjuncts(item))
         case _:
             yield (formula,)
+
+
+def present(formula: ir.Formula) -> ir.Formula:
+    """Return a formula without its operators of the future, which become true."""
+    match formula:
+        case ir.BoolOp(op, items):
+            return joined(op, map(present, items), ir.Truth(op == "and"))
+        case _:
+            return YES if looks_ahead(formula) else formula
 
 
 def _disjuncts(formula: ir.Formula) -> Iterator[ir.Formula]:
@@ -395,6 +503,19 @@ def _disjuncts(formula: ir.Formula) -> Iterator[ir.Formula]:
             yield from _disjuncts(item)
     else:
         yield formula
+
+
+def _conjunctions(formula: ir.Formula) -> Iterator[ir.Formula]:
+    """Yield conjunctions of which one holds where a formula without operators of the future does."""
+    match formula:
+        case ir.BoolOp("or", items):
+            for item in items:
+                yield from _conjunctions(item)
+        case ir.BoolOp("and", items):
+            for parts in islice(product(*map(_conjunctions, items)), MOST_LEVELS):
+                yield joined("and", parts, YES)
+        case _:
+            yield formula
 
 
 def _folded(formula: ir.Formula) -> ir.Formula:

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count, product
 from typing import TYPE_CHECKING
@@ -22,14 +23,16 @@ import torch
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined, pieces
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.support import columns, history, reach
 from stlc.compile.ir.traverse import nodes
 from stlc.controller.search.newton import values_of
+from stlc.controller.search.sequences.landmarks import Landmarks
 from stlc.controller.search.sequences.obligations import Obligations
-from stlc.controller.search.sequences.phases import Ask, Phase, Phases
-from stlc.controller.search.sequences.relaxation import Relaxation, RelaxedState
+from stlc.controller.search.sequences.phases import TAIL, UNSURE, Ask, Phase, Phases
+from stlc.controller.search.sequences.relaxation import Relaxation, RelaxedState, clauses_of, present
 from stlc.controller.search.sequences.residuals import NO, YES, Progression, looks_ahead
 from stlc.controller.search.starts import extremes
+from stlc.dynamics.model.algebra import names_in
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -40,9 +43,9 @@ if TYPE_CHECKING:
 
     Numbers = NDArray[np.float64]
 
-LENGTHS = 16, 48
+LENGTHS = 16, 64
 """Least and greatest number of steps of a phase."""
-SHARE = 6
+SHARE = 4
 """A phase may take this part of the mission, within `LENGTHS`."""
 ALTERNATIVES = 8
 """Largest number of alternatives into which the `or`s of one goal are written out."""
@@ -52,10 +55,24 @@ NEARER = 0.05
 """Share of its distance by which a phase that fails must come nearer to its target, to be kept as a node."""
 GREED = 2.0
 """Weight of the time that the missing steps take, beside the length of the prefix."""
+VARIED = 0.8, 1.2
+"""Range of random factors of this weight: another search takes other ways."""
+LATE = 3.0
+"""Weight of the time by which a goal would miss its deadline."""
+URGENT = 1.0
+"""Share of the time of steps that safety asks for soon; what is missing of it is added to the cost."""
+DRIFT = 0.02
+"""Share of its range by which a state may drift in the time of a phase where it nearly stands still."""
 EARLY = 1e-6
 """Share of a step by which a wait may end early, for rounding."""
 TRIES = 8
-"""Number of phases that are tried for each step of the relaxed plan at the start."""
+"""Number of phases that are tried for each step of the relaxed plan at the start, and as for some more."""
+FEWEST = 4.0
+"""Number of these."""
+OPEN = 64
+"""Number of nodes that are kept for the next search from a later state."""
+SOON = 9
+"""Number of samples of a prefix among which that state is looked for."""
 TWINS = 2
 """Number of nodes that are kept with the same modes and pending goals."""
 
@@ -91,6 +108,9 @@ class Node:
         time: time that these steps take, in steps of the plan.
         relaxed: relaxed plans from the last state.
         tries: targets of the last phases, if these came nearer to them without reaching one.
+        since: number of steps since the last goal or step was reached, which have led to landmarks.
+        tail: controls after the prefix, (j, m), with which the last phase goes on.
+        asks: requests for phases from here that are left; none before the first of them.
     """
 
     states: Numbers
@@ -102,6 +122,9 @@ class Node:
     time: float
     relaxed: RelaxedState
     tries: tuple[int, ...] = ()
+    since: int = 0
+    tail: Numbers | None = None
+    asks: tuple[Ask, ...] = ()
 
 
 class Sequences:
@@ -115,6 +138,8 @@ class Sequences:
     def __init__(self, task: Task, state: Tensor) -> None:
         self.task = task
         self._spent, self._made = 8.0, 1
+        self._open: list[Node] = []
+        self._last: tuple[tuple[float, ...], Progression] = (), Progression((), 0)
         self._obligations = Obligations(task)
         self._state = state
         self.steps = min(max(task.horizon // SHARE, LENGTHS[0]), LENGTHS[1], task.horizon)
@@ -122,7 +147,7 @@ class Sequences:
         self._untils = tuple(
             node for node in obligations if isinstance(node, ir.Until) and not looks_ahead(node.left)
         )
-        self._kept = tuple(ir.BoolOp("or", (each.left, _present(each.right))) for each in self._untils)
+        self._kept = tuple(ir.BoolOp("or", (each.left, present(each.right))) for each in self._untils)
         self._safe = tuple(
             self._obligations.within(piece.body)
             for rule in task.rules
@@ -131,24 +156,67 @@ class Sequences:
         )
         conditions = dict.fromkeys(each for formula in obligations for each in self._conditions(formula))
         self._relaxation = Relaxation(
-            task.system, (*self._safe, *self._kept), [*obligations, *conditions], state.numpy()
+            task.system, self._safe, self._untils, [*obligations, *conditions], state.numpy()
         )
         steps = self._relaxation.steps
-        self._targets = (*conditions, *(step.target for step in steps), YES)
+        wanted = (*conditions, *(step.target for step in steps))
+        own = set(task.system.decl.signature.names)
+        clauses = [
+            clause
+            for formula in (*self._safe, *self._kept)
+            for clause in clauses_of(formula)
+            if all(columns(each) <= own and not history(each) for each in clause)
+        ]
+        moved = self._relaxation.driven - {*self._relaxation.modes}
+        ranges = {each.name: each for each in task.system.decl.signature.columns if each.name in moved}
+        landmarks = Landmarks(clauses, ranges)
+        way = [landmarks.of(target) for target in wanted]
+        extra = list(dict.fromkeys(each for marks in way for each in marks))
+        self._targets = (*wanted, *extra, self._rest(), YES)
+        self._marks = [tuple(len(wanted) + extra.index(each) for each in marks) for marks in way]
+        self._merit = [0] * len(self._targets)
         self._target = {condition: i for i, condition in enumerate(conditions)}
         self._first_step, self._idle = len(conditions), len(self._targets) - 1
         self._modes = [task.system.names.index(name) for name in self._relaxation.modes]
 
+    def _rest(self) -> ir.Formula:
+        """Return a target in which the states that the controls accelerate nearly stand still."""
+        system, slow = self.task.system, list[ir.Formula]()
+        controls = frozenset(system.control_names)
+        for assign in system.decl.flow:
+            low, high = system.decl.signature[assign.name].low, system.decl.signature[assign.name].high
+            driven = assign.name in self._relaxation.driven and not names_in(assign.value) & controls
+            if driven and low is not None and high is not None:
+                speed = DRIFT * (high - low) / (self.steps * system.dt)
+                margin = ir.Op("sub", (ir.Const(speed), ir.Op("abs", (assign.value,))))
+                slow.append(ir.Predicate(margin))
+        return joined("and", slow, YES)
+
     @cached_property
     def _phases(self) -> Phases | None:
-        late = {self._first_step + i for i, step in enumerate(self._relaxation.steps) if step.delay}
         safe, scale = joined("and", self._safe, YES), self._scales(self._targets, self._state)
-        return Phases.of(self.task.system, safe, self._targets, late, self._kept, self.steps, scale)
+        return Phases.of(self.task.system, safe, self._targets, self._kept, self.steps, scale)
 
     def root(self, state: Tensor) -> Node | None:
         """Return the empty prefix at `state`, (n,), None if nothing leads from there to all goals."""
-        progression = Progression(self._obligations.at(state), self.task.horizon)
+        progression = self._progression(state)
         return self._node(progression, state.numpy()[None], self._nothing)
+
+    def several(self, node: Node) -> bool:
+        """True if several steps lead from a node to all goals, landmarks included."""
+        return node.missing > 1 or self.marked(node)
+
+    def marked(self, node: Node) -> bool:
+        """True if landmarks lead to a goal of a node."""
+        return any(self._marks[goal.target] for goal in node.goals)
+
+    def _progression(self, state: Tensor) -> Progression:
+        """Return the progression of the obligations from `state`, (n,), that phases do not keep anyway."""
+        key = tuple(state.tolist())
+        if self._last[0] != key:
+            open_ = [each for each in self._obligations.at(state) if not _is_kept(each)]
+            self._last = key, Progression(open_, self.task.horizon)
+        return self._last[1]
 
     @cached_property
     def _nothing(self) -> Numbers:
@@ -211,37 +279,100 @@ class Sequences:
         if self._phases is None:
             return
         order, seen = count(), dict[object, list[int]]()
-        progression = Progression(self._obligations.at(state), self.task.horizon)
+        progression = self._progression(state)
         heap: list[tuple[float, int, Node]] = []
+        least = math.inf, math.inf
 
-        def add(states: Numbers, plan: Numbers, tries: tuple[int, ...] = ()) -> None:
-            node = self._node(progression, states, plan, tries)
+        def add(node: Node | None) -> Tensor | None:
+            """Keep a node; return its plan if it is nearer to the end than those before."""
+            nonlocal least
             if node is None:
-                return
+                return None
             times = seen.setdefault(self._key(node), [])
-            if sum(time <= len(plan) for time in times) < TWINS:
-                times.append(len(plan))
-                heapq.heappush(heap, (len(plan) + GREED * node.time, next(order), node))
+            if node.missing and sum(time <= len(node.plan) for time in times) >= TWINS:
+                return None
+            times.append(len(node.plan))
+            greed = GREED * random.uniform(*VARIED)
+            cost = len(node.plan) + greed * node.time if node.missing else -float(len(node.plan))
+            heapq.heappush(heap, (cost, next(order), node))
+            if (node.missing, node.time) >= least or not len(node.plan):
+                return None
+            least = node.missing, node.time
+            return self._ended(node)
 
-        add(state.numpy()[None], self._nothing)
-        tries = TRIES * effort * (1.0 + heap[0][2].missing) if heap else 0.0
-        while heap and tries > 0:
-            node = heapq.heappop(heap)[2]
-            if not node.missing:
-                yield self._ended(node)
-            for ask, delay in self._asks(node):
-                phase = self._phases.reach(node.states[-1], ask, random, effort)
-                if found := self._grown(node, ask, delay, phase):
-                    add(*found)
-                tries -= 1
-                yield None
+        add(self._node(progression, state.numpy()[None], self._nothing))
+        for begun in self._begun(state):
+            yield add(begun)
+        tries = TRIES * effort * (FEWEST + heap[0][2].missing) if heap else 0.0
+        node: Node | None = None
+        try:
+            while heap and tries > 0:
+                node = heapq.heappop(heap)[2]
+                if not node.missing:
+                    yield self._ended(node)
+                asks = deque(node.asks or self._asks(node))
+                while asks:
+                    tries -= 1
+                    grown = self._try(progression, node, asks, random, effort)
+                    node = replace(node, asks=tuple(asks))
+                    yield None if grown is None else add(grown)
+                node = None
+        finally:
+            left = [] if node is None or not node.asks else [node]
+            self._open = [*self._open, *(each for _, _, each in sorted(heap)[:OPEN]), *left][-OPEN:]
+
+    def _begun(self, state: Tensor) -> list[Node]:
+        """Return what is left, from `state`, (n,), of nodes that earlier searches have not extended."""
+        found, others = list[Node](), list[Node]()
+        for node in self._open:
+            same = np.isclose(node.states[1:SOON], state.numpy()).all(1).nonzero()[0]
+            first = 1 + int(same[0]) if len(same) else len(node.plan)
+            if first < len(node.plan):
+                found.append(replace(node, states=node.states[first:], plan=node.plan[first:]))
+            else:
+                others.append(node)
+        self._open = others
+        return found
+
+    def _try(
+        self, progression: Progression, node: Node, asks: deque[Ask], random: Generator, effort: int
+    ) -> Node | None:
+        """Search for the phase that is asked for first, and return the node that it leads to, if any.
+
+        Where requests for a target have failed that has landmarks, the next landmark is asked for.
+        """
+        assert self._phases is not None
+        ask, state = asks.popleft(), node.states[-1]
+        marks = self._marks[ask.target] if ask.target < len(self._marks) else ()
+        missing = [mark for mark in marks if self._phases.margin(state, replace(ask, target=mark)) < -UNSURE]
+        mark = None
+        if missing and missing[-1] == marks[-1]:
+            last = min(self.steps, self.task.horizon - len(node.plan))
+            mark = replace(ask, target=missing[0], first=0, last=last, after=0)
+        if mark is None or self._merit[ask.target] >= 0:
+            phase = self._phases.reach(state, ask, random, effort)
+            found = self._grown(progression, node, ask, phase)
+            if found is None and ask.target == self._idle:
+                asks.append(replace(ask, target=self._idle - 1, first=0))
+            if mark is None:
+                return found
+            self._merit[ask.target] += 1 if found else -1
+            if found is not None:
+                return found
+        asks.appendleft(mark)
+        return self._try(progression, node, asks, random, effort)
 
     def _node(
-        self, progression: Progression, states: Numbers, plan: Numbers, tries: tuple[int, ...] = ()
+        self,
+        progression: Progression,
+        states: Numbers,
+        plan: Numbers,
+        tries: tuple[int, ...] = (),
+        since: int = 0,
     ) -> Node | None:
         """Return the node of a prefix; None if it has lost a requirement, or a goal that no jump can meet."""
         env = {name: states[:, i : i + 1] for i, name in enumerate(self.task.system.names)}
-        left = progression.after(env)
+        left = _needed(progression.after(env))
         if NO in left:
             return None
         relaxed = self._relaxation.at(states[-1])
@@ -250,9 +381,19 @@ class Sequences:
         if not math.isfinite(moves):
             return None
         steps = relaxed.plan(left)
+        each = self._spent / self._made
+        time = self._time(relaxed, steps) + moves * each - min(since, each)
+        for goal in goals:
+            late = self._time(relaxed, relaxed.plan([goal.condition])) + each - goal.last
+            time += LATE * max(0.0, late)
+        for stop, seconds in relaxed.due():
+            time += max(0.0, URGENT * each * relaxed.cost(stop) - seconds / self.task.system.dt)
+        return Node(states, plan, left, goals, steps, moves + len(steps), time, relaxed, tries, since)
+
+    def _time(self, relaxed: RelaxedState, steps: frozenset[int]) -> float:
+        """Number of samples that the steps of a relaxed plan take one after another."""
         waits = [wait / self.task.system.dt for step in steps if (wait := relaxed.wait(step)) is not None]
-        time = (moves + len(steps) - len(waits)) * self._spent / self._made + sum(waits)
-        return Node(states, plan, left, goals, steps, moves + len(steps), time, relaxed, tries)
+        return (len(steps) - len(waits)) * self._spent / self._made + sum(waits)
 
     def _goals(self, formula: ir.Formula) -> Iterator[Goal]:
         match formula:
@@ -268,8 +409,8 @@ class Sequences:
                 if (target := self._target.get(body)) is not None:
                     yield Goal(target, body, window.lo, window.lo)
 
-    def _asks(self, node: Node) -> list[tuple[Ask, int]]:
-        """Return what to try from a node, each with the samples that follow after the target is reached."""
+    def _asks(self, node: Node) -> list[Ask]:
+        """Return what to try from a node."""
         rest = self.task.horizon - len(node.plan)
         if not rest:
             return []
@@ -279,42 +420,57 @@ class Sequences:
             for i, until in enumerate(self._untils)
             if any(isinstance(part, ir.Until) and part.left is until.left for part in node.left)
         )
+        idle = Ask(self._idle, most, most, opened)
         if not node.missing:
-            return [(Ask(self._idle, most, most, opened), 0)]
-        found: list[tuple[Ask, int]] = []
+            return [idle]
+        found: list[Ask] = []
+        due = min((goal.last for goal in node.goals if node.relaxed.cost(goal.condition)), default=rest)
         for goal in sorted(node.goals, key=lambda goal: goal.last):
-            if node.relaxed.ready(goal.condition):
-                last = min(goal.last, most - reach(goal.condition).future)
+            if goal.first <= due and node.relaxed.ready(goal.condition):
+                after = reach(goal.condition).future
+                last = min(goal.last, most - after)
                 first = goal.first if goal.first <= last else 0
-                found.append((Ask(goal.target, first, last, opened), reach(goal.condition).future))
+                found.append(Ask(goal.target, first, last, opened, after))
                 if goal.first > 1 and not node.relaxed.cost(goal.condition):
                     pause = min(most, goal.first - 1)
-                    found.append((Ask(self._idle, pause, pause, opened), 0))
-        for step in sorted(filter(node.relaxed.possible, node.steps)):
+                    found.append(replace(idle, first=pause, last=pause))
+        soon = node.relaxed.plan([stop for stop, _ in node.relaxed.due()])
+        possible = filter(node.relaxed.possible, node.steps | soon)
+        for step in sorted(possible, key=lambda step: (step not in soon, step)):
             delay, wait = self._relaxation.steps[step].delay, node.relaxed.wait(step)
             first = 0 if wait is None else math.ceil(wait / self.task.system.dt - EARLY)
             if first > most and self._relaxation.runs_by_itself(step):
-                found.append((Ask(self._idle, most, most, opened), 0))
+                found.append(idle)
             else:
                 first = first if first <= most - delay else 0
-                found.append((Ask(self._first_step + step, first, most - delay, opened), delay))
-        return [each for each in dict.fromkeys(found) if each[0].last >= each[0].first]
+                found.append(Ask(self._first_step + step, first, most - delay, opened, delay))
+        return [each for each in dict.fromkeys(found) if each.last >= each.first]
 
-    def _grown(
-        self, node: Node, ask: Ask, delay: int, phase: Phase
-    ) -> tuple[Numbers, Numbers, tuple[int, ...]] | None:
+    def _grown(self, progression: Progression, node: Node, ask: Ask, phase: Phase) -> Node | None:
+        """Return the node of a phase; None if it comes no nearer to its target."""
         assert self._phases is not None
-        tries: tuple[int, ...] = ()
-        if phase.margin < 0.0:
+        wanted = ask.target < len(self._marks)
+        length, tries, since = phase.sample + ask.after, (*node.tries, ask.target), 0
+        if phase.margin < -UNSURE:
             now = self._phases.margin(node.states[-1], ask)
-            if not phase.sample or phase.margin < (1.0 - NEARER) * now:
+            if (wanted and self._marks[ask.target]) or phase.margin < (1.0 - NEARER) * now:
                 return None
-            tries, delay = (*node.tries, ask.target), 0
-        length = phase.sample + delay
-        if ask.target != self._idle and not tries:
-            self._spent, self._made = self._spent + length, self._made + 1
+            length = phase.sample
+        elif wanted:
+            if not ask.first:
+                self._spent, self._made = self._spent + node.since + length, self._made + 1
+            tries = ()
+        elif ask.target == self._idle:
+            tries = ()
+        else:
+            since = node.since + length
+        if not length:
+            return None
         states = np.concatenate((node.states, phase.states[1 : length + 1]))
-        return states, np.concatenate((node.plan, phase.plan[:length])), tries
+        plan = np.concatenate((node.plan, phase.plan[:length]))
+        found = self._node(progression, states, plan, tries, since)
+        late = self.steps // TAIL if phase.margin < 0.0 else 0
+        return found and replace(found, tail=phase.plan[length:], time=found.time + late)
 
     def _key(self, node: Node) -> object:
         modes = tuple(node.states[-1, self._modes])
@@ -322,19 +478,45 @@ class Sequences:
         return modes, goals, node.steps, node.tries
 
     def _ended(self, node: Node) -> Tensor:
-        """Return the plan of a node, continued to the end of the mission with its middle controls."""
-        system, rest = self.task.system, self.task.horizon - len(node.plan)
+        """Return the plan of a node, continued to the end of the mission, at last by the middle controls."""
+        system, plan = self.task.system, node.plan
+        if node.tail is not None:
+            plan = np.concatenate((plan, node.tail))[: self.task.horizon]
         middle = 0.5 * (system.control_low + system.control_high).double()
-        return torch.cat((torch.from_numpy(node.plan), middle.expand(rest, -1)))
+        return torch.cat((torch.from_numpy(plan), middle.expand(self.task.horizon - len(plan), -1)))
 
 
-def _present(formula: ir.Formula) -> ir.Formula:
-    """Return a formula without its operators of the future, which become true."""
-    match formula:
-        case ir.BoolOp(op, items):
-            return joined(op, map(_present, items), ir.Truth(op == "and"))
-        case _:
-            return YES if looks_ahead(formula) else formula
+def _is_kept(formula: ir.Formula) -> bool:
+    """True for a requirement on every sample from the first one on, that no later one decides."""
+    return (
+        isinstance(formula, ir.Temporal)
+        and formula.op == "always"
+        and formula.window.lo <= 1
+        and not looks_ahead(formula.body)
+    )
+
+
+def _needed(formulas: Sequence[ir.Formula]) -> tuple[ir.Formula, ...]:
+    """Return the parts of a conjunction without goals that are met whenever another one is."""
+    parts = list(dict.fromkeys(part for formula in formulas for part in _conjuncts(formula)))
+
+    def later(one: ir.Formula, other: ir.Formula) -> bool:
+        match one, other:
+            case ir.Temporal("eventually", ir.Window(a, b), p), ir.Temporal("eventually", ir.Window(c, d), q):
+                wider = b is None or (d is not None and d <= b)
+                return p == q and a <= c and wider and (a, b) != (c, d)
+            case _:
+                return False
+
+    return tuple(one for one in parts if not any(later(one, other) for other in parts))
+
+
+def _conjuncts(formula: ir.Formula) -> Iterator[ir.Formula]:
+    if isinstance(formula, ir.BoolOp) and formula.op == "and":
+        for item in formula.items:
+            yield from _conjuncts(item)
+    else:
+        yield formula
 
 
 def _moves(formula: ir.Formula, relaxed: RelaxedState) -> float:

@@ -7,11 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.guard.guard import Guard
+from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
-from stlc.controller.search.planner import PlanBudget, plan
+from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.search.sequences.phases import Ask
 from stlc.controller.search.sequences.sequences import Sequences
+from stlc.controller.world import world_type
 
 MISSIONS = Path(__file__).parents[3] / "data/sequences"
 
@@ -105,3 +109,35 @@ def test_each_goal_in_a_chain_is_a_step() -> None:
     root = Sequences(task, state).root(state)
     assert root is not None
     assert (root.missing, len(root.goals)) == (4, 1)  # only the first is pending
+
+
+def test_a_search_goes_on_where_the_last_one_ended(handover: Task) -> None:
+    x0 = handover.sample(1, seed=0)[0].double()
+    sequences = Sequences(handover, x0)
+    if sequences._phases is None:
+        pytest.skip("no C compiler")
+    search = sequences.plans(x0, np.random.default_rng(0))
+    best = next(plan for plan in search if plan is not None)
+    search.close()
+    later = handover.rollout(x0[None], best[None])[0, 1]
+    longest = max(len(node.plan) for node in sequences._open)
+    begun = sequences._begun(later)
+    assert max(len(node.plan) for node in begun) == longest - 1
+    assert np.allclose(begun[-1].states[0], later.numpy())
+    assert sequences._begun(x0) == []
+
+
+@pytest.mark.slow
+def test_calls_that_no_plan_foresees_are_answered() -> None:
+    task = load_task(MISSIONS / "lift.stl", whole=True)
+    if task.native is None:
+        pytest.skip("no C compiler")
+    policy = PlannerPolicy(task, planner_named("search"), PlanBudget(1.0, 12_000), seed=0)
+    recorder = Recorder(2, pictured=False)
+    steps = task.system.decl.test.steps
+    simulate(Guard(task, policy, "none"), world_type(task.system.decl), Setting((1,), 2, steps), recorder)
+    states = recorder.recording().states
+    names = task.system.names
+    calls = states[:, :, [names.index(f"call[{i}]") for i in range(3)]]
+    assert (np.diff(calls, axis=1) > 0.0).any()  # there were events
+    assert (states[:, -1, [names.index(name) for name in names if name.startswith("answer")]] >= 0.0).all()

@@ -1,0 +1,34 @@
+"""Landmarks on the way to a target."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stlc.compile.ir.text import show_formula
+from stlc.controller.problem.load import load_task
+from stlc.controller.search.sequences.sequences import Sequences
+
+MISSIONS = Path(__file__).parents[3] / "data/sequences"
+
+
+@pytest.fixture(scope="module")
+def lift() -> Sequences:
+    task = load_task(MISSIONS / "lift.stl")
+    return Sequences(task, task.sample(1, seed=0)[0].double())
+
+
+def test_an_open_door_needs_a_floor_first_and_before_that_a_closed_door(lift: Sequences) -> None:
+    for target, marks in zip(lift._targets[:3], lift._marks[:3], strict=True):
+        assert "door >= 0.9" in show_formula(target)
+        closed, there = (show_formula(lift._targets[mark]) for mark in marks)
+        assert closed == "door <= 0.05"
+        assert "abs(v) <= 0.1" in there
+        assert "door" not in there
+
+
+def test_only_the_floor_that_is_asked_for_is_left(lift: Sequences) -> None:
+    places = [show_formula(lift._targets[marks[1]]) for marks in lift._marks[:3]]
+    assert len(set(places)) == 3
+    assert not any(" or " in place for place in places)
