@@ -102,7 +102,7 @@ class PlannerPolicy(Policy):
     def _searched(
         self, x0: Tensor, solver: Solver, budget: PlanBudget, rest: Tensor | None = None, *, seed: int = 0
     ) -> PlanSearch:
-        search = PlanSearch(self.task, x0, budget, seed=seed, start=rest)
+        search = PlanSearch(self.task, x0, budget, seed=seed, start=rest, continued=True)
         with torch.enable_grad():
             if rest is not None:
                 rows = torch.arange(len(x0))

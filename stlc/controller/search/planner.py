@@ -7,6 +7,7 @@ state, and compares time and number of judged plans with the budget. A planner i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import Field, dataclass, fields, is_dataclass
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 PLANNING_VERSION = 3
 """Version of the planners, raised with every change of the plans that they find within a budget."""
+RATE = 50_000.0
+"""Judged plans that count as a second where time is not limited."""
 SECONDS = 1.0
 """Default budget per initial state, in seconds of processor time."""
 
@@ -90,6 +93,7 @@ class PlanSearch:
         task: specification and system.
         states: initial states, (B, n) float64.
         budget: limits of the search.
+        continued: True if the plans are followed, and another search begins from states on the way.
         generator: source of the random numbers of the planner.
         start: initial guesses of plans, within the control bounds, (B, T, m); the middle of every control
             range if none were given.
@@ -112,8 +116,9 @@ class PlanSearch:
         seed: int = 0,
         start: Tensor | None = None,
         progress: Callable[[PlanSearch], None] | None = None,
+        continued: bool = False,
     ) -> None:
-        self.task, self.budget = task, budget
+        self.task, self.budget, self.continued = task, budget, continued
         self.states = states.double()
         self.generator = torch.Generator().manual_seed(seed)
         low, high = task.system.control_low.double(), task.system.control_high.double()
@@ -132,6 +137,16 @@ class PlanSearch:
     def result(self) -> PlanResult:
         """The best plans found until now."""
         return PlanResult(self.states, self.plans, self.rho, self.infeasible, self.seconds, self.evaluations)
+
+    @property
+    def spent(self) -> Tensor:
+        """Cost of the search for each state, (B,): processor time in seconds.
+
+        If only the number of judged plans is limited, it is the time that these would take at `RATE`, so that
+        equal seeds give equal plans.
+        """
+        limited = math.isfinite(self.budget.seconds) or self.budget.evaluations is None
+        return self.seconds if limited else self.evaluations / RATE
 
     def open(self) -> Tensor:
         """Indices of the initial states for which the search is to continue, (k,).

@@ -21,27 +21,28 @@ from stlc.controller.options import bounded
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.sequences.sequences import Sequences
 from stlc.controller.search.starts import extremes
-from stlc.diagnostics import TraceError, UsageError
+from stlc.diagnostics import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Generator, Iterator
 
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner import PlanSearch, Solver
 
 
-SEVERAL = 2
-"""Least number of jumps, waits and goals of a mission for which their order is searched."""
-SHARE = 2.0
-"""Processor time of the searches that look at the requirements, as a multiple of that of the local search. It
-grows up to this with the time of the local search."""
-EQUAL = 0.05
-"""Processor time of the local search at which the others have had as much, in seconds."""
+ROUNDS = 3
+"""Number of rounds of local search after which the order of motions is searched."""
+SHARE, EQUAL = 2.0, 0.05
+"""Greatest cost of the searches that look at the requirements, in that of the local search, and the cost of
+the local search at which both are equal; see `PlanSearch.spent`."""
 LEAD = 0.02
-"""Processor time of the search for phases before schedules are searched for as long, in seconds."""
-RESTARTS = 4
-"""Number of searches for sequences of phases from one state. Each ends when no prefix is left to extend; the
-next makes twice the effort for each phase."""
+"""Cost of the search for phases before schedules are searched for as well."""
+COSTLY = 4_000
+"""Number of plans, a limit of judged plans given, that must be left for a search for phases."""
+RESTARTS = 16
+"""Number of searches for sequences of phases from one state. Each ends when no prefix is left to extend."""
+EFFORTS = 1, 2, 4, 8
+"""Efforts for each phase in these searches, one after another; the last of them for the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,6 @@ class SearchPlanner:
     piecewise constant plans; plans that solve an initial state are added.
 
     Attributes:
-        rounds: number of rounds of local search before the searches by the order of the goals begin.
         tries: number of plans tried per initial state in the first round; each later round tries twice as
             many, up to `longest`.
         longest: maximum number of plans tried per initial state and round.
@@ -64,7 +64,6 @@ class SearchPlanner:
     tries: int = bounded(2_000, 1, 10**9)
     longest: int = bounded(20_000, 1, 10**9)
     library: int = bounded(2_048, 1, 10**6)
-    rounds: int = bounded(3, 1, 10**6)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by local search, with the initial library."""
@@ -72,12 +71,14 @@ class SearchPlanner:
         return partial(self._run, library=library, orders=_Orders(task))
 
     def _run(self, search: PlanSearch, library: Tensor, orders: _Orders) -> None:
-        begun: dict[int, Iterator[None]] = {}
-        spent = [0.0] * len(search.states)
+        orders.begin(search)
         budget, tries, number = search.budget, self.tries, 0
         target = budget.target if budget.target else TOLERANCE
         searcher = Searcher(search.task, search.generator, enough=target)
-        while len(rows := search.open()):
+        while len(search.open()):
+            orders.advance(number)
+            if not len(rows := search.open()):
+                break
             with search.charged(rows):
                 start = search.start[rows]
                 if number % 2:
@@ -92,15 +93,7 @@ class SearchPlanner:
                 solved = search.plans[rows][search.rho[rows] >= -TOLERANCE]
                 library = torch.cat((solved, library))[: self.library]
             number, tries = number + 1, min(2 * tries, self.longest)
-            if number >= self.rounds:
-                for row in search.open().tolist():
-                    if row not in begun:
-                        begun[row] = orders.tries(search, torch.tensor([row]))
-                    local = float(search.seconds[row]) - spent[row]
-                    for _ in begun[row]:
-                        if float(search.seconds[row]) >= (1.0 + min(SHARE, local / EQUAL)) * local:
-                            break
-                    spent[row] = float(search.seconds[row]) - local
+        orders.settle()
 
 
 class _Orders:
@@ -108,6 +101,7 @@ class _Orders:
 
     def __init__(self, task: Task) -> None:
         self._task = task
+        self._jumps = bool(task.system.decl.jumps)
 
     @cached_property
     def _sequences(self) -> Sequences:
@@ -120,43 +114,84 @@ class _Orders:
         except UsageError:
             return None
 
-    def tries(self, search: PlanSearch, row: Tensor) -> Iterator[None]:
+    def begin(self, search: PlanSearch) -> None:
+        """Begin the searches for the states of `search`."""
+        self._search = search
+        self._running: dict[int, Generator[None]] = {}
+        self._nearest: dict[int, Tensor] = {}
+        self._own = torch.zeros(len(search.states), dtype=torch.float64)
+        # the order of motions is searched after some rounds, unless a plan is to be mended
+        self._first = 0 if self._jumps or bool(search.evaluations.any()) else ROUNDS
+
+    def advance(self, number: int) -> None:
+        """Continue the searches from each open state for their share of what local search has cost there.
+
+        `number`: number of rounds of local search.
+        """
+        search = self._search
+        for row in search.open().tolist() if number >= self._first else ():
+            if search.allowed(torch.tensor([row]), COSTLY) < COSTLY:
+                continue
+            local = float(search.spent[row] - self._own[row])
+            share = min(SHARE, max(local / EQUAL, float(self._jumps)))
+            allowed = local + max(LEAD * (self._first == 0), share * local)
+            going, before = self._running.get(row), search.spent.clone()
+            if going is None:
+                going = self._running[row] = self._tries(torch.tensor([row]))
+            while search.spent[row] < allowed and row in search.open() and next(going, True) is None:
+                pass
+            self._own += search.spent - before
+
+    def settle(self) -> None:
+        """End the searches: where no plan satisfies, one that begins with a sequence of phases is followed.
+
+        So the next search, from a state on the way, begins where this one has ended.
+        """
+        search = self._search
+        for running in self._running.values():
+            running.close()
+        for row, plan in self._nearest.items():
+            if search.continued and not search.result.satisfied[row]:
+                search.worth[row] = search.rho[row] = -torch.inf
+                search.offer(torch.tensor([row]), plan[None], evaluations=0)
+
+    def _tries(self, row: Tensor) -> Generator[None]:
         """Search for a plan from the initial state `row`, (1,), by phases and by schedules.
 
         An item is yielded after each phase that is tried, and each step towards schedules.
         """
-        searches: list[Iterator[None]] = []
-        try:
+        search, searches = self._search, list[Iterator[None]]()
+        with search.charged(row):
             root = self._sequences.root(search.states[row][0])
-        except TraceError:  # bounds on the robustness of a prefix need too many instants
-            moves = True
-        else:
-            if root is not None and root.missing >= SEVERAL:
-                searches.append(self._by_phases(search, row))
-            moves = root is None or not root.steps
-        if moves and self._schedules is not None:  # a schedule moves states, not modes
+        several = root is not None and self._sequences.several(root)
+        if root is not None and several:
+            searches.append(self._by_phases(row))
+        motions = root is None or not (root.steps or self._jumps or self._sequences.marked(root))
+        if motions and self._schedules is not None:  # a schedule knows no modes and no landmarks
             searches.append(self._schedules.of(search, row))
         spent = {each: LEAD * i for i, each in enumerate(searches)}
         while spent:
             least = min(spent, key=spent.__getitem__)
-            before = float(search.seconds[row])
+            before = float(search.spent[row])
             if next(least, search) is search:
                 del spent[least]
             else:
-                spent[least] += float(search.seconds[row]) - before
+                spent[least] += float(search.spent[row]) - before
             yield
 
-    def _by_phases(self, search: PlanSearch, row: Tensor) -> Iterator[None]:
-        sequences, state = self._sequences, search.states[row][0]
+    def _by_phases(self, row: Tensor) -> Generator[None]:
+        search, sequences = self._search, self._sequences
+        state = search.states[row][0]
         random = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
-        for effort in (2**i for i in range(RESTARTS)):
-            plans = sequences.plans(state, random, effort)
+        for number in range(RESTARTS):
+            plans = sequences.plans(state, random, EFFORTS[min(number, len(EFFORTS) - 1)])
             while bool((search.open() == row).any()):
                 before = sequences.tried
                 with search.charged(row):
                     found = next(plans, search)
                     if isinstance(found, Tensor):
                         search.offer(row, found[None], evaluations=0)
+                        self._nearest[int(row)] = found
                     search.evaluations[row] += sequences.tried - before
                 if found is search:
                     break
