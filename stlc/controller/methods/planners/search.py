@@ -35,8 +35,11 @@ ROUNDS = 3
 SHARE, EQUAL = 2.0, 0.05
 """Greatest cost of the searches that look at the requirements, in that of the local search, and the cost of
 the local search at which both are equal; see `PlanSearch.spent`."""
-LEAD = 0.02
-"""Cost of the search for phases before schedules are searched for as well."""
+LEAD, LONG = 0.02, 0.1
+"""Cost of the search for phases before schedules are searched for as well; and before local search, where the
+order of jumps matters."""
+JUMPS = 5.0
+"""This share where the order of jumps matters."""
 COSTLY = 4_000
 """Number of plans, a limit of judged plans given, that must be left for a search for phases."""
 RESTARTS = 16
@@ -133,8 +136,9 @@ class _Orders:
             if search.allowed(torch.tensor([row]), COSTLY) < COSTLY:
                 continue
             local = float(search.spent[row] - self._own[row])
-            share = min(SHARE, max(local / EQUAL, float(self._jumps)))
-            allowed = local + max(LEAD * (self._first == 0), share * local)
+            share = JUMPS if self._jumps else min(SHARE, local / EQUAL)
+            lead = LONG if self._jumps else LEAD if self._first == 0 else 0.0
+            allowed = local + max(lead, share * local)
             going, before = self._running.get(row), search.spent.clone()
             if going is None:
                 going = self._running[row] = self._tries(torch.tensor([row]))
@@ -160,7 +164,8 @@ class _Orders:
 
         An item is yielded after each phase that is tried, and each step towards schedules.
         """
-        search, searches = self._search, list[Iterator[None]]()
+        search = self._search
+        searches: list[Iterator[None]] = []
         with search.charged(row):
             root = self._sequences.root(search.states[row][0])
         several = root is not None and self._sequences.several(root)
