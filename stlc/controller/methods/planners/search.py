@@ -123,8 +123,8 @@ class _Orders:
         self._running: dict[int, Generator[None]] = {}
         self._nearest: dict[int, Tensor] = {}
         self._own = torch.zeros(len(search.states), dtype=torch.float64)
-        # the order of motions is searched after some rounds, unless a plan is to be mended
-        self._first = 0 if self._jumps or bool(search.evaluations.any()) else ROUNDS
+        # jumps are ordered after a round, motions after some more, unless a plan is to be mended
+        self._first = 0 if bool(search.evaluations.any()) else 1 if self._jumps else ROUNDS
 
     def advance(self, number: int) -> None:
         """Continue the searches from each open state for their share of what local search has cost there.
