@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 
     from stlc.controller.problem.task import Task
 
-EFFORTS = {16: 20_000, 8: 80_000, 4: 320_000}
+EFFORTS = {16: 20_000, 4: 60_000}
 """Number of missions for which plans are searched -> plans judged for each; the next if none is found."""
+TORCH_EFFORTS = {4: 2_000}
+"""The same without compiled code, where judging takes some hundred times as long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,8 @@ def mission_plans(task: Task, count: int, generator: torch.Generator) -> Mission
         count: number of plans to choose, k; if fewer are found, they are repeated.
         generator: source of all random numbers.
     """
-    for missions, judged in EFFORTS.items():
+    compiled = task.native is not None
+    for missions, judged in (EFFORTS if compiled else TORCH_EFFORTS).items():
         starts = task.sample(missions, generator=generator)
         seed = int(torch.randint(2**62, (), generator=generator))
         searched = plan(task, starts, budget=PlanBudget(torch.inf, judged), seed=seed)
@@ -59,7 +62,9 @@ def mission_plans(task: Task, count: int, generator: torch.Generator) -> Mission
     x0, plans = starts[good], searched.plans[good].to(starts.dtype)
     if not len(x0):
         return MissionPlans(SearchResult(x0, plans, searched.rho[good]), plans)
-    found = Searcher(task, generator, enough=torch.inf).repair(x0, plans, plans, tries=THOROUGH)
+    found = Searcher(task, generator, enough=torch.inf).repair(
+        x0, plans, plans, tries=THOROUGH if compiled else TORCH_EFFORTS[4]
+    )
     every = starts.repeat(len(x0), 1), found.plans.repeat_interleave(len(starts), 0)
     most = float(found.rho.median())
     rho = task.judge(*every, states=False).rho.view(-1, len(starts)).clamp(-most, most)
