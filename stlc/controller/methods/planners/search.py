@@ -38,8 +38,6 @@ the local search at which both are equal; see `PlanSearch.spent`."""
 LEAD, LONG = 0.02, 0.1
 """Cost of the search for phases before schedules are searched for as well; and before local search, where the
 order of jumps matters."""
-JUMPS = 5.0
-"""This share where the order of jumps matters."""
 COSTLY = 4_000
 """Number of plans, a limit of judged plans given, that must be left for a search for phases."""
 RESTARTS = 16
@@ -136,7 +134,7 @@ class _Orders:
             if search.allowed(torch.tensor([row]), COSTLY) < COSTLY:
                 continue
             local = float(search.spent[row] - self._own[row])
-            share = JUMPS if self._jumps else min(SHARE, local / EQUAL)
+            share = 1.0 if self._jumps else min(SHARE, local / EQUAL)
             lead = LONG if self._jumps else LEAD if self._first == 0 else 0.0
             allowed = local + max(lead, share * local)
             going, before = self._running.get(row), search.spent.clone()
