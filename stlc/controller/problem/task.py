@@ -145,8 +145,9 @@ class Task:
     ) -> Task:
         """Compile a specification for a system.
 
-        If it has deadlines, plans may reach to the end of a mission (`whole`, or the key `mission` of the
-        system file), and then end there. Otherwise they have the horizon of the system.
+        If it has deadlines, or a mission is no longer than a plan, plans may reach to the end of a mission
+        (`whole`, or the key `mission` of the system file), and then end there. Otherwise they have the
+        horizon of the system.
 
         Args:
             spec: parsed specification.
@@ -163,7 +164,8 @@ class Task:
         decl, interface, overrides = system.decl, system.interface(), overrides or {}
         compiled = compile_spec(spec, grid=decl.grid, interface=interface, overrides=overrides, end=end)
         last = decl.test.steps if whole and decl.mission is None else decl.mission
-        if compiled.mission is not None and compiled.recurring is None and last:
+        ends = compiled.mission is not None or (last is not None and last <= decl.horizon)
+        if ends and compiled.recurring is None and last:
             grid = Grid(decl.dt, decl.horizon, max(decl.horizon, min(last, LONGEST)), last)
             compiled = compile_spec(spec, grid=grid, interface=interface, overrides=overrides, end=end)
         if values:

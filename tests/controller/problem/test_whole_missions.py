@@ -101,6 +101,15 @@ def test_a_plan_is_asked_for_nothing_after_the_end(task: Task) -> None:
     assert float(judged.columns["charge"][-1].min()) < 2.0
 
 
+def test_a_mission_no_longer_than_a_plan_needs_no_deadline_to_end(tmp_path: Path) -> None:
+    text = "state signal x\nrequire a: eventually[0, 1 s] x > 0.5 m\nrequire b: eventually[0, T] x < -0.5 m\n"
+    spec, path = parse(Source("short.stl", text)), tmp_path / "cart.yaml"
+    for steps, end in (("2 s", 10), ("12 s", None)):
+        path.write_text((CART % "").replace("steps: 12 s", f"steps: {steps}"))
+        task = Task.of(spec, System.load(path), whole=True)
+        assert (task.horizon, task.compiled.grid.end) == (10, end)
+
+
 def test_a_satisfying_plan_is_never_lost(task: Task) -> None:
     recording = driven(task, 3, 40_000)
     known = recording.rho >= -1e-6
