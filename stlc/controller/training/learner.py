@@ -84,13 +84,12 @@ def _margin(reached: Tensor) -> float:
     return min(max(MARGIN_SHARE * float(reached.median()), MARGIN_RANGE[0]), MARGIN_RANGE[1])
 
 
-def _mean(losses: Tensor) -> Tensor:
+def _finite_mean(losses: Tensor) -> Tensor:
     """Mean of the losses that are finite, (); NaN if none is.
 
-    A plan under which a state overflows, or which no number describes, does not end the training.
+    Along a mission, a plan under which a state overflows does not end the training.
     """
-    finite = torch.isfinite(losses.detach())
-    return losses.mean() if bool(finite.all()) else losses[finite].mean()
+    return losses[torch.isfinite(losses.detach())].mean()
 
 
 def _bounded_slopes(slopes: Tensor) -> Tensor:
@@ -380,12 +379,13 @@ class Trainer(Learner):
         winner, good = self._winner(x0, plans)
         rows = torch.arange(len(x0), device=self.device)
         chosen = plans[rows, winner]
-        value = _mean(loss(self.task, self.objective, x0, chosen))
+        mean = torch.mean if self.task.compiled.grid.end is None else _finite_mean
+        value = mean(loss(self.task, self.objective, x0, chosen))
         if config.share:
             some = rows[:: config.plans]
             other = torch.randint(config.plans, (len(some),), generator=self.generator).to(self.device)
             others = loss(self.task, self.objective, x0[some], plans[some, other])
-            value = value + config.share * _mean(others)
+            value = value + config.share * mean(others)
         if self.failures is not None and self.safety is not None:
             value = value + self._unsafe(self.safety, x0[: config.batch], plans[: config.batch])
         if hard:

@@ -11,7 +11,7 @@ import torch
 from stlc.cli.framework.app import main
 from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
 from stlc.controller.training.config import TrainConfig, resolve_config
-from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes, _mean
+from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes, _finite_mean
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.run import task_of_run
 from stlc.controller.training.samplers import POOL, Missions
@@ -95,8 +95,8 @@ def test_no_plan_outweighs_the_others() -> None:
     assert bool(torch.isfinite(found).all())
     assert torch.equal(found[3:], slopes[3:])
     assert float(found[2].norm()) == pytest.approx(STEEPEST * 3.0**0.5)
-    assert float(_mean(torch.tensor([1.0, torch.inf, 3.0, torch.nan]))) == 2.0
-    assert torch.isnan(_mean(torch.tensor([torch.inf])))
+    assert float(_finite_mean(torch.tensor([1.0, torch.inf, 3.0, torch.nan]))) == 2.0
+    assert torch.isnan(_finite_mean(torch.tensor([torch.inf])))
 
 
 @pytest.mark.parametrize(("method", "steps"), [("guided", 20), ("gradient", 4)])

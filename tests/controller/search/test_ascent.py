@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.guard.stages import gradient_refine as ascent
 from stlc.controller.problem.task import Task
+from stlc.controller.search import ascent
 from stlc.controller.search.ascent import APART, KEPT, GradientAscent
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
