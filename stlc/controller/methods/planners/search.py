@@ -35,6 +35,8 @@ ROUNDS = 3
 SHARE, EQUAL = 2.0, 0.05
 """Greatest cost of the searches that look at the requirements, in that of the local search, and the cost of
 the local search at which both are equal; see `PlanSearch.spent`."""
+ORDERS = 4.0
+"""This cost where the order of jumps matters."""
 LEAD, LONG = 0.02, 0.1
 """Cost of the search for phases before schedules are searched for as well; and before local search, where the
 order of jumps matters."""
@@ -134,7 +136,7 @@ class _Orders:
             if search.allowed(torch.tensor([row]), COSTLY) < COSTLY:
                 continue
             local = float(search.spent[row] - self._own[row])
-            share = 1.0 if self._jumps else min(SHARE, local / EQUAL)
+            share = ORDERS if self._jumps else min(SHARE, local / EQUAL)
             lead = LONG if self._jumps else LEAD if self._first == 0 else 0.0
             allowed = local + max(lead, share * local)
             going, before = self._running.get(row), search.spent.clone()
