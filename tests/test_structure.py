@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 462_707
+NODES = 462654
 CROSSINGS = 6.83
 CIRCLES = {
     ("cli/certify", "cli/check"),

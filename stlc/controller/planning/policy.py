@@ -48,10 +48,7 @@ class PlannerPolicy(Policy):
         self._planner, self._budget, self._seed = planner, budget, seed
         self._prepared = task, prepared(planner, task)
         self._short: tuple[Task, Solver] | None = None
-        self._clock = None
-        if task.compiled.grid.end is not None:
-            clock = next(timer.name for timer in task.compiled.timers if timer.kind == "clock")
-            self._clock = task.system.names.index(clock)
+        self._clock = None if task.compiled.grid.end is None else task.clock
         self._spent: list[Tensor] = []
         self._reached: list[Tensor] = []
 

@@ -237,12 +237,6 @@ FAINT = 0.1
 """Factor of the last layer's weights in a network that begins at given plans."""
 
 
-def _clock(task: Task) -> int:
-    """Index, from the last, of the state that counts the steps of a mission; among observations as well."""
-    names = [timer.kind for timer in task.compiled.timers]
-    return names.index("clock") - len(names)
-
-
 class PlanNetwork(PlanProposer):
     """MLP from the observation to `plans` open-loop plans over the horizon.
 
@@ -279,7 +273,7 @@ class PlanNetwork(PlanProposer):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
         layers.append(nn.Linear(widths[-1], plans * task.horizon * self._width))
         self.body = nn.Sequential(*layers)
-        self.clock = None if task.compiled.grid.end is None else _clock(task)
+        self.clock = None if task.compiled.grid.end is None else task.clock
         self.register_buffer("centre", torch.zeros(widths[0]))
         self.register_buffer("spread", torch.ones(widths[0]))
         changes = variations(task) if varied else variations(task)[:0].clone()

@@ -183,6 +183,15 @@ class Task:
         return self.system.decl.horizon
 
     @property
+    def clock(self) -> int | None:
+        """Index of the state that counts the steps of a mission, negative; None if there is none.
+
+        The timers come last in states and in observations, so that it is the index of both.
+        """
+        kinds = [timer.kind for timer in self.compiled.timers]
+        return kinds.index("clock") - len(kinds) if "clock" in kinds else None
+
+    @property
     def rules(self) -> tuple[CompiledRequirement, ...]:
         """The compiled requirements, in the order of the specification."""
         return self.compiled.requirements

@@ -143,7 +143,7 @@ class Descent:
         return first
 
     def _give_way(self, first: Instants) -> None:
-        """Where steps stall, consider fewer samples, other choices or smaller margins; else it is over."""
+        """Let plans that stall consider fewer samples, other choices or smaller margins; or end them."""
         stalled, whole = self._stalled >= PATIENCE, self._end == self._last
         sooner = stalled & ~whole & (self._ahead > 1)
         self._ahead = np.where(sooner, self._ahead // 2, self._ahead)

@@ -169,7 +169,8 @@ class Missions(Supply):
         if not len(self.pool):
             self.pool, self.age = self._starts(POOL), torch.zeros(POOL, device=self.device)
         judged = self._plan(self.pool)
-        now = self._now()
+        clock = self.task.clock
+        now = (self.age if clock is None else self.pool[:, clock]).round().long()
         legs = self._legs(len(self.pool)).minimum(self._until_due(now))
         shares = [self._rand(len(legs)) for _ in range(GLIMPSES - 1)]
         glimpses = [self._at(judged, (legs * share).long()) for share in shares]
@@ -194,12 +195,6 @@ class Missions(Supply):
         """
         most = max(self.task.horizon // 2, 1)
         return torch.randint(1, most + 1, (n,), generator=self.generator).to(self.device)
-
-    def _now(self) -> Tensor:
-        """Step of each mission, (POOL,) int64: by its clock if it has one, else by its age."""
-        names = [timer.name for timer in self.task.compiled.timers if timer.kind == "clock"]
-        found = self.pool[:, self.task.system.names.index(names[0])] if names else self.age
-        return found.round().long()
 
     def _until_due(self, now: Tensor) -> Tensor:
         """Steps after `now`, (POOL,), until the next event that is due at given steps, (POOL,) int64."""

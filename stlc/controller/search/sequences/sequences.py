@@ -288,7 +288,9 @@ class Sequences:
             nonlocal least
             if node is None:
                 return None
-            times = seen.setdefault(self._key(node), [])
+            modes = tuple(node.states[-1, self._modes])
+            goals = tuple(sorted({goal.target for goal in node.goals}))
+            times = seen.setdefault((modes, goals, node.steps, node.tries), [])
             if node.missing and sum(time <= len(node.plan) for time in times) >= TWINS:
                 return None
             times.append(len(node.plan))
@@ -471,11 +473,6 @@ class Sequences:
         found = self._node(progression, states, plan, tries, since)
         late = self.steps // TAIL if phase.margin < 0.0 else 0
         return found and replace(found, tail=phase.plan[length:], time=found.time + late)
-
-    def _key(self, node: Node) -> object:
-        modes = tuple(node.states[-1, self._modes])
-        goals = tuple(sorted({goal.target for goal in node.goals}))
-        return modes, goals, node.steps, node.tries
 
     def _ended(self, node: Node) -> Tensor:
         """Return the plan of a node, continued to the end of the mission, at last by the middle controls."""
