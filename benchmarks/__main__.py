@@ -20,10 +20,12 @@ PROGRAM = Program(
         "method and its version, version of the guard, seeds. What is there is not measured again.",
     ),
     package="benchmarks.tables",
-    order=(
-        *("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step", "robustness"),
-        *("tasks", "gym", "falsify", "searches", "certificates", "uncertain", "verify", "ainncs"),
-    ),
+    groups={
+        "Controllers": ("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step"),
+        "Monitors": ("robustness", "gym"),
+        "Tasks": ("tasks",),
+        "Assurance": ("falsify", "searches", "certificates", "uncertain", "verify", "ainncs"),
+    },
     drives=True,
 )
 

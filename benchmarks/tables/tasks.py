@@ -165,7 +165,7 @@ def _plans(cell: TaskCell, trace: Path) -> Outcome:
     size = cell.size
     result = asked(
         *("plan", str(cell.task.spec), "--starts", str(size.starts), "--budget", f"{size.seconds:g}s"),
-        *("--seed", str(cell.seed), "--output", str(trace)),
+        *("--seed", str(cell.seed), "--out", str(trace)),
         limit=size.limit,
     )
     times = result["seconds"]

@@ -121,7 +121,7 @@ def worlds(
     ] = "none,paper,full",
     ceiling: Annotated[
         int,
-        typer.Option("--ceiling", metavar="N", min=0, help="Visited states to check for a feasible plan."),
+        typer.Option("--known-feasible", metavar="N", min=0, help="Visited states to check for plans."),
     ] = 1000,
     options: DeploymentOptions = _OPTIONS,
     output: Output = _OUTPUT,

@@ -386,7 +386,7 @@ def _simulate(contents: RunContents) -> list[str]:
     limit = done.get("time_limit", USUAL_LIMIT)
     if limit != USUAL_LIMIT or done.get("paper_time_limit") is not None:
         words += ["--time-limit", "none" if limit is None else f"{1000 * float(limit):g}ms"]
-    words += ["--ceiling", str(done["ceiling"])] if done.get("ceiling") else []
+    words += ["--known-feasible", str(done["ceiling"])] if done.get("ceiling") else []
     margins = (done.get("margin") or {}).items()
     return words + [word for name, value in margins for word in ("--margin", f"{name}={value:.6g}")]
 

@@ -158,7 +158,7 @@ def test_worlds_are_driven_kept_and_laid_out(
 ) -> None:
     page = tmp_path / "worlds.md"
     command = ["worlds", str(run.path), "--seeds", "0..2", "--guards", "none,full", "--json"]
-    assert measure([*command, "--ceiling", "30", "--page", str(page), "--out", str(tmp_path)]) == 0
+    assert measure([*command, "--known-feasible", "30", "--page", str(page), "--out", str(tmp_path)]) == 0
     document = json.loads(capsys.readouterr().out)
     assert misfits(document, document_schema()) == []
     (row,) = document["result"]["rows"]

@@ -175,7 +175,7 @@ def test_a_file_where_a_folder_is_needed_is_told_before_any_work(
     assert main(["check", "s.stl", "a.csv", "b.csv", "--out", "taken"]) == 5
     assert "error[R201]: cannot use `taken`" in capsys.readouterr().err
     spec = str(Path(__file__).parents[2] / "specs/arch/chasing_cars.stl")
-    assert main(["falsify", spec, "--simulations", "1", "--output", "taken"]) == 5
+    assert main(["falsify", spec, "--simulations", "1", "--out", "taken"]) == 5
     assert "error[R201]: cannot use `taken`" in capsys.readouterr().err
     assert Path("taken").read_text(encoding="utf-8") == "mine"
 

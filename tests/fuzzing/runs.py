@@ -16,7 +16,7 @@ from fuzzing.valid import battered
 RUN = "runs/small/0001-seed"
 _TRAIN = "train a.stl --system b.yaml --steps 6 --batch 8 --held-out 10 --no-pictures --name seed"
 _DRIVE = "simulate --backup --seeds 0 --steps 4 --agents 2 --no-pictures"
-_CERTIFY = "certify latest --max-drives 4 --steps 2 --agents 2"
+_CERTIFY = "certify latest --drives 4 --steps 2 --agents 2"
 
 COMMANDS = (
     *("runs show latest", "runs show latest --json", "runs list", "runs list --json", "runs diff latest 1"),

@@ -48,7 +48,8 @@ class Traces:
         str | None,
         typer.Option(
             metavar="TIME",
-            help="In longer gaps signals are unknown; default: three steps with --resample, else no gap.",
+            help="In longer gaps signals are unknown.",
+            show_default="three steps with --resample, else no gap",
         ),
     ] = None
     dt: Annotated[

@@ -22,8 +22,11 @@ from stlc.cli.framework.assured import (
 )
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
+    AgentsOption,
     DriveStepsOption,
+    JobsOption,
     MarginOption,
+    PlantOption,
     RequireOption,
     RunsOption,
     SetOption,
@@ -60,9 +63,7 @@ class Driving:
     margin: MarginOption = None
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="A scenario of the system.")] = None
     steps: DriveStepsOption = None
-    agents: Annotated[
-        int | None, typer.Option(min=1, help="Agents in each world; by default the system's.")
-    ] = None
+    agents: AgentsOption = None
 
 
 DRIVING = Driving()
@@ -72,19 +73,14 @@ DRIVING = Driving()
 class DrawnSubject:
     """Options on what is simulated instead of a policy."""
 
-    plant: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="A plant file, for a specification: a black box (docs/plants.md)."),
-    ] = None
+    plant: PlantOption = None
     system: Annotated[
         str | None,
         typer.Option(
             "--system", "-s", metavar="FILE", help="A system without controls, for a specification."
         ),
     ] = None
-    jobs: Annotated[
-        int, typer.Option("--jobs", "-j", min=1, metavar="N", help="With --plant: number of processes.")
-    ] = 1
+    jobs: JobsOption = 1
 
 
 DRAWING = DrawnSubject()
@@ -92,7 +88,7 @@ DRAWING = DrawnSubject()
 
 @command(
     "stlc certify latest --guard full",
-    "stlc certify latest --guard full --share .999 --confidence .99 --max-drives 20000",
+    "stlc certify latest --guard full --share .999 --confidence .99 --drives 20000",
     "stlc certify latest --scenario mismatch-10 --width .02 --agents 1",
     "stlc certify fall.stl --plant ball.yaml --share .9",
     "stlc certify --verify runs/latest/eval/certificate.json",
@@ -110,7 +106,9 @@ def certify(
     ] = None,
     share: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", help="Share of drives to certify; .99 unless --width is given."),
+        typer.Option(
+            metavar="SHARE", help="Share of drives to certify.", show_default=".99, unless --width is given"
+        ),
     ] = None,
     confidence: Annotated[float, typer.Option(metavar="P", help="Confidence of each bound.")] = 0.95,
     width: Annotated[
@@ -130,10 +128,11 @@ def certify(
         str | None,
         typer.Option(
             metavar="SEEDS",
-            help="Drive these seeds, such as 0..99, whatever they show; fresh ones as needed if not given.",
+            help="Drive these seeds, such as 0..99, whatever they show.",
+            show_default="fresh ones, as needed",
         ),
     ] = None,
-    max_drives: Annotated[
+    drives: Annotated[
         int,
         typer.Option(
             min=1,
@@ -146,7 +145,8 @@ def certify(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="File of the certificate; eval/certificate.json of the run, or certificates/NAME.json.",
+            help="File of the certificate.",
+            show_default="eval/certificate.json of the run, or certificates/NAME.json",
         ),
     ] = None,
     verify: Annotated[
@@ -186,7 +186,7 @@ def certify(
     fixed = None if seeds is None else parse_seeds(seeds)
     chosen = _Chosen(run, how, what, tuple(require or ()), parse_overrides(set_), runs)
     subject, home, shown = chosen.subject()
-    order = Campaign(subject, claim, width, max_drives, fixed)
+    order = Campaign(subject, claim, width, drives, fixed)
     result = _observed(order, out or home)
     name = shown if out is None else str(out)
 

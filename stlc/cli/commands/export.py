@@ -26,13 +26,16 @@ def export(
     to: Annotated[str, typer.Option("--to", metavar="TARGET", help="torch, c or onnx.")] = "torch",
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", "--out", metavar="DIR", help="By default in the run's folder."),
+        typer.Option(
+            "--out", "-o", metavar="DIR", help="Folder of the files.", show_default="export/ of the run"
+        ),
     ] = None,
     precision: Annotated[
         str | None,
         typer.Option(
             metavar="TYPE",
-            help="Numbers of ONNX graphs: float32 (default), which every runtime has, or float64, exact.",
+            help="Numbers of ONNX graphs: float32, which every runtime has, or float64, exact.",
+            show_default="float32",
         ),
     ] = None,
     python: PythonOption = False,

@@ -25,8 +25,11 @@ from stlc.cli.framework.assured import (
 from stlc.cli.framework.options import (
     MOST_SEED,
     ClusterOption,
+    JobsOption,
+    PlantOption,
     RequireOption,
     RunsOption,
+    SeedOption,
     SetOption,
     SystemOption,
     parse_overrides,
@@ -71,25 +74,25 @@ def falsify(
         typer.Argument(metavar="SPEC|RUN", help="A specification of a system without controls, or a run."),
     ] = "latest",
     system: SystemOption = None,
-    plant: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A black box instead of a system (docs/plants.md).")
-    ] = None,
+    plant: PlantOption = None,
     require: RequireOption = None,
     simulations: Annotated[
         int, typer.Option(min=1, metavar="N", help="Simulations per requirement at most.")
     ] = 300,
-    time: Annotated[
-        str | None, typer.Option("--time", metavar="TIME", help="Time per requirement at most.")
+    budget: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Time per requirement at most.", show_default="no limit"),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of the search.")] = 0,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that simulate.")] = 1,
+    seed: SeedOption = 0,
+    jobs: JobsOption = 1,
     cluster: ClusterOption = None,
     batch: Annotated[
         int | None,
         typer.Option(
             min=1,
             metavar="N",
-            help="Points that a search proposes at a time; by default as many as there are processes.",
+            help="Points that a search proposes at a time.",
+            show_default="number of processes",
         ),
     ] = None,
     random: Annotated[
@@ -100,7 +103,7 @@ def falsify(
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each drive of a run.")] = None,
     scenario: Annotated[str | None, typer.Option(metavar="NAME", help="Scenario of a run.")] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the counterexamples.")
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the counterexamples.")
     ] = Path("counterexamples"),
     replay: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Simulate this counterexample again, and compare.")
@@ -132,7 +135,7 @@ def falsify(
     if replay is not None:
         return _replayed(made, replay, overrides, runs)
     require_folder(output)
-    limit = None if time is None else parse_seconds(time)
+    limit = None if budget is None else parse_seconds(budget)
     require_no_jobs(cluster, jobs)
     source = _Source(made, overrides, runs, jobs, cluster)
     simulator = source.load()

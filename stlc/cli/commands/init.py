@@ -55,7 +55,9 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the project.")] = Path(),
     example: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="cart (if not given), car, …, or empty.", autocompletion=examples),
+        typer.Option(
+            metavar="NAME", help="Such as cart, car, or empty.", show_default="cart", autocompletion=examples
+        ),
     ] = None,
     spec: Annotated[
         str | None, typer.Option("--spec", metavar="NAME", help="Write this specification only.")

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.framework.options import (
-    MOST_SEED,
     FailUnderOption,
-    PlannerOptionsOption,
+    MethodOptionsOption,
+    SeedOption,
     SetOption,
     SystemOption,
     parse_count,
@@ -49,14 +49,16 @@ def plan(
         str,
         typer.Option("--from", metavar="random|STATE|TRACE", help="Initial states, such as `x=1, v=2 m/s`."),
     ] = "random",
-    starts: Annotated[int | None, typer.Option(min=1, help="Number of initial states; 1.")] = None,
+    starts: Annotated[
+        int | None, typer.Option(min=1, help="Number of initial states.", show_default="1")
+    ] = None,
     method: Annotated[
         str,
         typer.Option(
             "--method", "-m", metavar="|".join((*PLANNERS.installed, "FILE.py")), help="The planner."
         ),
     ] = PLANNERS.default,
-    option: PlannerOptionsOption = None,
+    option: MethodOptionsOption = None,
     budget: Annotated[
         str, typer.Option(metavar="TIME", help="Processor time per initial state at most.")
     ] = "1s",
@@ -66,9 +68,7 @@ def plan(
     target: Annotated[
         str, typer.Option(metavar="RHO|max", help="Robustness at which the search ends.")
     ] = "0",
-    seed: Annotated[
-        int, typer.Option(min=0, max=MOST_SEED, help="Seed of the planner and of random states.")
-    ] = 0,
+    seed: SeedOption = 0,
     tube: Annotated[
         str | None,
         typer.Option(
@@ -76,7 +76,7 @@ def plan(
         ),
     ] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="Trace of the plans (.npz, .csv, .mcap).")
+        Path, typer.Option("--out", "-o", metavar="FILE", help="Trace of the plans (.npz, .csv, .mcap).")
     ] = Path("plan.npz"),
     fail_under: FailUnderOption = None,
     set_: SetOption = None,
@@ -99,7 +99,7 @@ def plan(
     from stlc.trace import check_writable, save_trace
 
     check_writable(output)
-    require_separate([("--output", output)], (spec, system, from_))
+    require_separate([("--out", output)], (spec, system, from_))
     choice = planner_choice(method, option, budget)
     judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
     planner = planner_named(choice.name, **choice.options)

@@ -34,7 +34,10 @@ _FORMATS = (".svg", ".png", ".pdf")
 def plot(
     what: Annotated[str, typer.Argument(metavar="TRACE|RUN", help="A trace, or a run with one.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="By default beside the trace, .svg.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="The picture.", show_default="beside the trace, .svg"
+        ),
     ] = None,
     trace: Annotated[int | None, typer.Option(min=0, metavar="K", help="Trace number K of the file.")] = None,
     places: Annotated[
@@ -60,7 +63,7 @@ def plot(
     require_drawing()
     path = recorded_trace(what, reading.runs)
     target = _target(output, path)
-    require_separate([("--output", target)], (path, reading.spec, reading.system))
+    require_separate([("--out", target)], (path, reading.spec, reading.system))
     question = reading.question(require=())
     loaded = load(path, question, planned=windows or places)  # plans name the places that they have to reach
     if len(loaded.traces) > 1:

@@ -6,7 +6,6 @@ import sys
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -15,12 +14,15 @@ from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, re
 from stlc.cli.framework.assured import Assurance
 from stlc.cli.framework.documents import ScenarioResult, SimulateResult, Simulation
 from stlc.cli.framework.options import (
+    AgentsOption,
     DriveStepsOption,
     FailUnderOption,
+    JobsOption,
     JsonOption,
     MarginOption,
+    MethodOptionsOption,
     PicturesOption,
-    PlannerOptionsOption,
+    PlantOption,
     RunArgument,
     RunsOption,
     SeedsOption,
@@ -55,8 +57,6 @@ if TYPE_CHECKING:
 
 ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"
-LONG = 10.0
-"""Seconds of drawing from which on a remark says how to do without."""
 EACH = ", ".join(f"`{name}` {guard.help}" for name, guard in GUARDS.loaded().items() if guard.help)
 """Help of the guards that have one, such as "`full` also repairs plans"."""
 
@@ -81,19 +81,18 @@ def simulate(
         str | None,
         typer.Option(
             metavar="|".join(GUARDS.installed),
-            help=f"Guard, by default {GUARDS.default}; {EACH}.",
+            help=f"Guard; {EACH}.",
+            show_default=GUARDS.default,
         ),
     ] = None,
     time_limit: TimeLimitOption = None,
-    ceiling: Annotated[
+    known_feasible: Annotated[
         int, typer.Option(min=0, help="Number of visited states to check for a feasible plan.")
     ] = 0,
     margin: MarginOption = None,
     seeds: SeedsOption = "0..9",
     steps: DriveStepsOption = None,
-    agents: Annotated[
-        int | None, typer.Option(min=1, help="Agents in each world; by default the system's.")
-    ] = None,
+    agents: AgentsOption = None,
     record: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also write the trace to this file (.npz, .csv, .mcap)."),
@@ -131,27 +130,24 @@ def simulate(
             f"{', '.join(PLANNERS.installed)}, or FILE.py.",
         ),
     ] = None,
-    option: PlannerOptionsOption = None,
+    option: MethodOptionsOption = None,
     budget: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="With --method: processor time per plan; by default 20ms."),
+        typer.Option(metavar="TIME", help="With --method: processor time per plan.", show_default="20ms"),
     ] = None,
-    plant: Annotated[
-        Path | None,
-        typer.Option("--plant", metavar="FILE", help="A plant file: RUN is a specification, and judges it."),
-    ] = None,
+    plant: PlantOption = None,
     from_: Annotated[
         str | None,
         typer.Option("--from", metavar="POINT", help="With --plant: values, such as `h=1 m, e=0.7`."),
     ] = None,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="With --plant: number of processes.")] = 1,
+    jobs: JobsOption = 1,
     stream: Annotated[
         bool, typer.Option("--stream", help="With --plant: judge while it runs, in constant memory.")
     ] = False,
     system: SystemOption = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
-    pictures: PicturesOption = True,
+    pictures: PicturesOption = False,
     window: Annotated[bool, typer.Option("--window", help="Show robots in PyBullet's window, too.")] = False,
     json: JsonOption = False,
 ) -> Answer[SimulateResult]:
@@ -167,8 +163,8 @@ def simulate(
     all of them. With --plant, RUN is a specification and FILE a plant file (docs/plants.md): a black box is
     simulated in processes of its own, at --from or at a random point for each seed, and each trace is judged.
     The command measures: its exit code is 0 whatever the drives satisfy, or with --fail-under 1 if fewer do;
-    and 1 if a plant gives no trace. The animation and the report take longer than short simulations:
-    --no-pictures does without, and `stlc report` draws them later.
+    and 1 if a plant gives no trace. With --pictures an animation and the report are drawn, which
+    can take longer than the simulation; `stlc report` draws the report later.
     """
     require_separate([("--record", record), ("--robustness", margins)], (run, plant, system))
     if plant is not None:
@@ -208,7 +204,7 @@ def simulate(
     if window:
         _require_robots(opened)
     size = agents or test.agents, steps or test.steps
-    setting = Setting(parse_seeds(seeds), *size, test.replan, ceiling=ceiling)
+    setting = Setting(parse_seeds(seeds), *size, test.replan, ceiling=known_feasible)
     if time_limit is not None:  # by default the paper's guard has none
         limit = parse_limit(time_limit)
         setting = replace(setting, limit=limit, paper_limit=limit)
@@ -220,10 +216,7 @@ def simulate(
     if not json:  # before the pictures, so that they do not affect the measurements
         for line in chain(screen(document, windows=windows), _bounds_shown(document, chosen)):
             printed(line)
-    begun = monotonic()
     drawn = _pictures(opened) if pictures else {}
-    if (took := monotonic() - begun) > LONG:
-        say(f"drawing took {took:.0f} s: --no-pictures does without, `stlc report` draws later")
 
     def show() -> None:
         # external functions are not stored in traces: judging needs the system file

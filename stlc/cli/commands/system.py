@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.framework import documents
-from stlc.cli.framework.options import MOST_SEED, SetOption, parse_overrides
+from stlc.cli.framework.options import SeedOption, SetOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.escape import visible
@@ -48,7 +48,7 @@ def check(
     steps: Annotated[
         int, typer.Option(min=0, help="Steps of the rollouts; with 0 the file is only read.")
     ] = 32,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of the states and controls.")] = 0,
+    seed: SeedOption = 0,
     set_: SetOption = None,
 ) -> Answer[documents.SystemFacts]:
     """Validate a system file with random rollouts.

@@ -17,6 +17,9 @@ from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.documents import TrainedRun, TrainedRuns
 from stlc.cli.framework.options import (
     MOST_SEED,
+    ClusterOption,
+    JobsOption,
+    MethodOptionsOption,
     PicturesOption,
     RunsOption,
     SetOption,
@@ -65,14 +68,16 @@ def train(
         str | None,
         typer.Option(
             metavar="TIME",
-            help="Training time, such as 5min (60s by default); the steps are adapted.",
+            help="Training time, such as 5min; the steps are adapted.",
+            show_default="60s",
         ),
     ] = None,
     clock: Annotated[
         str | None,
         typer.Option(
             metavar="wall|processor",
-            help="Clock of the budget, wall by default; processor time is that of an idle machine.",
+            help="Clock of the budget; processor time is that of an idle machine.",
+            show_default="wall",
         ),
     ] = None,
     steps: Annotated[
@@ -81,46 +86,39 @@ def train(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, max=MOST_SEED, help="Seed of everything random; the system file's if not given."),
+        typer.Option(min=0, max=MOST_SEED, help="Seed of everything random.", show_default="the system's"),
     ] = None,
     seeds: Annotated[
         str | None,
         typer.Option(metavar="SEEDS", help="Several runs, such as 0..2 or 0,3, in processes of their own."),
     ] = None,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs side by side.")] = 1,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            "--cluster",
-            metavar="auto|local|HOST:PORT",
-            help="Train on a Ray cluster, as many runs at a time as it has cores for.",
-        ),
-    ] = None,
+    jobs: JobsOption = 1,
+    cluster: ClusterOption = None,
     method: Annotated[
         str | None,
         typer.Option(
             metavar="|".join((*METHODS.installed, "FILE.py")),
-            help="How to train, see docs/methods.md; guided unless the system file says otherwise.",
+            help="How to train, see docs/methods.md.",
+            show_default="the system's, or guided",
         ),
     ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", metavar="NAME=VALUE", help="An option of the method; repeatable."),
-    ] = None,
+    option: MethodOptionsOption = None,
     resume: Annotated[
         str | None,
         typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the run; random words if not given.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the run.", show_default="random words")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of torch.")] = None,
     plans: Annotated[int | None, typer.Option(min=1, help="Plans that the network proposes.")] = None,
     lr: Annotated[float | None, typer.Option(help="Peak learning rate.")] = None,
     batch: Annotated[int | None, typer.Option(min=1, help="New states per step.")] = None,
-    held_out: Annotated[int | None, typer.Option(min=1, help="Held-out starts of the verdict; 5000.")] = None,
+    held_out: Annotated[
+        int | None, typer.Option(min=1, help="Held-out starts of the verdict.", show_default="5000")
+    ] = None,
     drives: Annotated[
         int | None,
-        typer.Option(min=0, help="Drives after the training, at most, per guard; 400, 0: none."),
+        typer.Option(min=0, help="Drives after the training per guard, at most.", show_default="400"),
     ] = None,
     falsify: Annotated[
         bool,

@@ -14,10 +14,11 @@ from stlc.cli.certify.text import floored
 from stlc.cli.framework.assured import Verified, VerifiedMode
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
-    MOST_SEED,
     FailUnderOption,
+    JobsOption,
     PythonOption,
     RunsOption,
+    SeedOption,
     SystemOption,
     parse_clock,
     parse_seconds,
@@ -57,7 +58,7 @@ def verify(
     ] = None,
     period: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Control period of the network; the time step if not given."),
+        typer.Option(metavar="TIME", help="Control period of the network.", show_default="the time step"),
     ] = None,
     continuous: Annotated[
         bool,
@@ -74,8 +75,8 @@ def verify(
     clock: Annotated[
         str, typer.Option(metavar="wall|processor", help="Clock of the search for proofs.")
     ] = "wall",
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes that prove.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of the sampled states.")] = 0,
+    jobs: JobsOption = 1,
+    seed: SeedOption = 0,
     fail_under: FailUnderOption = None,
     python: PythonOption = False,
     runs: RunsOption = Path("runs"),

@@ -16,11 +16,13 @@ PROGRAM = Program(
         "stlc check trace.npz",
     ),
     package="stlc.cli.commands",
-    order=(
-        *("train", "simulate", "falsify", "certify", "verify"),
-        *("check", "explain", "plot", "report", "runs", "export"),
-        *("init", "lint", "fmt", "compile", "system", "lsp", "schema", "doctor", "help"),
-    ),
+    groups={
+        "Requirements and traces": ("check", "explain", "plot", "lint", "fmt", "compile"),
+        "Controllers": ("plan", "train", "simulate", "export"),
+        "Assurance": ("falsify", "certify", "verify"),
+        "Projects and runs": ("init", "system", "runs", "report"),
+        "Tools": ("lsp", "schema", "doctor", "help"),
+    },
     moved={
         "bench": "python -m benchmarks  in a clone of the repository makes the tables of the documentation",
         "parse": "stlc compile FILE --show ast",

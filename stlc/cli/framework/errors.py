@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import typer
 
+from stlc.cli.framework.help import MOVED_OPTIONS
 from stlc.cli.framework.output import emit_json, show_diagnostics
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, not_installed, os_reason
 
@@ -126,9 +128,13 @@ def _usage(error: BaseException) -> Diagnostic:
     """
     message = str(error.format_message()).strip().rstrip(".")  # type: ignore[attr-defined]
     message = message.replace(": Value error, ", ": ")  # pydantic's prefix of messages of validators
-    context = getattr(error, "ctx", None)
+    context: Any = getattr(error, "ctx", None)
     command = getattr(context, "command_path", "stlc")
     lowered = message[:1].lower() + message[1:] if message[1:2].islower() else message
+    former = str(getattr(error, "option_name", ""))
+    present = MOVED_OPTIONS.get(former, former)
+    if present != former and any(present in param.opts for param in context.command.params):
+        return Diagnostic("U101", f"{former} is now called {present}", help=(f"{command} {present} …",))
     return Diagnostic("U101", lowered, help=(f"{command} --help",))
 
 

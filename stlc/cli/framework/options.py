@@ -76,7 +76,8 @@ TimeLimitOption = Annotated[
     str | None,
     typer.Option(
         metavar="TIME",
-        help="Time limit of a guard's decision per agent, or `none`; 100ms unless it is the paper's.",
+        help="Time limit of a guard's decision per agent, or `none`.",
+        show_default="100ms, or none of the paper's guard",
     ),
 ]
 MarginOption = Annotated[
@@ -87,7 +88,7 @@ MarginOption = Annotated[
     ),
 ]
 DriveStepsOption = Annotated[
-    int | None, typer.Option(min=1, help="Steps of each drive; by default the system's.")
+    int | None, typer.Option(min=1, help="Steps of each drive.", show_default="the system's")
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of all runs.")]
 PythonOption = Annotated[
@@ -98,9 +99,18 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a constant of the spec or a key of the system."),
 ]
-PlannerOptionsOption = Annotated[
+MethodOptionsOption = Annotated[
     list[str] | None,
-    typer.Option("--option", metavar="NAME=VALUE", help="An option of the planner; repeatable."),
+    typer.Option("--option", metavar="NAME=VALUE", help="An option of --method; repeatable."),
+]
+SeedOption = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of everything random.")]
+JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Number of processes side by side.")]
+AgentsOption = Annotated[
+    int | None, typer.Option(min=1, help="Agents in each world.", show_default="the system's")
+]
+PlantOption = Annotated[
+    Path | None,
+    typer.Option("--plant", metavar="FILE", help="A black box instead of a system (docs/plants.md)."),
 ]
 
 

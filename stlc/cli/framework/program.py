@@ -24,6 +24,7 @@ import typer
 
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.errors import report as report_error
+from stlc.cli.framework.help import CommandHelp, ProgramHelp
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, PluginError, UsageError
@@ -81,7 +82,7 @@ def subcommand(made: typer.Typer, name: str, *examples: str) -> Callable[[F], F]
     """
 
     def add(function: F) -> F:
-        made.command(name, help=_help(function, examples))(flat(function))
+        made.command(name, cls=CommandHelp, help=_help(function, examples))(flat(function))
         return function
 
     return add
@@ -163,7 +164,8 @@ class Program:
         name: name of the program, as it is typed.
         help: help text of the program.
         package: dotted name of the package of commands.
-        order: names of commands in the order of the help text; other commands follow in alphabetical order.
+        groups: title of a group in the help text -> names of its commands, in this order; other commands
+            follow in alphabetical order.
         moved: name of a former command -> command line that replaces it.
         elsewhere: commands of other packages; those of `package` come before them.
         drives: whether all commands run the Python that the files of a run name.
@@ -172,7 +174,7 @@ class Program:
     name: str
     help: str
     package: str
-    order: tuple[str, ...] = ()
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     moved: Mapping[str, str] = field(default_factory=dict)
     drives: bool = False
     elsewhere: Registry[Any] | None = None
@@ -180,7 +182,8 @@ class Program:
     def names(self) -> list[str]:
         """Return the names of all commands, in the order of the help text."""
         own, others = self._own(), self.elsewhere or ()
-        ordered = [*(name for name in self.order if name in own), *sorted(own - set(self.order))]
+        grouped = [name for names in self.groups.values() for name in names]
+        ordered = [*(name for name in grouped if name in own), *sorted(own.difference(grouped))]
         return [*ordered, *(name for name in others if name not in own)]
 
     def _own(self) -> set[str]:
@@ -200,6 +203,7 @@ class Program:
         """
         app = typer.Typer(
             name=self.name,
+            cls=type("_Help", (ProgramHelp,), {"titles": self.groups}),
             help=self.help,
             rich_markup_mode=None,
             pretty_exceptions_enable=False,
@@ -235,7 +239,8 @@ class Program:
         if isinstance(found, typer.Typer):
             app.add_typer(found, name=name)
         else:
-            app.command(name, help=_help(found, _MARKED[_place(found)]))(flat(found))
+            about = _help(found, _MARKED[_place(found)])
+            app.command(name, cls=CommandHelp, help=about)(flat(found))
 
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run a command line and return its exit code.

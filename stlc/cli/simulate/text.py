@@ -183,6 +183,8 @@ def closing(trace: str, drawn: Mapping[str, str], record: Path | None, system: s
     yield f"  trace      {visible(trace)}"
     for what, path in drawn.items():
         yield f"  {what:<10} {visible(path)}"
+    if not drawn:
+        yield f"  pictures   {shell(('stlc', 'report', operand(str(Path(trace).parent))))}"
     found = (
         find_trace("trace.npz")
         if Path("trace.npz").exists() or Path("runs/latest/trace.npz").exists()

@@ -173,7 +173,7 @@ def test_the_width_decides_when_to_stop(capsys: pytest.CaptureFixture[str]) -> N
     low, high = result["overall"]["interval"]
     assert (result["answer"], result["share"]) == ("measured", None)
     assert high - low <= 0.3
-    assert certified(capsys, "--width", ".01", "--max-drives", "100", code=4)["finished"] is True
+    assert certified(capsys, "--width", ".01", "--drives", "100", code=4)["finished"] is True
 
 
 @pytest.mark.usefixtures("there")

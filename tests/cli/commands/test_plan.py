@@ -35,7 +35,7 @@ def planned(*options: str) -> int:
 def test_what_makes_no_sense(
     options: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert planned(*options, "--output", str(tmp_path / "plan.npz")) == 2
+    assert planned(*options, "--out", str(tmp_path / "plan.npz")) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -72,7 +72,7 @@ def test_plans_found_before_a_signal_are_kept_and_counted(
     before = signal.getsignal(number)
     monkeypatch.setattr(PlanSearch, "offer", interrupted)
     trace = tmp_path / "plan.npz"
-    options = ["--starts", "5", "--output", str(trace)]
+    options = ["--starts", "5", "--out", str(trace)]
     assert planned(*options, "--json") == code
     captured = capsys.readouterr()
     assert "interrupted: 1 of 5 initial states were planned for" in captured.err
@@ -90,7 +90,7 @@ def test_without_any_plan_nothing_is_written(
         lambda *_: lambda _search: signal.raise_signal(signal.SIGTERM),
     )
     trace = tmp_path / "plan.npz"
-    assert planned("--starts", "5", "--output", str(trace), "--json") == 143
+    assert planned("--starts", "5", "--out", str(trace), "--json") == 143
     captured = capsys.readouterr()
     assert "interrupted: 0 of 5 initial states were planned for" in captured.err
     assert json.loads(captured.out)["exit_code"] == 143

@@ -142,7 +142,7 @@ def test_recorded_traces_are_checked_and_plotted(home, capsys):
         assert (calm["robustness"], calm["unit"]) == (pytest.approx(wanted), "cm")
     assert main(["check", "drier.stl", "trace.npz", "--certify", ".5", "--json"]) in (0, 1, 4)
     assert json.loads(capsys.readouterr().out)["result"]["assurance"]["overall"]["units"] == len(found)
-    assert main(["plot", "trace.npz", "--output", "levels.svg"]) == 0
+    assert main(["plot", "trace.npz", "--out", "levels.svg"]) == 0
     assert "level" in (home / "levels.svg").read_text()
     assert main(["simulate", "drier.stl", *options[:-1], "trace.csv"]) == code
     (following,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]

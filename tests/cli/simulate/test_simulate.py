@@ -392,7 +392,7 @@ def test_pictures_are_drawn(
     there: RunDir, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("stlc.view.player.MOST_FRAMES", 4)
-    assert main(["simulate", "--backup", *SMALL[:-1]]) == 0
+    assert main(["simulate", "--backup", "--pictures", *SMALL[:-1]]) == 0
     out = capsys.readouterr().out
     assert "report.html" in out
     assert "traffic.gif" in out
@@ -496,5 +496,5 @@ def test_a_planner_alone_is_guarded_and_certified(there: RunDir, capsys: pytest.
     assert run.path != there.path
     found = run.read_json("eval/simulate.json")["guards"]
     assert {"search", "assurance"} <= set(found["paper"]) & set(found["none"])
-    few = ["--share", "0.1", "--max-drives", "4", "--agents", "2", "--steps", "6", "--guard", "paper"]
+    few = ["--share", "0.1", "--drives", "4", "--agents", "2", "--steps", "6", "--guard", "paper"]
     assert main(["certify", run.shown, *few]) in (0, 1, 4)
