@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463139
+NODES = 463615
 CROSSINGS = 6.84
 CIRCLES = {
     ("cli/certify", "cli/check"),

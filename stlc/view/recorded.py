@@ -19,7 +19,7 @@ from stlc.view.html import Child, Html, Section, classed, el, figure, join, tabl
 from stlc.view.region_map import draw_map
 from stlc.view.run_animation import map_of_drives
 from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals, left_out
-from stlc.view.verdicts import judged_at_start, margins_of, monitor_of, trace_names, units_of
+from stlc.view.verdicts import judged_at_start, margins_of, marks_of, monitor_of, trace_names, units_of
 from stlc.view.words import count, share
 
 TITLE = "Recorded drives"
@@ -49,7 +49,7 @@ def recorded_section(contents: RunContents) -> Section | None:
     causes = explain_all(verdict)
     robustness = np.atleast_1d(np.asarray(verdict.robustness, dtype=float))
     choices = choose_traces(robustness, names, acted_in(trace))
-    picture = draw_signals(trace, margins, choices, units_of(verdict))
+    picture = draw_signals(trace, margins, choices, units_of(verdict), marks_of(verdict, causes, trace))
     body = join(
         el("p", _summary(verdict, "" if trace.meta.judge_text else " at every instant")),
         _verdict_table(verdict, causes, names),

@@ -132,6 +132,50 @@ def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class Deciding:
+    """Value that decides a violation: that of a signal at a sample of a trace.
+
+    Attributes:
+        signal: name of the signal.
+        trace: number of the trace.
+        sample: the sample.
+        window: first and last sample of the window in which the value comes closest; None without one.
+    """
+
+    signal: str
+    trace: int
+    sample: int
+    window: tuple[int, int] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """Thresholds of requirements, and the values that decide violations.
+
+    Attributes:
+        thresholds: signal -> constants with which predicates compare it, in the unit of the signal.
+        deciding: values that decide violations, each with its window.
+    """
+
+    thresholds: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    deciding: Sequence[Deciding] = ()
+
+    def draw(self, axes: Axes, name: str, trace: Trace, index: int) -> None:
+        """Mark the panel of the signal `name` of trace number `index`; the limits of the panel are kept."""
+        low, high = axes.get_ylim()
+        for value in self.thresholds.get(name, ()):
+            if 2 * low - high < value < 2 * high - low:  # one that is far away would flatten the signal
+                axes.axhline(value, color=MUTED, lw=0.9, ls="--")
+        for each in self.deciding:
+            if (each.signal, each.trace) == (name, index) and each.sample < trace.samples:
+                if each.window is not None:
+                    first, last = (min(sample, trace.samples - 1) for sample in each.window)
+                    axes.axvspan(trace.times[first], trace.times[last], color=RED, alpha=0.13, lw=0)
+                at = each.sample
+                axes.plot(trace.times[at], trace.data[name][index][at], "o", color=RED, ms=4)
+
+
+@dataclass(frozen=True, slots=True)
 class Choice:
     """A trace chosen to be drawn.
 
@@ -169,7 +213,11 @@ def choose_traces(
 
 
 def draw_signals(
-    trace: Trace, margins: Margins, choices: Sequence[Choice], units: Mapping[str, str] | None = None
+    trace: Trace,
+    margins: Margins,
+    choices: Sequence[Choice],
+    units: Mapping[str, str] | None = None,
+    marks: Marks | None = None,
 ) -> Picture:
     """Draw a column of panels per chosen trace: signals, decisions, and robustness of each requirement.
 
@@ -178,8 +226,9 @@ def draw_signals(
         margins: requirement -> robustness at every sample, (traces, samples), NaN where undefined.
         choices: the traces to draw.
         units: requirement -> unit of its robustness; it contains only requirements that have a unit.
+        marks: thresholds and deciding values, drawn with the signals.
     """
-    trace = drawable(trace)
+    trace, marks = drawable(trace), marks or Marks()
     rows = _rows(trace, margins)
     heights = [_HEIGHTS[kind] for kind, _ in rows]
     with picture_style():
@@ -192,6 +241,8 @@ def draw_signals(
             column[0].set_title(_wrapped(choice.title), pad=8)
             for axes, (kind, name) in zip(column, rows, strict=True):
                 _draw_row(axes, kind, name, trace, margins, choice.index)
+                if kind == "line":
+                    marks.draw(axes, name, trace, choice.index)
             column[-1].set_xlabel("time [s]")
             column[-1].tick_params(labelbottom=True)
         for axes, (kind, name) in zip(grid[:, 0], rows, strict=True):
@@ -199,7 +250,7 @@ def draw_signals(
             axes.set_ylabel(picture(labelled(name, unit)), rotation=0, ha="right", va="center", labelpad=6)
             axes.yaxis.set_label_coords(-0.085, 0.5)
         grid[0][0].set_xlim(trace.times[0], trace.times[-1])
-        _legend(figure, trace, bool(margins))
+        _legend(figure, trace, marks, bool(margins))
     shown = " and ".join(choice.title for choice in choices)
     return Picture(figure, f"Signals, decisions and robustness per requirement; {shown}.")
 
@@ -225,8 +276,9 @@ def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
     return rows + [("robustness", name) for name in margins]
 
 
-def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
-    """Draw the legend of robustness margins and decisions."""
+def _legend(figure: Figure, trace: Trace, marks: Marks, judged: bool) -> None:
+    """Draw the legend of thresholds, deciding values, robustness margins and decisions."""
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     keys = [(BLUE, 0.5, "robustness margin"), (RED, None, "violated")] if judged else []
@@ -234,7 +286,15 @@ def _legend(figure: Figure, trace: Trace, judged: bool) -> None:
     for source in sorted(set() if decisions is None else {*np.unique(decisions).tolist()} - {POLICY}):
         word, color = DECISIONS.get(source, ("", MUTED))
         keys.append((color, None, f"{word} decided"))
-    handles = [Patch(color=color, alpha=alpha, lw=0, label=label) for color, alpha, label in keys]
+    handles: list[Artist] = [
+        Patch(color=color, alpha=alpha, lw=0, label=label) for color, alpha, label in keys
+    ]
+    if marks.deciding:
+        handles.insert(0, Line2D([], [], color=RED, marker="o", ms=4, lw=0, label="decides the violation"))
+        if any(each.window for each in marks.deciding):
+            handles.insert(1, Patch(color=RED, alpha=0.13, lw=0, label="its window"))
+    if any(marks.thresholds.values()):
+        handles.insert(0, Line2D([], [], color=MUTED, lw=0.9, ls="--", label="threshold"))
     if handles:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), handlelength=1.0)
 

@@ -5,7 +5,7 @@ The runs are evaluated by the specification that is stored in their trace.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import margin_unit
+from stlc.compile.ir.traverse import margin_unit, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.monitor.explain.report import violations
+from stlc.monitor.explain.report import Cause, violations
 from stlc.monitor.judgement import Judgement
 from stlc.monitor.verdict import Monitor, Verdict
 from stlc.source import Source
 from stlc.trace import Trace
-from stlc.view.signals import Strip
+from stlc.view.signals import Deciding, Marks, Strip
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -114,6 +114,29 @@ def demands_of(formula: ir.Formula) -> list[Demand]:
 def units_of(verdict: Verdict) -> dict[str, str]:
     """Mapping from requirements to the units of their robustness; it omits requirements without a unit."""
     return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
+
+
+def marks_of(verdict: Verdict, causes: Mapping[str, Cause], trace: Trace) -> Marks:
+    """Thresholds of the requirements of `verdict` on `trace`, and values that decide its violations."""
+    columns = {each.name: each for each in trace.signature.columns}
+    thresholds: dict[str, list[float]] = {}
+    for judgement in verdict:
+        for part in nodes(judgement.rule.formula):
+            match part:
+                case ir.Predicate(
+                    ir.Op("sub", (ir.Signal(name), ir.Const(value)) | (ir.Const(value), ir.Signal(name)))
+                ) if name in columns:
+                    unit = columns[name].unit
+                    shown = (value - float(unit.offset)) / unit.scale
+                    thresholds[name] = list(dict.fromkeys([*thresholds.get(name, ()), shown]))
+    deciding = []
+    for cause in causes.values():
+        leaf, first = cause.tree.leaf, cause.first
+        window = (first + leaf.during[0], first + leaf.during[-1]) if leaf.during else None
+        deciding += [
+            Deciding(name, cause.trace, cause.sample + offset, window) for name, offset in leaf.reads
+        ]
+    return Marks(thresholds, deciding)
 
 
 def _judged_once(verdict: Verdict) -> list[Judgement]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stlc.signature import Column, Signature
-from stlc.view.signals import choose_traces, draw_signals, left_out, margin_limits
+from stlc.view.signals import Choice, Deciding, Marks, choose_traces, draw_signals, left_out, margin_limits
 
 
 @pytest.fixture
@@ -109,6 +109,20 @@ def test_what_has_no_panel_is_named(recording):
     wide = replace(recording, signature=more, data={**recording.data, **still})
     assert left_out(recording) == []
     assert left_out(wide) == [f"z{k}" for k in range(7)]
+
+
+def test_thresholds_and_deciding_values_are_marked_where_they_belong(recording, margins):
+    x = recording.data["x"][3]
+    near, far = float(x.mean()), float(x.max() + 100 * (np.ptp(x) + 1))
+    marks = Marks({"x": (near, far)}, (Deciding("x", 3, 7, (4, 9)), Deciding("x", 5, 7, None)))
+    figure = draw_signals(recording, margins, (Choice(3, "trace 3"),), marks=marks).figure
+    (panel,) = (axes for axes in figure.axes if axes.get_ylabel().startswith("x"))
+    dashed = [line.get_ydata()[0] for line in panel.lines if line.get_linestyle() == "--"]
+    assert dashed == [near]  # the far one would flatten the signal
+    (dot,) = (line for line in panel.lines if line.get_marker() == "o")
+    assert (dot.get_xdata()[0], dot.get_ydata()[0]) == (recording.times[7], x[7])
+    (legend,) = figure.legends
+    assert {"threshold", "decides the violation", "its window"} <= {t.get_text() for t in legend.get_texts()}
 
 
 def test_margins_are_labelled_with_their_units(recording, margins, choices):

@@ -8,8 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stlc.grammar.parse.parser import parse
+from stlc.monitor.explain.report import explain_all
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
+from stlc.source import Source
 from stlc.trace import Trace, TraceMeta
 from stlc.units import parse_unit
 from stlc.view.verdicts import (
@@ -22,6 +25,7 @@ from stlc.view.verdicts import (
     least,
     margins_of,
     marks,
+    marks_of,
     monitor_of,
     strip_of,
     units_of,
@@ -187,3 +191,20 @@ def test_a_mark_comes_and_goes():
     shown = marks(events, 12, 2, {"low"})
     assert not shown[:, 0].any()
     assert shown[:, 1].tolist() == [False, False, True, *(FLASH * FLASHES)[:9]]
+
+
+def test_marks_are_in_the_units_of_the_trace_and_name_the_deciding_sample():
+    text = "spec s\nsignal x [m]\nrequire up: always (x < 4 m -> eventually[0 s, 2 s] x > 0.8 m)\n"
+    column = Column("x", unit=parse_unit("cm"))
+    trace = Trace(
+        Signature((column,)), 1.0, {"x": np.array([[500.0, 300.0, 20.0, 79.0, 500.0, 500.0, 500.0]])}
+    )
+    verdict = Monitor(parse(Source("s.stl", text))).check(trace)
+    assert marks_of(verdict, {}, trace).thresholds == {"x": pytest.approx([400.0, 80.0])}
+    assert not marks_of(verdict, explain_all(verdict), trace).deciding  # it comes back in time
+    trace.data["x"][0, 4:] = 70.0
+    verdict = Monitor(parse(Source("s.stl", text))).check(trace)
+    (only,) = marks_of(verdict, explain_all(verdict), trace).deciding
+    first, last = only.window
+    assert first <= only.sample <= last
+    assert trace.data["x"][0, only.sample] == trace.data["x"][0, first : last + 1].max()

@@ -55,10 +55,11 @@ def plot(
     requirements, such as `dock` in `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
     from stlc.cli.check.judge import load
+    from stlc.monitor.explain.report import explain_all
     from stlc.rundir import recorded_trace
     from stlc.view import require_drawing
     from stlc.view.signals import draw_signals
-    from stlc.view.verdicts import margins_of, units_of
+    from stlc.view.verdicts import margins_of, marks_of, units_of
 
     require_drawing()
     path = recorded_trace(what, reading.runs)
@@ -77,8 +78,10 @@ def plot(
     else:
         verdict = monitor.check(recorded, require=reading.require or [])
         margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
-        choices = _choices(recorded, margins, trace)
-        picture = draw_signals(_with_units(recorded, monitor.spec), margins, choices, units)
+        choices = _choices(recorded, margins, trace, path.name)
+        drawn = _with_units(recorded, monitor.spec)
+        marks = marks_of(verdict, explain_all(verdict), drawn)
+        picture = draw_signals(drawn, margins, choices, units, marks)
         shown = [choice.index for choice in choices]
     _save(picture, target)
 
@@ -148,13 +151,13 @@ def _require_trace(traces: int, wanted: int) -> None:
         raise usage(f"there is no trace {wanted}", *advice)
 
 
-def _choices(trace: Trace, margins: Margins, wanted: int | None) -> tuple[Choice, ...]:
+def _choices(trace: Trace, margins: Margins, wanted: int | None, file: str) -> tuple[Choice, ...]:
     import numpy as np
 
     from stlc.view.signals import Choice, acted_in, choose_traces
     from stlc.view.verdicts import trace_names
 
-    names = trace_names(trace)
+    names = trace_names(trace) if trace.traces > 1 else [file]
     if wanted is not None:
         _require_trace(len(names), wanted)
         return (Choice(wanted, names[wanted]),)
