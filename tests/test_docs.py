@@ -311,11 +311,23 @@ def test_the_python_of_the_quickstart_runs(monkeypatch, capsys):
 
 def test_the_readme_shows_the_specification_as_it_is():
     shown = next(
-        body for language, body in FENCE.findall((ROOT / "README.md").read_text()) if "require" in body
+        body
+        for language, body in FENCE.findall((ROOT / "README.md").read_text())
+        if body.startswith("@safety")
     )
     written = (ROOT / "specs/traffic.stl").read_text(encoding="utf-8").splitlines()
     for line in filter(None, shown.splitlines()):
         assert line in written
+
+
+def test_the_readme_shows_a_real_check(monkeypatch, capsys):
+    (shown,) = [
+        body for _, body in FENCE.findall((ROOT / "README.md").read_text()) if body.startswith("$ stlc check")
+    ]
+    command, _, rest = shown.partition("\n")
+    monkeypatch.chdir(ROOT)
+    assert main(shlex.split(command)[2:]) == 1
+    assert rest.partition("\n$ ")[0] == capsys.readouterr().out.rstrip()
 
 
 def test_the_readme_shows_a_real_diagnostic(monkeypatch, tmp_path, capsys):

@@ -19,6 +19,7 @@ from stlc.escape import visible
 if TYPE_CHECKING:
     from stlc.grammar import ast
     from stlc.monitor.verdict import Monitor
+    from stlc.signature import Column
     from stlc.trace import Trace
     from stlc.view.signals import Choice, Margins
     from stlc.view.style import Picture
@@ -79,7 +80,7 @@ def plot(
         verdict = monitor.check(recorded, require=reading.require or [])
         margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
         choices = _choices(recorded, margins, trace, path.name)
-        drawn = _with_units(recorded, monitor.spec)
+        drawn = _as_declared(recorded, monitor.spec)
         marks = marks_of(verdict, explain_all(verdict), drawn)
         picture = draw_signals(drawn, margins, choices, units, marks)
         shown = [choice.index for choice in choices]
@@ -101,19 +102,22 @@ def _target(output: Path | None, trace: Path) -> Path:
     return target
 
 
-def _with_units(trace: Trace, spec: ast.Spec) -> Trace:
-    """Return the trace; signals without a unit in the file get the unit that the specification declares."""
+def _as_declared(trace: Trace, spec: ast.Spec) -> Trace:
+    """Return the trace; a column without unit and type has those that the specification declares."""
     from stlc.grammar import ast
     from stlc.signature import Signature
     from stlc.units import parse_unit
 
-    signals = [item for item in spec.items if isinstance(item, ast.Signal) and item.unit]
-    declared = {item.column or item.name: parse_unit(item.unit) for item in signals}
-    columns = (
-        replace(c, unit=declared[c.name]) if not c.unit.text and c.name in declared else c
-        for c in trace.signature.columns
-    )
-    return replace(trace, signature=Signature(tuple(columns)))
+    def declared(column: Column) -> Column:
+        for item in spec.items:
+            if isinstance(item, ast.Signal) and (item.column or item.name) == column.name:
+                if item.unit and not column.unit.text:
+                    return replace(column, unit=parse_unit(item.unit))
+                if item.type and item.type.name == "bool":
+                    return replace(column, kind="bool")
+        return column
+
+    return replace(trace, signature=Signature(tuple(map(declared, trace.signature.columns))))
 
 
 def _one(trace: Trace, wanted: int | None) -> Trace:
