@@ -1,6 +1,6 @@
 """Proximal policy optimisation in one file, on the vector environment of a benchmark.
 
-    pip install 'stlc[gym]'
+    pip install -e ".[train,gym]"
     python examples/gym_ppo.py traffic --envs 512 --updates 100
 
 In the manner of CleanRL's `ppo_continuous_action.py`, to read and to change. A batch is one episode of every

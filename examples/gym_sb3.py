@@ -1,6 +1,6 @@
 """Train a policy with Stable-Baselines3 on a benchmark, and count satisfied episodes.
 
-    pip install 'stlc[gym]' stable-baselines3
+    pip install -e ".[train,gym]" stable-baselines3
     python examples/gym_sb3.py traffic --method ppo --steps 200000
     python examples/gym_sb3.py traffic --method sac --reward task --envs 8 --steps 20000
 

@@ -15,6 +15,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from stlc.extras import explained
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -77,7 +78,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'stlc' has no attribute '{name}'")
     module, _, attribute = _HOMES[name].partition(":")
-    value = getattr(import_module(module), attribute)
+    with explained():
+        value = getattr(import_module(module), attribute)
     globals()[name] = value
     return value
 
@@ -122,8 +124,10 @@ class _CallablePackage(ModuleType):
 
         Raises:
             SpecError: the specification is invalid, or does not fit the system.
+            NotInstalledError: R301, the extra `train` is not installed.
         """
-        from stlc.controller.problem.task import Task
+        with explained():
+            from stlc.controller.problem.task import Task
 
         return Task.of(spec, system)
 

@@ -159,11 +159,6 @@ class MissingError(StlcError):
     exit_code = 5
 
 
-def not_installed(message: str, extra: str) -> MissingError:
-    """Return the error R301 (a package is not installed); the extra `stlc[extra]` would install it."""
-    return MissingError(Diagnostic("R301", message, help=(f"pip install 'stlc[{extra}]'",)))
-
-
 class Notice(UserWarning):
     """A warning about the machine that does not affect results; the command line shows it once."""
 

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from hypothesis import HealthCheck, settings
 from stlc.__main__ import GARBAGE
 
 TESTS = Path(__file__).parent
+if find_spec("torch") is None:  # the base installation
+    pytest_plugins = ["helpers.light"]
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -68,7 +71,7 @@ TRAINING = {
 @pytest.fixture(scope="module", autouse=True)
 def _small_runs(request: pytest.FixtureRequest):
     with pytest.MonkeyPatch.context() as patch:
-        if request.path.relative_to(TESTS).parts[0] in TRAINING:
+        if find_spec("torch") and request.path.relative_to(TESTS).parts[0] in TRAINING:
             from stlc.controller.training import loop
 
             decided = loop.resolve_config

@@ -19,7 +19,7 @@ ROOMS = (
     {"source", "version", "stopping"},
     {"diagnostics"},
     {"escape"},
-    {"plugins", "registry", "units", "jsontext"},
+    {"plugins", "registry", "units", "jsontext", "extras"},
     {"signature"},
     {"rundir", "files", "foreign", "provenance", "cache", "toolchain", "native", "trace"},
     {"grammar"},

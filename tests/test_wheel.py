@@ -339,4 +339,4 @@ def test_what_it_is(metadata):
     assert {re.split(r"[<>=!~ ]", entry)[0] for entry in needed} == IMPORTED
 
 
-IMPORTED = {"lark", "typer", "rich", "pyyaml", "numpy", "torch", "safetensors"}
+IMPORTED = {"lark", "typer", "rich", "pyyaml", "numpy"}

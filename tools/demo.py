@@ -37,7 +37,7 @@ def newest():
 
 def main():
     """Run all stages and print the table of their run times."""
-    seconds = environment.ensure()
+    seconds = environment.ensure("train,plot")
     rows = [("environment", f".venv (Python {platform.python_version()})", seconds)]
     for name, arguments, text, answers in STAGES:
         code, seconds = stage(name, arguments, answers)

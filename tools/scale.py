@@ -2,7 +2,7 @@
 
     python tools/scale.py --files 60 --samples 20000 --simulations 400
 
-starts the nodes with one CPU each (`pip install 'stlc[cluster]'`), writes recordings to a temporary folder,
+starts the nodes with one CPU each (extra `cluster`), writes recordings to a temporary folder,
 judges them by `stlc check`, and searches a system by `stlc falsify`. It prints elapsed and processor time of
 each way. The processor time of a cluster is that of its workers and of the command. Results must be the same.
 """

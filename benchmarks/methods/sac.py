@@ -1,7 +1,7 @@
 """Soft actor-critic (Haarnoja et al., ICML 2018) by stable-baselines3.
 
 RL_R, RL_S and RL_A of Meng and Fan (2023) are this method with `reward=task`, `robustness` and `accuracy`.
-Training needs stable-baselines3, which `stlc[bench]` installs; the trained policy does not.
+Training needs stable-baselines3, which the extra `bench` installs; the trained policy does not.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from benchmarks.methods._sac import SacActor, SacConfig
 from stlc.controller.methods import Learner, Method
 from stlc.controller.training.config import base_config
 from stlc.controller.training.run import load_weights
-from stlc.diagnostics import not_installed
+from stlc.extras import explained
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.ddp import Ranks
@@ -51,12 +51,8 @@ class Sac(Method):
             UsageError: U101, no reward is named `config.reward`; or this name is `task`, and the system
                 declares no reward; or several processes are to train together.
         """
-        try:
+        with explained():
             from benchmarks.methods._sb3 import SacLearner
-        except ModuleNotFoundError as error:
-            if (error.name or "").partition(".")[0] not in ("stable_baselines3", "gymnasium"):
-                raise
-            raise not_installed("method `sac` needs stable-baselines3", "bench") from None
         assert isinstance(config, SacConfig)
         return SacLearner(task, config, steps=steps, device=device, ranks=ranks)
 

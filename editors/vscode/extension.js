@@ -24,7 +24,7 @@ async function start() {
   try {
     await client.start();
   } catch (error) {
-    const advice = "pip install 'stlc[lsp]', or say where it is in the setting stlc.command";
+    const advice = "Install stlc with its extra lsp, or say where it is in the setting stlc.command";
     vscode.window.showErrorMessage(`stlc: ${program} does not start (${error.message}). ${advice}`);
   }
 }

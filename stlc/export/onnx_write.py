@@ -15,8 +15,9 @@ from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, Value
 from stlc.controller.guard import candidates as backup
 from stlc.controller.training.run import spec_hash, system_hash
-from stlc.diagnostics import Diagnostic, UsageError, not_installed
+from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export.onnx_graphs import deciding, falling, following, judging
+from stlc.extras import needed
 from stlc.jsontext import dumps
 from stlc.provenance import sha256
 from stlc.runtime import Controller
@@ -46,10 +47,7 @@ IR_VERSION = 8
 
 def require_onnx() -> None:
     """Raise MissingError (R301) if the package `onnx` is not installed."""
-    try:
-        import onnx  # noqa: F401
-    except ImportError:
-        raise not_installed("`--to onnx` needs the packages `onnx` and `onnxruntime`", "onnx") from None
+    needed("onnx", "`--to onnx` needs")
 
 
 def model_of(

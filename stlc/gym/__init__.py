@@ -3,19 +3,18 @@
 `make` returns one environment; `make_vec` returns many, which are simulated as one batch in C. Importing this
 package registers the six benchmarks with gymnasium: `gymnasium.make("stlc/traffic-v0")` and
 `gymnasium.make_vec(…)`. The reward is computed from the specification, by default as the robustness of the
-episode. The package needs the optional packages of `stlc[gym]`.
+episode. The package needs the extras `gym` and `train`.
 """
 
 from __future__ import annotations
 
-try:
-    import gymnasium
-except ModuleNotFoundError:
-    message = "stlc.gym needs gymnasium, which is not installed: pip install 'stlc[gym]'"
-    raise ModuleNotFoundError(message, name="gymnasium") from None
+from stlc.extras import explained
 
-from stlc.gym.single import Reward, SpecEnv, make
-from stlc.gym.vector import SpecVectorEnv, make_vec
+with explained():
+    import gymnasium
+
+    from stlc.gym.single import Reward, SpecEnv, make
+    from stlc.gym.vector import SpecVectorEnv, make_vec
 
 __all__ = ["BENCHMARKS", "Reward", "SpecEnv", "SpecVectorEnv", "make", "make_vec"]
 

@@ -12,16 +12,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, MissingError, usage
+from stlc.diagnostics import usage
+from stlc.extras import explained
 from stlc.gym.pictures import Picture
 from stlc.gym.spaces import Floats
 from stlc.gym.vector import SpecVectorEnv
 
-try:
+with explained():
     from stable_baselines3.common.vec_env import VecEnv
-except ModuleNotFoundError:
-    message = "stlc.gym.sb3 needs stable-baselines3, which is not installed"
-    raise MissingError(Diagnostic("R301", message, help=("pip install stable-baselines3",))) from None
 
 Indices: TypeAlias = Iterable[int] | int | None
 

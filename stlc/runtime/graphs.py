@@ -10,7 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, MissingError, RunError
+from stlc.diagnostics import Diagnostic, RunError
+from stlc.extras import needed
 from stlc.runtime.facts import CONTINUE, DECIDE, FALL, FOLLOW, JUDGE, Facts
 
 Numbers: TypeAlias = NDArray[np.float64]
@@ -127,11 +128,7 @@ class Graphs:
         return self._session(FALL) if FALL in self.facts.graphs else None
 
     def _session(self, name: str) -> Any:
-        try:
-            import onnxruntime
-        except ImportError:
-            message = "this needs the package `onnxruntime`, which is not installed"
-            raise MissingError(Diagnostic("R301", message, help=("pip install onnxruntime",))) from None
+        onnxruntime = needed("onnxruntime")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads
         options.inter_op_num_threads = 1

@@ -26,7 +26,6 @@ from stlc.trace.formats.registry import (
     FORMATS,
     WRITTEN,
     format_of,
-    needed,
     opened,
     suffix_of,
     suffixes,
@@ -402,10 +401,9 @@ def check_writable(path: Path | str) -> None:
         MissingError: R301, an `.mcap` file needs a package that is not installed.
     """
     suffix, found = Path(path).suffix.lower(), format_of(Path(path))
-    writes = found.writes and suffix == found.suffixes[0]
-    if writes and found.packages:
-        needed(found.packages[0])
-    if not writes and not Path(path).is_char_device():
+    if found.writes and suffix == found.suffixes[0]:
+        found.require()
+    elif not Path(path).is_char_device():
         message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
         raise UsageError(
             Diagnostic("U101", message, help=(f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}",))

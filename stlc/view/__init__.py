@@ -1,6 +1,6 @@
 """Pictures of training and deployment: learning curves, signals, failures, animations, and one report.
 
-Drawing needs matplotlib and Pillow (`pip install 'stlc[plot]'`). They are imported only when a picture is
+Drawing needs matplotlib and Pillow (extra `plot`). They are imported only when a picture is
 drawn, so that training and deployment work without them. The function `available` tells whether both are
 installed.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from stlc.diagnostics import not_installed
+from stlc.extras import not_installed
 
 _PACKAGES = {"matplotlib": "matplotlib", "PIL": "pillow"}
 
@@ -23,8 +23,7 @@ def require_drawing() -> None:
     """Raise MissingError (R301) if matplotlib or Pillow is not installed."""
     missing = _missing()
     if missing:
-        verb = "is" if len(missing) == 1 else "are"
-        raise not_installed(f"pictures need {' and '.join(missing)}, which {verb} not installed", "plot")
+        raise not_installed(*missing, need="pictures need")
 
 
 def _missing() -> list[str]:

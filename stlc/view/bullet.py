@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 
 from stlc.controller.sketch import DECIDED, NOTE, deciders
 from stlc.controller.stage import Ball, Stage
-from stlc.diagnostics import Diagnostic, MissingError, not_installed
+from stlc.diagnostics import Diagnostic, MissingError
 from stlc.dynamics.robots.kinematics import read_urdf, robot_of
+from stlc.extras import not_installed
 from stlc.view.scene import Scene
 
 Mode: TypeAlias = Literal["picture", "window"]
 Draw: TypeAlias = Callable[[Any, Scene, int], None]
 Rgba: TypeAlias = tuple[float, float, float, float]
 
-ADVICE = "pip install 'stlc[panda]'"
 SIZE = 1216
 """Width of a picture in pixels."""
 PITCH = 1.32
@@ -40,7 +40,7 @@ _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 
 def available() -> bool:
     """True if PyBullet is installed."""
-    return find_spec("pybullet") is not None and find_spec("pybullet_data") is not None
+    return find_spec("pybullet") is not None
 
 
 def stage_drawing(stage: Stage) -> Draw:
@@ -93,7 +93,7 @@ def show(stage: Stage, scene: Scene, dt: float) -> None:
 def require_window() -> None:
     """Raise MissingError: R301 if PyBullet is not installed, R302 if there is no display."""
     if not available():
-        raise not_installed("a window needs pybullet, which is not installed", "panda")
+        raise not_installed("pybullet", need="a window needs")
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         advice = ("leave `--window` out: the animation shows the same, and needs no display",)
         raise MissingError(Diagnostic("R302", "there is no display for a window", help=advice))

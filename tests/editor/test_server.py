@@ -12,6 +12,7 @@ import pytest
 from lsp_client import Client, LspError
 
 from stlc.cli.framework.app import main
+from stlc.extras import installation
 
 pytestmark = pytest.mark.apart
 
@@ -216,4 +217,4 @@ def test_without_the_package_the_command_says_what_to_install(monkeypatch, capsy
     for name in [name for name in sys.modules if name.startswith(("pygls.", "stlc.editor"))]:
         monkeypatch.delitem(sys.modules, name)
     assert main(["lsp"]) == 5
-    assert "pip install 'stlc[lsp]'" in capsys.readouterr().err
+    assert installation("lsp") in capsys.readouterr().err

@@ -9,6 +9,7 @@ from PIL import Image
 
 import stlc.view
 from stlc.diagnostics import MissingError
+from stlc.extras import installation
 from stlc.view.style import BLUE, INK, ON_DARK, PAPER, Picture, new_figure, picture_style
 
 
@@ -64,7 +65,7 @@ def test_missing_package_says_how_to_get_it(monkeypatch):
         stlc.view.require_drawing()
     (finding,) = caught.value.diagnostics
     assert finding.code == "R301"
-    assert finding.help == ("pip install 'stlc[plot]'",)
+    assert finding.help == (installation("plot"),)
     assert "matplotlib" in finding.message
     assert "pillow" not in finding.message
 

@@ -2,7 +2,7 @@
 
 An array is `(time, 1)`, since a nonlinear program computes one trajectory. Kinks of functions (`abs`, `min`,
 `max`, `clip`) are rounded over the width `ROUNDING`, so that Newton's method applies. Step functions
-(`floor`, `sign`) stay exact, with derivative 0. CasADi comes with the extra `stlc[bench]`.
+(`floor`, `sign`) stay exact, with derivative 0. CasADi comes with the extra `bench`.
 """
 
 from __future__ import annotations

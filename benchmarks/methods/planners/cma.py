@@ -1,4 +1,4 @@
-"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by a package of `stlc[bench]`."""
+"""`cma`: covariance matrix adaptation over plans (Hansen 2016), by a package of the extra `bench`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from stlc.controller.options import bounded
-from stlc.diagnostics import not_installed
+from stlc.extras import needed
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
@@ -38,10 +38,7 @@ class Cma:
         Raises:
             MissingError: R301, the package `cma` is not installed.
         """
-        try:
-            import cma
-        except ModuleNotFoundError:
-            raise not_installed("planner `cma` needs cma", "bench") from None
+        cma = needed("cma", "planner `cma` needs")
         return partial(self._run, strategy=cma.CMAEvolutionStrategy)
 
     def _run(self, search: PlanSearch, strategy: Any) -> None:

@@ -1,4 +1,4 @@
-"""`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT, which `stlc[bench]` installs.
+"""`mpc`: nonlinear programming by CasADi (Andersson et al. 2019) and IPOPT, which the extra `bench` installs.
 
 This planner applies to smooth systems. It uses multiple shooting with the smooth robustness of Pant et al.
 (2017), from several initial guesses. `simulate --method mpc` plans anew in every step: model predictive
@@ -20,8 +20,9 @@ from torch import Tensor
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.search.local_search import Searcher
-from stlc.diagnostics import not_installed, usage
+from stlc.diagnostics import usage
 from stlc.dynamics.model.step import build_step
+from stlc.extras import needed
 
 if TYPE_CHECKING:
     from benchmarks.methods.planners._shooting import Shooting
@@ -70,10 +71,7 @@ class Mpc:
                 expression.
             MissingError: R301, CasADi is not installed.
         """
-        try:
-            import casadi
-        except ModuleNotFoundError:
-            raise not_installed("planner `mpc` needs casadi", "bench") from None
+        casadi = needed("casadi", "planner `mpc` needs")
         shooting = self._shooting(task)
         options: dict[str, Any] = {
             "print_time": False,

@@ -13,7 +13,8 @@ import numpy as np
 
 from stlc.assurance.verification.forms import Floats
 from stlc.assurance.verification.network import NetworkLayer
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, usage
+from stlc.diagnostics import StlcError, usage
+from stlc.extras import needed
 
 WIDEST = 100_000
 """Largest number of inputs of a network."""
@@ -28,11 +29,7 @@ def read_onnx(path: Path) -> list[NetworkLayer]:
         UsageError: U101, the file cannot be read, or has an operation that is not supported.
         MissingError: R301, the package onnx is missing.
     """
-    try:
-        import onnx
-    except ImportError:
-        message = "a network in ONNX needs the package onnx"
-        raise MissingError(Diagnostic("R301", message, help=("pip install 'stlc[onnx]'",))) from None
+    onnx = needed("onnx", "a network in ONNX needs")
     try:
         return _layers(onnx.load(str(path), load_external_data=False).graph, path)
     except StlcError:

@@ -41,9 +41,9 @@ def require_table(path: Path | None) -> None:
     if path.is_dir():
         raise usage(f"`--table {path}` is a folder")
     if path.suffix.lower() == ".parquet":
-        from stlc.trace.formats.registry import needed
+        from stlc.trace.formats.registry import format_of
 
-        needed("pyarrow.parquet")
+        format_of(path).require()
 
 
 def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:

@@ -15,12 +15,13 @@ from stlc.cli.framework.documents import InstallationFinding, InstallationReport
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import StlcError
+from stlc.extras import commands
 from stlc.plugins import installed
 
 MISSING = 5
 
 _SLOWER = "torch does its work, about ten times slower"
-_NEEDED = ("torch", "numpy", "lark", "pyyaml", "safetensors", "typer", "rich")
+_NEEDED = ("numpy", "lark", "pyyaml", "typer", "rich")
 
 
 @command("stlc doctor")
@@ -53,36 +54,16 @@ def _python() -> Iterator[InstallationFinding]:
     from stlc.version import __version__
 
     yield _finding("stlc", "ok", f"{__version__} in {Path(__file__).parents[2]}")
-    found = ".".join(map(str, sys.version_info[:3]))
-    enough = sys.version_info >= (3, 11)
-    yield _finding("python", "ok" if enough else "missing", found if enough else f"{found}; 3.11 is needed")
+    yield _finding("python", "ok", ".".join(map(str, sys.version_info[:3])))
 
 
 def _packages() -> Iterator[InstallationFinding]:
     for name in _NEEDED:
         found = _version(name)
         yield _finding(name, "ok" if found else "missing", found or f"pip install {name}")
-    for package, extra in _optional().items():
+    for package, advice in commands().items():
         found = _version(package)
-        yield _finding(package, "ok" if found else "off", found or f"pip install 'stlc[{extra}]'")
-
-
-def _optional() -> dict[str, str]:
-    """Optional packages: name -> name of the extra that installs it, read from the metadata of stlc."""
-    from importlib.metadata import PackageNotFoundError, requires
-
-    try:
-        declared = requires("stlc") or []
-    except PackageNotFoundError:
-        return {}
-    found: dict[str, str] = {}
-    for entry in declared:
-        requirement, _, marker = entry.partition(";")
-        extra = marker.partition("extra ==")[2].strip(" '\"()")
-        name = requirement.split("[")[0].split(">")[0].split("=")[0].split("<")[0].split("!")[0].strip()
-        if extra and extra not in ("dev", "all") and name != "stlc":
-            found.setdefault(name, extra)
-    return found
+        yield _finding(package, "ok" if found else "off", found or advice)
 
 
 def _version(package: str) -> str:

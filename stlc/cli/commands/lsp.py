@@ -24,7 +24,7 @@ def lsp(
     """Serve an editor: findings, hover, completion, rename, format.
 
     Editors start this command and communicate with it by the language server protocol, over the standard
-    input and output. It needs `pip install 'stlc[lsp]'`. See docs/editors.md for the setup of editors.
+    input and output. It needs the extra `lsp`. See docs/editors.md for the setup of editors.
     """
     from stlc.editor.server import make_server
 

@@ -533,16 +533,15 @@ def _pictures(run: Run) -> dict[str, str]:
     from stlc.view import available
 
     if not available():
-        say("no pictures: they need matplotlib and pillow (pip install 'stlc[plot]')")
+        say("no pictures: they need the extra `plot` (see `stlc doctor`)")
         return {}
-    from stlc.view.bullet import ADVICE as BODIES
     from stlc.view.bullet import available as in_space
     from stlc.view.report import write_report
     from stlc.view.run_animation import animate, recorded_scene
 
     seen = recorded_scene(run.dir)
     if seen is not None and seen.stage is not None and not in_space():
-        say(f"robots are drawn as lines: bodies need pybullet ({BODIES})")
+        say("robots are drawn as lines: bodies need the extra `panda`")
     with PULSE.doing("drawing the animation"):
         gif = animate(run.dir)
     with PULSE.doing("drawing the report"):

@@ -15,7 +15,8 @@ import typer
 
 from stlc.cli.framework.help import MOVED_OPTIONS
 from stlc.cli.framework.output import emit_json, show_diagnostics
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, not_installed, os_reason
+from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, os_reason
+from stlc.extras import absent
 
 INTERNAL_ERROR = 70
 INTERRUPTED = 130
@@ -28,8 +29,6 @@ _NO_WRITING = frozenset(
     }
 )
 _NO_FILE = frozenset({errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
-_EXTRAS = {"matplotlib": "plot", "PIL": "plot", "pybullet": "panda", "pytorch_kinematics": "panda"}
-_EXTRAS |= {"pygls": "lsp", "lsprotocol": "lsp"}
 
 
 class BugError(StlcError):
@@ -102,10 +101,8 @@ def _known(error: BaseException) -> StlcError | None:
             return _from_system(error)
         case MemoryError():
             return MissingError(Diagnostic("R202", "there is not enough memory"))
-        case ModuleNotFoundError(name=str() as name) if name.partition(".")[0] in _EXTRAS:
-            package = name.partition(".")[0]
-            message = f"this needs the package `{package}`, which is not installed"
-            return not_installed(message, _EXTRAS[package])
+        case ModuleNotFoundError():
+            return absent(error)
     if callable(getattr(error, "format_message", None)):
         return UsageError(_usage(error))
     return None

@@ -236,7 +236,7 @@ def draw_report(folder: RunDir) -> None:
     from stlc.view import available
 
     if not available():
-        say("no pictures: pip install 'stlc[plot]'")
+        say("no pictures: they need the extra `plot` (see `stlc doctor`)")
         return
     from stlc.view.report import write_report
 

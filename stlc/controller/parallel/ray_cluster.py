@@ -1,4 +1,4 @@
-"""Workers of a Ray cluster (`pip install 'stlc[cluster]'`)."""
+"""Workers of a Ray cluster (extra `cluster`)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Self, TextIO, cast
 
 from stlc.controller.parallel.elsewhere import RemoteCall, RemoteValue, answer, linked
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, LostCall
 from stlc.diagnostics import Diagnostic, MissingError
+from stlc.extras import needed
 
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 _AHEAD = 2
@@ -184,11 +184,7 @@ def _connected(address: str, folder: str | None) -> Any:
         MissingError: R301, Ray is not installed; R302, there is no such cluster, or it refuses the files.
     """
     os.environ.update({key: value for key, value in _QUIET.items() if key not in os.environ})
-    try:
-        ray = import_module("ray")
-    except ModuleNotFoundError:
-        message = "`--cluster` needs ray, which is not installed"
-        raise MissingError(Diagnostic("R301", message, help=("pip install 'stlc[cluster]'",))) from None
+    ray = needed("ray", "`--cluster` needs")
     settings = {"log_to_driver": False, "logging_level": "error", "ignore_reinit_error": True}
     environment = None if folder is None else {"working_dir": folder}
     try:

@@ -1,14 +1,13 @@
-"""TensorBoard log of a training run (`pip install 'stlc[log]'`)."""
+"""TensorBoard log of a training run (extra `log`)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from stlc.diagnostics import not_installed
 from stlc.escape import markdown, tag
+from stlc.extras import needed
 from stlc.files import place
 
 if TYPE_CHECKING:
@@ -68,11 +67,7 @@ def find_writer() -> Opener:
     Raises:
         MissingError: R301, neither is installed.
     """
-    if find_spec("tensorboardX") is not None:
-        module = "tensorboardX"
-    elif find_spec("tensorboard") is not None:
-        module = "torch.utils.tensorboard"
-    else:
-        raise not_installed("`--log tensorboard` needs tensorboardX, which is not installed", "log")
-    writer = import_module(module).SummaryWriter
+    torch_has_it = find_spec("tensorboard") and not find_spec("tensorboardX")
+    module = "torch.utils.tensorboard" if torch_has_it else "tensorboardX"
+    writer = needed(module, "`--log tensorboard` needs").SummaryWriter
     return lambda run: TensorBoardLogger(writer(str(place(run, f"{FOLDER}/events").parent)))

@@ -56,7 +56,7 @@ def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
     """
     assert function.body is not None
     if find_spec("pytorch_kinematics") is None:
-        return Comparison(function.name, None, f"{LIBRARY} is not installed: pip install 'stlc[panda]'")
+        return Comparison(function.name, None, f"{LIBRARY} is not installed (extra `panda`)")
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (POSITIONS, len(function.body.formals)))
     nowhere = io.StringIO()  # for the library's messages about tags that it ignores
     try:

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
+from stlc.extras import needed
 from stlc.files import is_stored
 from stlc.trace.formats.messages import Bytes, Channel, DamageError, Decode, Log, Room, mapped
 from stlc.trace.formats.paths import Selection
-from stlc.trace.formats.registry import damage, needed, unreadable
+from stlc.trace.formats.registry import damage, unreadable
 from stlc.trace.formats.ros import decoder
 from stlc.trace.recording import ALL, Recording, Wanted
 

@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from stlc.extras import needed
 from stlc.trace.formats.arrays import Array, Arrays
 from stlc.trace.formats.mat4 import mat4_kind, modelica, read_mat4
 from stlc.trace.formats.mat5 import MAX_NODES, Mat5, Node, Variable
-from stlc.trace.formats.registry import MAX_BYTES, damage, needed, opened, room_for, unreadable
+from stlc.trace.formats.registry import MAX_BYTES, damage, opened, room_for, unreadable
 from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"

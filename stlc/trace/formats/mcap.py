@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stlc.escape import topic as topic_of
+from stlc.extras import needed
 from stlc.files import atomic_path
 from stlc.jsontext import loads
 from stlc.trace.formats.messages import LONGEST, Bytes, Channel, DamageError, Decode, Log, Room, mapped
 from stlc.trace.formats.paths import Selection
-from stlc.trace.formats.registry import damage, needed, unreadable
+from stlc.trace.formats.registry import damage, unreadable
 from stlc.trace.formats.ros import Form, decoder
 from stlc.trace.meta import meta_array, read_meta
 from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted

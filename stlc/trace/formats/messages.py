@@ -25,9 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, StlcError, TraceError
+from stlc.extras import needed
 from stlc.signature import MAX_COMPONENTS, Column
 from stlc.trace.formats.paths import ARRAYS, HEADER, Enclosing, Path, RefusedError, Selection, element_names
-from stlc.trace.formats.registry import MAX_LETTERS, needed, opened, unreadable
+from stlc.trace.formats.registry import MAX_LETTERS, opened, unreadable
 from stlc.trace.recording import ALL, Array, ClockGroup, Recording, Wanted
 
 MAX_BYTES = 2_000_000_000

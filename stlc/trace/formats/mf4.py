@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from stlc.extras import needed
 from stlc.trace.formats.arrays import Array, Arrays
-from stlc.trace.formats.registry import MAX_BYTES, damage, needed, opened, room_for, unreadable
+from stlc.trace.formats.registry import MAX_BYTES, damage, opened, room_for, unreadable
 from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
 
 _TIMES, _DEFLATE = (0, 1), (1, 2)

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.extras import needed
 from stlc.files import atomic_path
 from stlc.signature import MAX_COMPONENTS
 from stlc.trace.formats.arrays import Array, Arrays
 from stlc.trace.formats.csv import split_head
-from stlc.trace.formats.registry import MAX_LETTERS, damage, needed, require_room, unreadable
+from stlc.trace.formats.registry import MAX_LETTERS, damage, require_room, unreadable
 from stlc.trace.recording import ALL, Recording, Wanted
 
 _DEEPEST = 8

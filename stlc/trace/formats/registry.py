@@ -8,7 +8,7 @@ A format is a module of this package and an entry of `FORMATS`, or a module of a
 - if the format has `chunked` set: `size(path) -> int`, the bytes of its numbers in memory (0: not readable in
   chunks), and `chunks(path, samples) -> Iterator[Recording]`.
 
-The module imports optional libraries with `needed`.
+The module imports optional libraries with `stlc.extras.needed`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError, not_installed
+from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError
+from stlc.extras import needed
 from stlc.registry import PackageRegistry
 
 MAX_BYTES = 4_000_000_000
@@ -38,8 +39,7 @@ class Format:
     Attributes:
         module: name of the module in this package; of another package, its dotted name.
         suffixes: suffixes of its files, in lower case; files are written with the first one.
-        extra: name of the extra of the package `stlc` that installs the libraries of the format.
-        packages: modules of these libraries.
+        package: module of an optional library that writes the format.
         writes: whether traces can be written in this format.
         chunked: whether files can be read a number of samples at a time.
         folder: whether a folder may be one trace.
@@ -47,11 +47,15 @@ class Format:
 
     module: str
     suffixes: tuple[str, ...]
-    extra: str = ""
-    packages: tuple[str, ...] = ()
+    package: str = ""
     writes: bool = False
     chunked: bool = False
     folder: bool = False
+
+    def require(self) -> None:
+        """Raise NotInstalledError (R301) if the package that writes the format is not installed."""
+        if self.package:
+            needed(self.package)
 
     def function(self, name: str) -> Any:
         """Import the module of the format, and return its function `name`."""
@@ -63,20 +67,18 @@ FORMATS = (
     Format("npz", (".npz",), writes=True, chunked=True),
     Format("csv", (".csv", ".tsv", ".txt"), writes=True, chunked=True),
     Format("jsonl", (".jsonl", ".ndjson"), chunked=True),
-    Format("parquet", (".parquet", ".pq"), "parquet", ("pyarrow",), chunked=True),
-    Format("mat", (".mat",), "mat", ("h5py",)),
-    Format("mcap", (".mcap",), "mcap", ("mcap", "google"), writes=True),
-    Format("ulg", (".ulg",), "ulg", ("pyulog",)),
-    Format("mf4", (".mf4", ".mdf"), "mf4", ("asammdf",)),
-    Format("bag", (".bag", ".db3"), "bag", ("rosbags", "lz4", "zstandard"), folder=True),
+    Format("parquet", (".parquet", ".pq"), "pyarrow", chunked=True),
+    Format("mat", (".mat",)),
+    Format("mcap", (".mcap",), "mcap", writes=True),
+    Format("ulg", (".ulg",)),
+    Format("mf4", (".mf4", ".mdf")),
+    Format("bag", (".bag", ".db3"), folder=True),
 )
 ELSEWHERE: PackageRegistry[Format] = PackageRegistry(
     "trace format", "", "FORMAT", group="stlc.formats", accepts="stlc.trace.formats.registry:Format"
 )
 """Formats of other packages (`Format`), by the suffix of their files without its dot."""
 WRITTEN = tuple(each.suffixes[0] for each in FORMATS if each.writes)
-_PACKAGES = {"google": "protobuf"}
-"""Names of packages that differ from those of their modules."""
 
 
 def suffix_of(path: Path) -> str:
@@ -104,21 +106,6 @@ def suffixes() -> tuple[str, ...]:
     """Suffixes of all formats."""
     own = (suffix for each in FORMATS for suffix in each.suffixes)
     return *own, *(f".{name}" for name in ELSEWHERE)
-
-
-def needed(module: str) -> Any:
-    """Import and return a module.
-
-    Raises:
-        MissingError: R301, its package is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError:
-        package = module.partition(".")[0]
-        extra = next((each.extra for each in FORMATS if package in each.packages), "all")
-        message = f"this needs the package `{_PACKAGES.get(package, package)}`, which is not installed"
-        raise not_installed(message, extra) from None
 
 
 def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:

@@ -17,8 +17,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from stlc.extras import needed
 from stlc.trace.formats.arrays import MAX_OTHERS, Array, Arrays
-from stlc.trace.formats.registry import MAX_BYTES, damage, needed, opened, unreadable
+from stlc.trace.formats.registry import MAX_BYTES, damage, opened, unreadable
 from stlc.trace.recording import ALL, ClockGroup, Recording, Wanted
 
 _MAX_FIELDS = 2_000_000

@@ -20,6 +20,7 @@ from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.diagnostics import MissingError, UsageError
+from stlc.extras import installation
 from stlc.registry import METHODS
 
 pytestmark = pytest.mark.apart
@@ -149,7 +150,7 @@ def test_without_the_package(car_task: Task, monkeypatch: pytest.MonkeyPatch) ->
     assert isinstance(config, SacConfig)
     with pytest.raises(MissingError) as caught:
         METHODS.get("sac").learner(car_task, config, steps=1, device=CPU, ranks=ALONE)
-    assert caught.value.diagnostics[0].help == ("pip install 'stlc[bench]'",)
+    assert caught.value.diagnostics[0].help == (installation("bench"),)
 
 
 def test_it_trains_in_one_process(car_task: Task) -> None:

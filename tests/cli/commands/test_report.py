@@ -8,6 +8,7 @@ from helpers.documents import misfits
 import stlc.view
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
+from stlc.extras import installation
 from stlc.rundir import RunDir
 
 
@@ -42,5 +43,5 @@ def test_an_unknown_run_is_a_usage_error(capsys):
 def test_without_matplotlib_it_says_what_to_install(run, capsys, monkeypatch):
     monkeypatch.setattr(stlc.view, "find_spec", lambda _: None)
     assert main(["report"]) == 5
-    assert "pip install 'stlc[plot]'" in capsys.readouterr().err
+    assert installation("plot") in capsys.readouterr().err
     assert not (run.path / "report.html").exists()

@@ -21,6 +21,7 @@ from stlc.controller.parallel.ray_cluster import RayWorkers
 from stlc.controller.parallel.ray_jobs import RayExecutor
 from stlc.controller.parallel.workers import CallFiles, results
 from stlc.diagnostics import MissingError
+from stlc.extras import installation
 from stlc.rundir import every_run
 
 ROOT = Path(__file__).parents[3]
@@ -50,7 +51,7 @@ def test_without_ray_it_is_said_how_to_get_it(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert program([*command, "--steps", "5", "--cluster", "local"]) == 5
-    assert "pip install 'stlc[cluster]'" in capsys.readouterr().err
+    assert installation("cluster") in capsys.readouterr().err
     assert list(tmp_path.glob("*")) == []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,7 @@ def test_numbers_stand_under_their_names() -> None:
 
 def test_without_a_writer_nothing_begins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(logbook, "find_spec", lambda _name: None)
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(MissingError) as caught:
         find_writer()
     assert caught.value.diagnostics[0].code == "R301"

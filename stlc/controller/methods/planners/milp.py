@@ -1,4 +1,4 @@
-"""`milp`: mixed-integer linear programming by HiGHS (Huangfu & Hall 2018), which `stlc[plan]` installs.
+"""`milp`: mixed-integer linear programming by HiGHS (Huangfu & Hall 2018), in the extra `plan`.
 
 This planner applies to piecewise linear systems. It uses the big-M encodings of Karaman et al. (2008) and
 Raman et al. (2014). No other planner can prove that no plan from an initial state satisfies the
@@ -25,7 +25,8 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.starts import extremes
-from stlc.diagnostics import Diagnostic, UsageError, not_installed
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.extras import needed
 from stlc.native import Stop
 
 if TYPE_CHECKING:
@@ -68,10 +69,7 @@ class Milp:
             UsageError: U101, an expression has no mixed-integer linear form; the message shows it.
             MissingError: R301, HiGHS is not installed.
         """
-        try:
-            import highspy
-        except ModuleNotFoundError:
-            raise not_installed("planner `milp` needs highspy", "plan") from None
+        highspy = needed("highspy", "planner `milp` needs")
         for state in task.sample(8, seed=0, dtype=torch.float64):
             _encoded(task, state, 0.0, tight=True)
         return partial(self._run, highs=highspy)
