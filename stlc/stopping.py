@@ -56,15 +56,17 @@ def undoing(undo: Callable[[int], object]) -> int:
 def arm() -> None:
     """Start the watchdog thread, which forces an interrupted command to exit; call it in the main thread."""
     read, write = os.pipe()
-    os.set_blocking(write, False)
     try:
+        if hasattr(os, "set_blocking"):
+            os.set_blocking(write, False)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
     except ValueError:  # not the main thread
         os.close(read)
         os.close(write)
         return
     # a forked process must not write to the file descriptor of its parent
-    os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
     threading.Thread(target=_wait, args=(read,), name="last resort", daemon=True).start()
     _armed.append(time.perf_counter())
 

@@ -342,12 +342,9 @@ def _use(session: int) -> _Use | None:
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     """Terminate all processes of the session that `process` leads; kill those that do not end in time."""
-    if os.name != "posix":
-        process.kill()
-        process.wait()
-        return
     with suppress(OSError):
-        os.killpg(process.pid, signal.SIGTERM)
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGTERM)
     try:
         process.wait(_GRACE)
     except subprocess.TimeoutExpired:
@@ -360,4 +357,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 def _kill(process: subprocess.Popen[bytes]) -> None:
     """Kill all processes of the session that `process` leads."""
     with suppress(OSError):
-        os.killpg(process.pid, signal.SIGKILL)
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()

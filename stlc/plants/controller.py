@@ -9,7 +9,8 @@ from typing import Any, final
 
 import numpy as np
 
-from stlc.plants.kinds import AbsentError, FaultError, Floats, Layout, UnfitError
+from stlc.extras import needed
+from stlc.plants.kinds import FaultError, Floats, Layout, UnfitError
 
 _TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
@@ -19,15 +20,12 @@ class NetworkController:
     """A network that reads signals of a plant and writes inputs of it.
 
     Raises:
-        AbsentError: onnxruntime is not installed.
+        NotInstalledError: onnxruntime is not installed.
         UnfitError: the file cannot be read, or the sizes of the network differ from the plant file.
     """
 
     def __init__(self, layout: Layout) -> None:
-        try:
-            import onnxruntime
-        except ImportError:
-            raise AbsentError("onnxruntime", "onnx") from None
+        onnxruntime = needed("onnxruntime")
         assert layout.controller is not None
         self._declared = declared = layout.controller
         options = onnxruntime.SessionOptions()

@@ -20,6 +20,8 @@ Floats: TypeAlias = NDArray[np.float64]
 MAX_HEADER = 1 << 20
 MAX_ARRAY = 1 << 28
 """Most bytes of the two parts of a message. What is longer is not read."""
+SAID = b"\0said\0"
+"""Bytes on the standard error of a plant's process after all that was printed before a fault."""
 _LENGTHS = struct.Struct("<II")
 _NUMBER = np.dtype("<f8")
 

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import TIMEOUT_MAX, Event, Thread
 from typing import Any, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, MissingError, SystemFileError
+from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.extras import not_installed
 from stlc.plants.declaration import OutputDecl, PlantDecl, PlantInput, VariableDecl
 from stlc.plants.kinds import Reason
-from stlc.plants.messages import Message, MessageError, encoded, received
+from stlc.plants.messages import SAID, Message, MessageError, encoded, received
 from stlc.plants.watchdog import Watchdog
 from stlc.units import parse_unit, same_dims
 
@@ -32,8 +33,6 @@ OPENING = 180.0
 """Seconds that a plant has to open, if a simulation may not take longer: imports on a busy machine."""
 _LAST_WORDS = 1.0
 """Seconds to wait for the standard error of a process that has ended; a child may hold it open."""
-_LONGEST = 1e6
-"""Seconds of one wait at most: `poll` takes milliseconds of 31 bits."""
 _LEAVING = 10.0
 """Seconds that a process which has closed its output has to end by itself, on a busy machine."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -80,19 +79,16 @@ class PlantProcess:
         self._watchdog = Watchdog()
         try:
             self._process = _started(decl, self._watchdog.folder)
-            self._watchdog.watch(self._process.pid)
+            self._watchdog.watch(self._process)
         except BaseException:
             self._watchdog.end()
             raise
-        self._tail, self._reading = bytearray(), threading.Lock()
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        self._in, self._out = self._process.stdin.fileno(), self._process.stdout.fileno()
-        os.set_blocking(self._in, False)
-        os.set_blocking(self._process.stderr.fileno(), False)
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
+        self._requests: SimpleQueue[bytes] = SimpleQueue()
+        self._replies: SimpleQueue[Message | Exception] = SimpleQueue()
+        self._tail, self._heard = b"", Event()
+        self._listener = Thread(target=self._listen, daemon=True)
+        for thread in (self._listener, Thread(target=self._exchange, daemon=True)):
+            thread.start()
         try:
             self._open()
         except BaseException:
@@ -111,10 +107,7 @@ class PlantProcess:
                 decl, f"the plant cannot be opened: {error.fault.message}", "", error.fault.stderr
             ) from None
         if "absent" in header:
-            package, extra = str(header["absent"]), str(header.get("extra"))
-            advice = f"pip install 'stlc[{extra}]'" if extra else f"pip install {package}"
-            message = f"this needs the package `{package}`, which is not installed"
-            raise MissingError(Diagnostic("R301", message, help=(advice,)))
+            raise not_installed(str(header["absent"]))
         if "unfit" in header:
             raise _refused(decl, str(header["unfit"]), str(header.get("place", "")), self._said())
         if isinstance(units := header.get("units"), Mapping):
@@ -156,88 +149,69 @@ class PlantProcess:
     def _exchanged(
         self, header: Mapping[str, Any], array: Floats | None, deadline: float, limit: float
     ) -> Message:
+        self._heard.clear()
+        self._requests.put(encoded(header, array))
         try:
-            self._send(encoded(header, array), deadline)
-            return received(lambda count: self._received(count, deadline))
-        except TimeoutError:
-            message = f"not finished within {limit:g} s of the clock"
-            raise self._faulty("time limit", message) from None
-        except (EOFError, BrokenPipeError):
-            raise self._faulty("crash", self._end_in_words()) from None
-        except MessageError as error:
-            raise self._faulty("bad message", f"the process of the plant sent {error}") from None
+            reply = self._replies.get(timeout=min(max(deadline - time.monotonic(), 0.0), TIMEOUT_MAX))
+        except Empty:
+            raise self._faulty("time limit", f"not finished within {limit:g} s of the clock") from None
+        match reply:
+            case Message():
+                return reply
+            case MessageError():
+                raise self._faulty("bad message", f"the process of the plant sent {reply}")
+        raise self._faulty("crash", self._end_in_words())
 
     def _faulty(self, reason: Reason, message: str) -> FaultyError:
         """End the process, and return the error."""
         self.end()
         return FaultyError(Fault(reason, message, None, self._said()))
 
-    def _send(self, data: bytes, deadline: float) -> None:
-        view = memoryview(data)
-        while view:
-            _await(self._in, select.POLLOUT, deadline)
-            with suppress(BlockingIOError):
-                view = view[os.write(self._in, view) :]
+    def _exchange(self) -> None:
+        """Send requests and receive replies, in a thread that a plant may block, until an empty request."""
+        with self._process.stdout as replies, self._process.stdin as requests:  # type: ignore[union-attr]
 
-    def _received(self, count: int, deadline: float) -> bytes:
-        parts: list[bytes] = []
-        while count:
-            _await(self._out, select.POLLIN, deadline)
-            part = os.read(self._out, min(count, 1 << 20))
-            if not part:
-                raise EOFError
-            parts.append(part)
-            count -= len(part)
-        return b"".join(parts)
+            def read(count: int) -> bytes:
+                if len(part := replies.read(count)) < count:
+                    raise EOFError
+                return part
+
+            with suppress(OSError):  # where the pipe is closed with a request in it
+                for request in iter(self._requests.get, b""):
+                    try:
+                        requests.write(request)
+                        requests.flush()
+                        self._replies.put(received(read))
+                    except (OSError, EOFError, MessageError) as error:
+                        self._replies.put(error)
 
     # ----------------------------------------------------------------------------------- end
 
     @property
     def alive(self) -> bool:
         """True if the process can take further requests."""
-        return self._process.poll() is None and not self._process.stdin.closed  # type: ignore[union-attr]
+        return self._process.poll() is None
 
     def end(self) -> None:
         """Kill the process and its children, and remove its temporary files; any thread may call it."""
-        self._watchdog.end()  # before the process is waited for: then its number may be another's
-        self._process.kill()
-        self._process.wait()
+        self._watchdog.end()
+        self._requests.put(b"")
         self._listener.join(_LAST_WORDS)
-        for stream in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):
-                if stream is not None:
-                    stream.close()
 
     def _listen(self) -> None:
         """Keep the last bytes of the standard error, until it ends."""
-        assert self._process.stderr is not None
-        poll = select.poll()
-        poll.register(self._process.stderr.fileno(), select.POLLIN)
-        while poll.poll():
-            if not self._drain():
-                return
-
-    def _drain(self) -> bool:
-        """Read the pending bytes of the standard error; return whether more may come."""
-        stream = self._process.stderr
-        assert stream is not None
-        with self._reading:
-            while not stream.closed:
-                try:
-                    part = os.read(stream.fileno(), 1 << 16)
-                except BlockingIOError:
-                    return True
-                if not part:
-                    stream.close()
-                self._tail += part
-                del self._tail[:-TAIL]
-        return False
+        with self._process.stderr as stream:  # type: ignore[union-attr]
+            while part := os.read(stream.fileno(), 1 << 16):
+                self._tail = (self._tail + part)[-TAIL:]
+                if SAID in self._tail:
+                    self._tail = self._tail.replace(SAID, b"")
+                    self._heard.set()
+        self._heard.set()
 
     def _said(self) -> str:
-        """Return the end of the standard error, with all that was printed before the last reply."""
-        self._drain()
-        with self._reading:
-            return self._tail.decode(errors="replace").strip()
+        """Return the end of the standard error, with all that was printed before the last fault."""
+        self._heard.wait(_LAST_WORDS)
+        return self._tail.decode(errors="replace").strip()
 
     def _end_in_words(self) -> str:
         """Describe in one line how the process ended."""
@@ -266,21 +240,10 @@ def _started(decl: PlantDecl, scratch: str) -> subprocess.Popen[bytes]:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        bufsize=0,
         start_new_session=True,
         env=environment,
         cwd=decl.path.parent.resolve(),
     )
-
-
-def _await(number: int, event: int, deadline: float) -> None:
-    """Wait until a file descriptor is ready. Raises TimeoutError at the deadline."""
-    poll = select.poll()
-    poll.register(number, event)
-    while (rest := deadline - time.monotonic()) > 0:
-        if poll.poll(1000 * min(rest, _LONGEST)):
-            return
-    raise TimeoutError
 
 
 def _refused(decl: PlantDecl, message: str, place: str, said: str) -> SystemFileError:

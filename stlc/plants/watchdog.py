@@ -2,11 +2,14 @@
 
 It is a shell that waits for the end of its standard input. That end comes when `Watchdog.end` closes it, and
 also when stlc is killed, even by SIGKILL. Then the shell kills the process group of the plant and removes its
-folder.
+folder. Where there are no process groups (on Windows), `Watchdog.end` kills the process alone, and a process
+whose stlc was killed ends at its next request.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import tempfile
 from contextlib import suppress
@@ -37,6 +40,11 @@ class Watchdog:
 
     def __init__(self) -> None:
         self.folder = str(Path(tempfile.gettempdir()) / f"{SCRATCH}{token_hex(8)}")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._watched: subprocess.Popen[bytes] | None = None
+        if not hasattr(os, "killpg"):
+            Path(self.folder).mkdir(0o700)
+            return
         self._process = subprocess.Popen(
             ["/bin/sh", "-c", _SCRIPT, "sh", self.folder],
             stdin=subprocess.PIPE,
@@ -53,12 +61,20 @@ class Watchdog:
                 self.end()
                 raise OSError(f"no folder can be made at `{self.folder}`")
 
-    def watch(self, group: int) -> None:
-        """Kill the process group `group` at the end, too."""
-        self._lead.write(f"{group}\n".encode())
+    def watch(self, process: subprocess.Popen[bytes]) -> None:
+        """Kill the process, which leads a group, with its group at the end, too."""
+        self._watched = process
+        if self._process is not None:
+            self._lead.write(f"{process.pid}\n".encode())
 
     def end(self) -> None:
-        """Kill the process group, and remove the folder; any thread may call it, more than once."""
-        with suppress(OSError):
-            self._lead.close()
-        self._process.wait()
+        """Kill the process, and remove the folder; any thread may call it, more than once."""
+        if self._process is not None:  # before the process is waited for: then its number may be another's
+            with suppress(OSError):
+                self._lead.close()
+            self._process.wait()
+        if self._watched is not None:
+            self._watched.kill()
+            self._watched.wait()
+        if self._process is None:
+            shutil.rmtree(self.folder, ignore_errors=True)

@@ -16,10 +16,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from stlc.extras import NotInstalledError
 from stlc.plants.controller import NetworkController
 from stlc.plants.kinds import (
     KINDS,
-    AbsentError,
     BlackBox,
     FaultError,
     Floats,
@@ -28,7 +28,7 @@ from stlc.plants.kinds import (
     layout_of,
     vector,
 )
-from stlc.plants.messages import Message, encoded, received
+from stlc.plants.messages import SAID, Message, encoded, received
 
 
 class ControlledPlant:
@@ -118,6 +118,8 @@ def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
                 reply = does[request.header["do"]](request.header, request.array)
         except BaseException as error:  # what the code of a user raises
             reply = Message(_failure(error, 0 if simulator is None else simulator.step), np.zeros((0, 0)))
+            with suppress(OSError):
+                os.write(2, SAID)
         outbox.write(encoded(reply.header, reply.array))
         outbox.flush()
 
@@ -127,8 +129,8 @@ def _failure(error: BaseException, step: int) -> dict[str, Any]:
     match error:
         case UnfitError():
             return {"unfit": str(error), "place": error.place}
-        case AbsentError():
-            return {"absent": error.package, "extra": error.extra}
+        case NotInstalledError():
+            return {"absent": error.name}
         case FaultError():
             return {"fault": error.reason, "message": str(error), "step": step}
         case MemoryError():
@@ -158,7 +160,8 @@ def main() -> None:
     os.dup2(nowhere, 0)
     os.close(nowhere)
     os.dup2(2, 1)
-    os.register_at_fork(after_in_child=lambda: _disconnect(inbox, outbox))
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: _disconnect(inbox, outbox))
     with open(inbox, "rb") as requests, open(outbox, "wb") as replies:  # noqa: PTH123
         serve(requests, replies)
 

@@ -11,6 +11,7 @@ from helpers.plants import FILE, changed, pendulum, read, simulated
 
 from stlc.diagnostics import MissingError, SystemFileError, UsageError
 from stlc.dynamics.declaration.inputs import signal_values
+from stlc.extras import installation
 from stlc.monitor.verdict import Monitor
 from stlc.plants.plant import Plant, load_plant
 from stlc.trace import Trace
@@ -245,7 +246,7 @@ def test_a_missing_package_is_named(tmp_path):
         patch.setenv("PYTHONPATH", str(tmp_path))
         with Plant(read(text, tmp_path)) as plant, pytest.raises(MissingError, match="gymnasium") as caught:
             plant.simulate(plant.random_point(0)[None])
-    assert caught.value.diagnostics[0].help == ("pip install 'stlc[gym]'",)
+    assert caught.value.diagnostics[0].help == (installation("gym"),)
 
 
 def test_units_of_the_plant_must_be_those_of_the_file(tmp_path):

@@ -196,15 +196,6 @@ class UnfitError(Exception):
         self.place = place
 
 
-class AbsentError(Exception):
-    """Error: a package that the plant needs is not installed; `extra` of stlc installs it."""
-
-    def __init__(self, package: str, extra: str) -> None:
-        super().__init__(package)
-        self.package = package
-        self.extra = extra
-
-
 class FaultError(Exception):
     """Error: a simulation has failed for a reason that the worker has recognised."""
 

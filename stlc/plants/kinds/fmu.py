@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, final
 
 from stlc.dynamics.schema.record import TEXT, key, number, word
-from stlc.plants.kinds import AbsentError, FaultError, Floats, Layout, PlantKind, Port, UnfitError
+from stlc.extras import needed
+from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, Port, UnfitError
 from stlc.registry import did_you_mean
 
 INTERFACES = {"co-simulation": "coSimulation", "model exchange": "modelExchange"}
@@ -36,12 +37,9 @@ class FmuKeys:
 
 def open_fmu(layout: Layout) -> Fmu:
     """Unpack the FMU and load its library. Raises UnfitError if it cannot be used."""
-    try:
-        import fmpy
-        import fmpy.simulation
-        import fmpy.sundials  # now, so that the time limit of the first simulation does not count it
-    except ImportError:
-        raise AbsentError("fmpy", "fmu") from None
+    needed("fmpy.simulation")
+    needed("fmpy.sundials")  # before the clock of the first simulation runs
+    fmpy = needed("fmpy")
     path = layout.path(str(layout.options["file"]))
     if not path.is_file():
         raise UnfitError(f"there is no file `{path}`")

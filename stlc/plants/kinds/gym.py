@@ -18,7 +18,8 @@ from typing import Any, final
 import numpy as np
 
 from stlc.dynamics.schema.record import TEXT, key, raw
-from stlc.plants.kinds import AbsentError, FaultError, Floats, Layout, PlantKind, Port, UnfitError
+from stlc.extras import needed
+from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, Port, UnfitError
 
 _PLACE = re.compile(r"(?P<name>obs|state|action)\[(?P<index>\d{1,6})\]")
 _FIRST = {"output": "obs[{}]", "input": "action[{}]", "initial": "state[{}]"}
@@ -37,10 +38,7 @@ class GymKeys:
 
 def open_gym(layout: Layout) -> GymEnvironment:
     """Make the environment. Raises UnfitError if there is none of this name, or it lacks a port."""
-    try:
-        import gymnasium
-    except ImportError:
-        raise AbsentError("gymnasium", "gym") from None
+    gymnasium = needed("gymnasium")
     sys.path.insert(0, layout.folder)
     name = str(layout.options["id"])
     try:

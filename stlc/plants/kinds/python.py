@@ -27,8 +27,9 @@ from typing import Any, final
 import numpy as np
 
 from stlc.dynamics.schema.record import TEXT, integer, key, number, word
+from stlc.extras import needed
 from stlc.foreign import module_at
-from stlc.plants.kinds import AbsentError, FaultError, Floats, Layout, PlantKind, UnfitError, vector
+from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, UnfitError, vector
 from stlc.registry import did_you_mean
 
 TARGET = re.compile(r"(?P<module>[\w./-]+\.py|\w+(?:\.\w+)*):(?P<attribute>[^\W\d]\w*)")
@@ -209,10 +210,7 @@ class StateFunction:
 
     def _adaptive(self) -> Callable[[float, Floats, Floats], Floats]:
         """One time step by LSODA (Petzold 1983) of SciPy."""
-        try:
-            from scipy.integrate import solve_ivp
-        except ImportError:
-            raise AbsentError("scipy", "") from None
+        solve_ivp = needed("scipy.integrate").solve_ivp
         tolerance = float(self._layout.options.get("tolerance", 1e-8))
 
         def advance(t: float, x: Floats, u: Floats) -> Floats:
