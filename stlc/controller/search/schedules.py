@@ -11,13 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import leaves, nodes, numbers, operands
+from stlc.compile.ir.traverse import leaves, map_children, nodes, numbers, operands
 
 Instants = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -133,6 +136,27 @@ class GoalScheduler:
             for num in numbers(formula)
             for leaf in leaves(num)
         )
+
+    @cached_property
+    def forms(self) -> tuple[list[ir.Formula], list[ir.Formula]]:
+        """The operands of choices; and each with signals `0`, `1`, … in place of the conditions.
+
+        What a schedule leaves out is true there.
+        """
+        left, asked = list(self._formulas), list[ir.Formula]()
+        for formula in left:
+            if not self.decidable(formula):
+                left.extend(operands(formula))
+                if isinstance(formula, ir.Until) or getattr(formula, "op", "") in ("or", "eventually"):
+                    asked.extend(operands(formula))
+        return asked, [self._named(formula) for formula in asked]
+
+    def _named(self, formula: ir.Formula) -> ir.Formula:
+        if (number := self._numbers.get(formula)) is not None:
+            return ir.Predicate(ir.Signal(str(number)))
+        if isinstance(formula, (ir.Truth, ir.BoolOp, ir.AtStart, ir.Temporal, ir.Until)):
+            return map_children(formula, formulas=self._named)
+        return ir.Truth(True)
 
     def parts(self, formula: ir.Formula) -> Iterator[ir.Formula]:
         """Yield the parts of a condition: the operands of its conjunctions, or the condition itself."""
@@ -354,8 +378,13 @@ class _Nearest(_Drawing):
 
     def __init__(self, scheduler: GoalScheduler, distance: NDArray[np.float64]) -> None:
         super().__init__(scheduler, len(distance), np.random.default_rng(0), None)
-        self._distance = distance
-        self._worths: dict[int, NDArray[np.float64]] = {}
+        env = {str(i): column.T for i, column in enumerate(distance.swapaxes(0, 1))}
+        asked, forms = scheduler.forms
+        worths = evaluate(forms, env, ops=NUMPY, count=self._last + 1, end="truncate") if env else []
+        shape = self._last + 1, len(distance)
+        self._worths = {
+            id(one): np.broadcast_to(worth, shape).T for one, worth in zip(asked, worths, strict=True)
+        }
 
     def _alternative(self, items: Sequence[ir.Formula], now: Instants) -> Instants:
         there = np.arange(len(now)), now.clip(0, self._last)
@@ -392,49 +421,7 @@ class _Nearest(_Drawing):
 
     def _worth(self, formula: ir.Formula) -> NDArray[np.float64]:
         """Least distance that decides a formula at each sample, (trajectories, T + 1); inf where unknown."""
-        found = self._worths.get(id(formula))
-        if found is None:
-            found = self._worths[id(formula)] = self._combined(formula)
-        return found
-
-    def _combined(self, formula: ir.Formula) -> NDArray[np.float64]:
-        whole = np.full_like(self._distance[:, 0], np.inf)
-        if self._scheduler.decidable(formula):
-            for part in self._scheduler.parts(formula):
-                if isinstance(part, ir.Truth):
-                    whole = whole if part.value else -whole
-                else:
-                    whole = np.minimum(whole, self._distance[:, self._scheduler.number(part)])
-            return whole
-        match formula:
-            case ir.BoolOp(op, items):
-                found: NDArray[np.float64] = np.stack([*map(self._worth, items)])
-                decided: NDArray[np.float64] = found.min(0) if op == "and" else found.max(0)
-                return decided
-            case ir.AtStart(body):
-                return np.broadcast_to(self._worth(body)[:, :1], whole.shape)
-            case ir.Temporal("always", window, body):
-                return -self._reached(np.full_like(whole, np.inf), -self._worth(body), window)
-            case ir.Temporal("eventually", window, body):
-                return self._reached(whole, self._worth(body), window)
-            case ir.Until("until", window, left, right):
-                return self._reached(self._worth(left), self._worth(right), window)
-            case ir.Until(_, window, left, right):
-                return -self._reached(-self._worth(left), -self._worth(right), window)
-            case _:
-                return whole
-
-    def _reached(
-        self, left: NDArray[np.float64], right: NDArray[np.float64], window: ir.Window
-    ) -> NDArray[np.float64]:
-        """Worth of `left until right` at each sample, (trajectories, T + 1)."""
-        found, kept = np.full_like(right, -np.inf), left.copy()
-        for k in range((self._last if window.hi is None else min(window.hi, self._last)) + 1):
-            end = self._last + 1 - k
-            kept[:, :end] = np.minimum(kept[:, :end], left[:, k:])
-            if k >= window.lo:
-                found[:, :end] = np.maximum(found[:, :end], np.minimum(kept[:, :end], right[:, k:]))
-        return found
+        return self._worths[id(formula)]
 
 
 def tempo(needed: Flags, apart: NDArray[np.float64]) -> NDArray[np.float64]:
