@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 PIECES = 3
 MOST = 2048
 """Maximum size of the plan library."""
+RANDOM = 12
+"""Maximum number of constant pieces of a random plan."""
+MODERATE = 0.6
+"""Share of the control ranges in which random plans lie."""
 
 
 def extremes(task: Task, generator: torch.Generator) -> Tensor:
@@ -31,3 +35,13 @@ def extremes(task: Task, generator: torch.Generator) -> Tensor:
         pick = torch.randint(3, (MOST, *shape), generator=generator)
     pieces = levels.gather(0, pick.flatten(0, 1)).view(-1, *shape)
     return pieces.repeat_interleave(-(-task.horizon // PIECES), 1)[:, : task.horizon]
+
+
+def random_plans(task: Task, count: int, generator: torch.Generator) -> Tensor:
+    """Draw piecewise constant plans with random numbers of pieces, (count, T, m) float64."""
+    low, high = task.system.control_low.double(), task.system.control_high.double()
+    number = torch.randint(1, RANDOM + 1, (count, 1), generator=generator)
+    begins = torch.rand(count, task.horizon, generator=generator) < number / task.horizon
+    piece = begins.cumsum(1)[..., None].expand(-1, -1, len(low))
+    levels = torch.rand(count, task.horizon + 1, len(low), generator=generator).double()
+    return 0.5 * (low + high) + MODERATE * (high - low) * (levels.gather(1, piece) - 0.5)

@@ -29,7 +29,7 @@ def planned(*options: str) -> int:
         (("--target", "-inf"), "`--target -inf` is no robustness"),
         (("--seed", str(2**63)), "should be less than or equal to 9223372036854775807"),
         (("--from", ""), "there is no file `` with initial states"),
-        (("--method", "schedule", "--option", "starts=0"), "a whole number from 1 to 1,000,000, not `0`"),
+        (("--method", "schedule", "--option", "tries=0"), "a whole number from 1 to 1,000,000,000, not `0`"),
     ],
 )
 def test_what_makes_no_sense(

@@ -191,7 +191,7 @@ def test_names_are_known_without_torch() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("serach", {}), ("schedule", {"starts": "many"}), ("policy", {"run": "latest"})]
+    ("name", "options"), [("serach", {}), ("schedule", {"tries": "many"}), ("policy", {"run": "latest"})]
 )
 def test_a_refused_planner_leaves_no_run_behind(
     car_task: Task, tmp_path: Path, name: str, options: dict[str, str]

@@ -142,9 +142,9 @@ def test_starts_that_make_no_sense(car_task: Task, text: str, message: str) -> N
 
 def test_options_are_checked() -> None:
     with pytest.raises(UsageError, match="a whole number, not `many`"):
-        planner_named("schedule", draws="many")
-    assert planner_named("schedule", draws="7", greed="1") == planner_named("schedule", draws=7, greed=1.0)
-    for wrong in ({"draws": 2.5}, {"draws": True}, {"greed": None}):
+        planner_named("schedule", tries="many")
+    assert planner_named("schedule", tries="7") == planner_named("schedule", tries=7)
+    for wrong in ({"tries": 2.5}, {"tries": True}, {"library": None}):
         with pytest.raises(UsageError, match="of planner `schedule` is"):
             planner_named("schedule", **wrong)
     with pytest.raises(UsageError, match="unknown planner `serach`"):

@@ -1,4 +1,4 @@
-"""Schedules of goals, and the planner that meets them by Gauss-Newton steps."""
+"""Schedules of goals, and the search that meets them by Gauss-Newton steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from stlc.compile.ir import nodes as ir
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.schedules import GoalScheduler, tempo
-from stlc.diagnostics import UsageError
 from stlc.dynamics.model.system import System
 
 ROOT = Path(__file__).parents[3]
@@ -146,9 +145,3 @@ def test_goals_in_an_order_are_reached() -> None:
     assert bool(found.satisfied.all())
     again = plan(task, x0, "schedule", budget=PlanBudget(10.0))
     assert torch.equal(found.plans, again.plans)
-
-
-def test_without_a_condition_on_states_it_refuses() -> None:
-    task = task_of("require goal: true")
-    with pytest.raises(UsageError, match="needs a condition on states"):
-        plan(task, torch.zeros(1, 2), "schedule")

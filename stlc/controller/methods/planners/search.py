@@ -2,7 +2,7 @@
 
 Local search runs in C if a compiler is installed. Where it finds no plan, two other searches take turns with
 it: for sequences of phases, if the mission needs several steps (`stlc.controller.search.sequences`), and by
-schedules of the goals, towards which Gauss-Newton steps lead (the planner `schedule`).
+schedules of the goals, towards which Gauss-Newton steps lead (`stlc.controller.search.attempts`).
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.methods.planners.schedule import SchedulePlanner, Schedules
 from stlc.controller.options import bounded
+from stlc.controller.search.attempts import Attempts
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.sequences.sequences import Sequences
 from stlc.controller.search.starts import extremes
-from stlc.diagnostics import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
     from stlc.controller.search.planner import PlanSearch, Solver
 
 
-ROUNDS = 3
-"""Number of rounds of local search after which the order of motions is searched."""
 SHARE, EQUAL = 2.0, 0.05
 """Greatest cost of the searches that look at the requirements, in that of the local search, and the cost of
 the local search at which both are equal; see `PlanSearch.spent`."""
@@ -62,16 +59,19 @@ class SearchPlanner:
             many, up to `longest`.
         longest: maximum number of plans tried per initial state and round.
         library: maximum number of plans in the library, which all initial states share.
+        rounds: number of rounds after which the searches that look at the requirements begin; where the order
+            of jumps matters, they begin after the first round.
     """
 
     tries: int = bounded(2_000, 1, 10**9)
     longest: int = bounded(20_000, 1, 10**9)
     library: int = bounded(2_048, 1, 10**6)
+    rounds: int = bounded(3, 0, 10**9)
 
     def prepare(self, task: Task) -> Solver:
         """Return a function that searches for plans by local search, with the initial library."""
         library = extremes(task, torch.Generator().manual_seed(0)).double()
-        return partial(self._run, library=library, orders=_Orders(task))
+        return partial(self._run, library=library, orders=_Orders(task, self.rounds))
 
     def _run(self, search: PlanSearch, library: Tensor, orders: _Orders) -> None:
         orders.begin(search)
@@ -83,11 +83,9 @@ class SearchPlanner:
             if not len(rows := search.open()):
                 break
             with search.charged(rows):
-                start = search.start[rows]
+                start = search.plans[rows] if number else search.start[rows]
                 if number % 2:
                     start = library[torch.randint(len(library), (len(rows),), generator=search.generator)]
-                elif number:
-                    start = search.plans[rows]
                 count = search.affordable(rows, tries)
                 found = searcher.repair(
                     search.states[rows], start, library, tries=count, stop=budget.stop
@@ -102,20 +100,17 @@ class SearchPlanner:
 class _Orders:
     """Searches that look at the requirements of one task; they are built when they are first needed."""
 
-    def __init__(self, task: Task) -> None:
-        self._task = task
-        self._jumps = bool(task.system.decl.jumps)
+    def __init__(self, task: Task, rounds: int) -> None:
+        self._task, self._jumps = task, bool(task.system.decl.jumps)
+        self._rounds = min(rounds, 1) if self._jumps else rounds
 
     @cached_property
     def _sequences(self) -> Sequences:
         return Sequences(self._task, self._task.sample(1, seed=0)[0].double())
 
     @cached_property
-    def _schedules(self) -> Schedules | None:
-        try:
-            return Schedules(SchedulePlanner(first=1), self._task)
-        except UsageError:
-            return None
+    def _attempts(self) -> Attempts:
+        return Attempts(self._task)
 
     def begin(self, search: PlanSearch) -> None:
         """Begin the searches for the states of `search`."""
@@ -123,8 +118,7 @@ class _Orders:
         self._running: dict[int, Generator[None]] = {}
         self._nearest: dict[int, Tensor] = {}
         self._own = torch.zeros(len(search.states), dtype=torch.float64)
-        # jumps are ordered after a round, motions after some more, unless a plan is to be mended
-        self._first = 0 if bool(search.evaluations.any()) else 1 if self._jumps else ROUNDS
+        self._first = 0 if bool(search.evaluations.any()) else self._rounds  # 0: a plan is to be mended
 
     def advance(self, number: int) -> None:
         """Continue the searches from each open state for their share of what local search has cost there.
@@ -172,8 +166,8 @@ class _Orders:
         if root is not None and several:
             searches.append(self._by_phases(row))
         motions = root is None or not (root.steps or self._jumps or self._sequences.marked(root))
-        if motions and self._schedules is not None:  # a schedule knows no modes and no landmarks
-            searches.append(self._schedules.of(search, row))
+        if motions:  # a schedule knows no modes and no landmarks
+            searches.append(self._attempts.of(search, row))
         spent = {each: LEAD * i for i, each in enumerate(searches)}
         while spent:
             least = min(spent, key=spent.__getitem__)

@@ -91,7 +91,7 @@ def test_goals_in_an_order_are_reached_in_either_form() -> None:
     near = "(x - 3 m)^2 + y^2 <= (1 m)^2", "(x + 3 m)^2 + y^2 <= (1 m)^2"
     for window in ("[0, T]", "@[0 steps, 20 steps]"):
         task = task_of(text.format(f"(not {near[0]})", window, near[1], window, near[0]))
-        found = plan(task, task.sample(2, seed=3), "schedule", budget=PlanBudget(10.0, 4_000))
+        found = plan(task, task.sample(2, seed=3), "schedule", budget=PlanBudget(10.0, 20_000))
         assert bool(found.satisfied.all()), window
 
 
