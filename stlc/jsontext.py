@@ -9,15 +9,39 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from fractions import Fraction
+from functools import cache
 from pathlib import PurePath
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 from stlc.escape import json_text
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+Num: TypeAlias = Annotated[float, "unbounded"]
+"""Number of a record that need not be finite."""
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """Key of a record in JSON: its name, the attribute that it holds, and whether empty values are left out."""
+
+    name: str
+    attribute: str
+    optional: bool
+
+
+@cache
+def keys_of(kind: type) -> tuple[Key, ...]:
+    """Keys of a dataclass: its fields, or the words of its attribute `JSON`: `key`, `key=attribute`, `key?`.
+
+    A key with `?` is left out where its value is None or empty.
+    """
+    words = getattr(kind, "JSON", None) or " ".join(field.name for field in fields(kind))
+    parts = [word.partition("=") for word in words.split()]
+    names = [(name.removesuffix("?"), attribute, name.endswith("?")) for name, _, attribute in parts]
+    return tuple(Key(name, attribute or name, optional) for name, attribute, optional in names)
 
 
 def plain(value: object) -> Json:
@@ -45,11 +69,16 @@ def plain(value: object) -> Json:
         case PurePath():
             return value.as_posix()
     if is_dataclass(value) and not isinstance(value, type):
-        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
+        held = ((key, getattr(value, key.attribute)) for key in keys_of(type(value)))
+        return {key.name: plain(each) for key, each in held if not (key.optional and _is_empty(each))}
     to_list = getattr(value, "tolist", None)
     if to_list is None:
         raise TypeError(f"{type(value).__name__} is no JSON data")
     return plain(to_list())
+
+
+def _is_empty(value: object) -> bool:
+    return value is None or (isinstance(value, str | list | tuple | dict) and not value)
 
 
 def _number(value: float) -> float | str:
@@ -81,9 +110,22 @@ def conforming(text: str | bytes, shape: Shape) -> Any:
             or beyond 1e100, or is of another shape. The message names the key.
         RecursionError: the text is nested too deeply to be read.
     """
-    value = loads(text if isinstance(text, str) else text.decode("utf-8"))
-    _require_plain(value, "", _DEEPEST)
+    value = data_of(text)
     _require_shape(value, shape, "")
+    return value
+
+
+def data_of(text: str | bytes | Json) -> Any:
+    """Parse untrusted JSON; data that were parsed before are checked alike.
+
+    Raises:
+        ValueError: the text is no JSON in UTF-8, nests more than 100 deep, or holds a number that is not
+            finite or beyond 1e100. The message names the key.
+        RecursionError: the text is nested too deeply to be read.
+    """
+    given = text.decode("utf-8") if isinstance(text, bytes) else text
+    value = loads(given) if isinstance(given, str) else given
+    _require_plain(value, "", _DEEPEST)
     return value
 
 

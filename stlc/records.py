@@ -1,0 +1,210 @@
+"""Records and JSON: schemas derived from dataclasses, and stored documents read back into them.
+
+`stlc.jsontext.plain` writes a record: each field under its name, or what the class attribute `JSON` lists.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from stlc.diagnostics import Diagnostic, RunError
+from stlc.jsontext import Json, Key, data_of, keys_of
+
+R = TypeVar("R")
+
+_NAMES: dict[Any, str] = {str: "string", int: "integer", float: "number", bool: "boolean"}
+_NAMES |= {types.NoneType: "null", Path: "string"}
+_NOUNS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false", Path: "a path"}
+_NOUNS |= {types.NoneType: "null"}
+_INFINITE = {"inf": float("inf"), "-inf": float("-inf"), "nan": float("nan")}
+_UNIONS = (Union, types.UnionType)
+_LISTS = (list, tuple, frozenset, Sequence)
+
+
+@cache
+def hints_of(kind: type) -> dict[str, Any]:
+    """Key of a record's JSON -> type of its value: that of the field, or what the property returns."""
+    found: dict[str, Any] = {}
+    for key in keys_of(kind):
+        owner = next(each for each in kind.__mro__ if _hint(each, key) is not None)
+        space = {"__annotations__": {key.name: _hint(owner, key)}, "__module__": owner.__module__}
+        found |= get_type_hints(type("Wanted", (), space), include_extras=True)
+    return found
+
+
+def _hint(kind: type, key: Key) -> Any:
+    """Annotation of an attribute that a class itself declares; None if it does not."""
+    own = vars(kind).get(key.attribute)
+    accessor = getattr(own, "fget", None) or getattr(own, "func", None)  # a property, cached or not
+    if accessor is not None:
+        return accessor.__annotations__["return"]
+    return kind.__annotations__.get(key.attribute) if "__annotations__" in vars(kind) else None
+
+
+# ------------------------------------------------------------------------- schemas
+
+
+def schema_of(kind: Any) -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of the values of a type, as `stlc.jsontext.plain` writes them."""
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return {}
+    if kind in _NAMES:
+        return {"type": _NAMES[kind]}
+    if is_dataclass(kind):
+        keys, hints = keys_of(kind), hints_of(kind)  # type: ignore[arg-type]
+        found: dict[str, Any] = {"type": "object", "properties": {k: schema_of(h) for k, h in hints.items()}}
+        required = [key.name for key in keys if not key.optional]
+        return found | ({"required": required} if required else {})
+    if origin is Annotated:
+        what = args[1]() if callable(args[1]) else args[1]
+        if what == "unbounded":
+            return {"type": ["number", "string"]}
+        return {**schema_of(args[0]), "minimum": what} if isinstance(what, int) else {"enum": list(what)}
+    if origin is Literal:
+        return {"enum": list(args)}
+    if origin in (dict, Mapping):
+        return {"type": "object"} | ({} if args[1] is Any else {"additionalProperties": schema_of(args[1])})
+    if origin is tuple and Ellipsis not in args:
+        of = schema_of(Union[tuple(dict.fromkeys(args))])
+        return {"type": "array", "items": of, "minItems": len(args), "maxItems": len(args)}
+    if origin in _LISTS:
+        return {"type": "array", "items": schema_of(args[0])}
+    if origin in _UNIONS:
+        return _union([schema_of(each) for each in args])
+    return schema_of(kind.__value__) if hasattr(kind, "__value__") else {"type": "array"}
+
+
+def _union(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the JSON Schema of a value that matches one of the schemas `parts`.
+
+    Schemas that consist of a type only are joined into one: `{"type": ["string", "null"]}`.
+    """
+    plain = [part["type"] for part in parts if part.keys() == {"type"}]
+    rest = [part for part in parts if part.keys() != {"type"}]
+    if not rest:
+        return {"type": [name for each in plain for name in ([each] if isinstance(each, str) else each)]}
+    if len(rest) == 1 and plain == ["null"] and "type" in rest[0]:
+        return {**rest[0], "type": [rest[0]["type"], "null"]}
+    return {"anyOf": parts}
+
+
+# ------------------------------------------------------------------------- reading
+
+
+def from_json(kind: type[R], document: str | bytes | Json, file: Path | str, *, code: str = "R101") -> R:
+    """Read a record that stlc has stored, and that anybody may have changed.
+
+    Keys that the record does not have are left out; a missing key takes the default of its field.
+
+    Args:
+        kind: the record, a dataclass; anything that `schema_of` knows.
+        document: the text of the file, or its content as JSON data.
+        file: name of the file in the diagnostic.
+        code: code of the diagnostic.
+
+    Raises:
+        RunError: `code`, the text is no JSON, holds a number that is not finite or beyond 1e100, or a key is
+            missing or of another type; the note names the key.
+    """
+    try:
+        found: R = read(kind, data_of(document))
+    except (ValueError, RecursionError) as error:
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
+        raise RunError(Diagnostic(code, f"`{file}` is damaged", note=(reason,))) from None
+    return found
+
+
+def read(kind: Any, value: Json, key: str = "") -> Any:
+    """Return JSON data as a value of a type. Raises ValueError, which names the key, for other data."""
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if is_dataclass(kind):
+        return _read_record(kind, value, key)  # type: ignore[arg-type]
+    if origin is Annotated:
+        return _read_annotated(args[0], args[1], value, key)
+    if origin is Literal:
+        if not any(value == each and type(value) is type(each) for each in args):
+            raise _unlike(value, f"one of {', '.join(map(str, args))}", key)
+        return value
+    if origin in _UNIONS:
+        return _read_union(args, value, key)
+    if origin in (dict, Mapping):
+        if not isinstance(value, dict):
+            raise _unlike(value, "a JSON object", key)
+        return {name: read(args[1], each, _below(key, name)) for name, each in value.items()}
+    if origin in _LISTS:
+        return _read_list(origin, args, value, key)
+    accepted = {float: (float, int), Path: str}.get(kind, kind)
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise _unlike(value, _NOUNS[kind], key)
+    return Path(str(value)) if kind is Path else float(value) if kind is float else value  # type: ignore[arg-type]
+
+
+def _read_record(kind: type, value: Json, key: str) -> Any:
+    if not isinstance(value, dict):
+        raise _unlike(value, "a JSON object", key)
+    hints, own = hints_of(kind), {each.name: each for each in fields(kind)}
+    given = {}
+    for each in keys_of(kind):
+        field = own.get(each.attribute)
+        if field is None or not field.init:
+            continue
+        if each.name in value:
+            given[each.attribute] = read(hints[each.name], value[each.name], _below(key, each.name))
+        elif not _has_default(field):
+            raise ValueError(f"{f'`{key}`' if key else 'it'} has no `{each.name}`")
+    return kind(**given)
+
+
+def _has_default(field: Field[Any]) -> bool:
+    return field.default is not MISSING or field.default_factory is not MISSING
+
+
+def _read_annotated(kind: Any, what: Any, value: Json, key: str) -> Any:
+    if what == "unbounded" and isinstance(value, str) and value in _INFINITE:
+        return _INFINITE[value]
+    found, known = read(kind, value, key), what() if callable(what) else what
+    if isinstance(known, int) and found < known:
+        raise _unlike(value, f"a number from {known} on", key)
+    if isinstance(known, Sequence) and not isinstance(known, str) and found not in known:
+        raise _unlike(value, f"one of {', '.join(map(str, known))}", key)
+    return found
+
+
+def _read_union(kinds: Sequence[Any], value: Json, key: str) -> Any:
+    if value is None and types.NoneType in kinds:
+        return None
+    others = [each for each in kinds if each is not types.NoneType]
+    errors = []
+    for each in others:
+        try:
+            return read(each, value, key)
+        except ValueError as error:
+            errors.append(error)
+    if len(others) == 1:
+        raise errors[0]
+    raise _unlike(value, " or ".join(_NOUNS.get(each, "a record") for each in others), key)
+
+
+def _read_list(origin: Any, args: Sequence[Any], value: Json, key: str) -> Any:
+    fixed = origin is tuple and Ellipsis not in args
+    if not isinstance(value, list) or (fixed and len(value) != len(args)):
+        raise _unlike(value, f"a list of {len(args)}" if fixed else "a list", key)
+    items = [read(args[n if fixed else 0], each, _below(key, n)) for n, each in enumerate(value)]
+    made: Callable[[list[Any]], Any] = list if origin is list else frozenset if origin is frozenset else tuple
+    return made(items)
+
+
+def _below(key: str, name: object) -> str:
+    return f"{key}.{name}" if key else str(name)
+
+
+def _unlike(value: Json, noun: str, key: str) -> ValueError:
+    return ValueError(f"{f'`{key}`' if key else 'it'} is {value!r:.40}, not {noun}")
