@@ -34,6 +34,7 @@ from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.scenarios.scenario import DISTURBED
+from stlc.jsontext import plain
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
 from stlc.rundir import SPEC, SYSTEM, RunDir
@@ -211,8 +212,8 @@ class Deployments:
             "run": run.dir.name,
             "policy": _policy_of(run.dir),
             **({"margin": dict(margin)} if margin else {}),
-            "metrics": {name: metrics[name].summary() for name in METRICS if name in metrics},
-            "progress": {name: metrics[name].summary() for name in filter(is_progress, metrics)},
+            "metrics": {name: plain(metrics[name]) for name in METRICS if name in metrics},
+            "progress": {name: plain(metrics[name]) for name in filter(is_progress, metrics)},
             "acted": 1.0 - decided(recording)["policy"],
             "seconds": seconds,
         }

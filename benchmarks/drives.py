@@ -34,6 +34,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PLANNING_VERSION, PlanBudget, planner_named
 from stlc.controller.training.run import Run
 from stlc.diagnostics import UsageError
+from stlc.jsontext import plain
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
 
@@ -135,7 +136,7 @@ def drive(cell: Drive) -> Result:
         times = _timed(guard, recording)
     metrics = measure(recording, judge_executed(task, recording))
     return {
-        "metrics": {name: metrics[name].summary() for name in METRICS if name in metrics},
+        "metrics": {name: plain(metrics[name]) for name in METRICS if name in metrics},
         "acted": 1.0 - decided(recording)["policy"],
         "decision": {"median": times.median, "p99": times.p99, "samples": times.samples},
         "seconds": process_time() - began,

@@ -8,9 +8,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
-from stlc.source import Span
+from stlc.source import Range, Span
 
 Severity = Literal["error", "warning", "fact"]
 """An error; a warning, which most likely is a mistake; a fact, which stands beside a result."""
@@ -20,8 +20,20 @@ Severity = Literal["error", "warning", "fact"]
 class Label:
     """A secondary source location of a finding, and the text shown beside it."""
 
+    JSON: ClassVar = "file=span.source.name range=span.range text"
+
     span: Span
     text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """A location, and the text that replaces that there."""
+
+    JSON: ClassVar = "file=span.source.name range=span.range replacement"
+
+    span: Span
+    replacement: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +43,16 @@ class Fix:
     If not `same`, the repair changes what is required: it is offered, and never applied by itself.
     """
 
+    JSON: ClassVar = "text edits=replacements"
+
     edits: tuple[tuple[Span, str], ...]
     text: str = ""
     same: bool = True
+
+    @property
+    def replacements(self) -> tuple[Edit, ...]:
+        """The edits."""
+        return tuple(Edit(*each) for each in self.edits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +70,8 @@ class Diagnostic:
         fix: edits that repair the finding.
     """
 
+    JSON: ClassVar = "code severity message file range label labels help note fix"
+
     code: str
     message: str
     span: Span | None = None
@@ -66,6 +87,16 @@ class Diagnostic:
         if not self.code.startswith("W"):
             return "error"
         return "fact" if self.code in FACTS else "warning"
+
+    @property
+    def file(self) -> str | None:
+        """Name of the source; None for a finding that concerns no text."""
+        return None if self.span is None else self.span.source.name
+
+    @property
+    def range(self) -> Range | None:
+        """Lines and columns of the location, from 1."""
+        return None if self.span is None else self.span.range
 
     def with_note(self, text: str) -> Diagnostic:
         """A copy with one more note."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from fractions import Fraction
 from functools import cache
+from operator import attrgetter
 from pathlib import PurePath
 from typing import Annotated, Any, TypeAlias
 
@@ -25,7 +26,7 @@ Num: TypeAlias = Annotated[float, "unbounded"]
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """Key of a record in JSON: its name, the attribute that it holds, and whether empty values are left out."""
+    """Key of a record in JSON: its name, its (dotted) attribute, and whether empty values are left out."""
 
     name: str
     attribute: str
@@ -69,7 +70,7 @@ def plain(value: object) -> Json:
         case PurePath():
             return value.as_posix()
     if is_dataclass(value) and not isinstance(value, type):
-        held = ((key, getattr(value, key.attribute)) for key in keys_of(type(value)))
+        held = ((key, attrgetter(key.attribute)(value)) for key in keys_of(type(value)))
         return {key.name: plain(each) for key, each in held if not (key.optional and _is_empty(each))}
     to_list = getattr(value, "tolist", None)
     if to_list is None:
@@ -95,24 +96,7 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     return json_text(json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False))
 
 
-Shape: TypeAlias = Any
-"""Shape of JSON data: a type (`float` is any number), `Any`, `[shape]` for a list, a tuple for a list of that
-length, or a mapping from keys to shapes. A key with `?` may be missing or null; `*` are all other keys."""
 _DEEPEST, _LARGEST = 100, 1e100
-_NOUNS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
-
-
-def conforming(text: str | bytes, shape: Shape) -> Any:
-    """Parse JSON that stlc has stored, and that anybody may have changed, and check its shape.
-
-    Raises:
-        ValueError: the text is no JSON in UTF-8, nests more than 100 deep, holds a number that is not finite
-            or beyond 1e100, or is of another shape. The message names the key.
-        RecursionError: the text is nested too deeply to be read.
-    """
-    value = data_of(text)
-    _require_shape(value, shape, "")
-    return value
 
 
 def data_of(text: str | bytes | Json) -> Any:
@@ -137,32 +121,6 @@ def _require_plain(value: Json, key: str, depth: int) -> None:
             _require_plain(item, f"{key}.{name}" if key else str(name), depth - 1)
     elif isinstance(value, int | float) and not abs(value) <= _LARGEST:
         raise ValueError(f"`{key}` is not finite, or is too large")
-
-
-def _require_shape(value: Json, shape: Shape, key: str) -> None:
-    where = f"`{key}`" if key else "it"
-    if isinstance(shape, dict):
-        if not isinstance(value, dict):
-            raise ValueError(f"{where} is no JSON object")
-        for name, inner in shape.items():
-            plain_name = name.removesuffix("?")
-            others = [other for other in value if not {other, f"{other}?"} & shape.keys()]
-            for each in others if plain_name == "*" else [plain_name]:
-                if value.get(each) is None and name.endswith("?"):
-                    continue
-                if each not in value:
-                    raise ValueError(f"{where} has no `{each}`")
-                _require_shape(value[each], inner, f"{key}.{each}" if key else each)
-    elif isinstance(shape, list | tuple):
-        length = len(shape) if isinstance(shape, tuple) else None
-        if not isinstance(value, list) or length not in (None, len(value)):
-            raise ValueError(f"{where} is no list" + (f" of {length}" if length else ""))
-        for number, item in enumerate(value):
-            _require_shape(item, shape[number if length else 0], f"{key}.{number}")
-    elif shape is not Any:
-        accepted = shape | int if shape in (float, float | str) else shape
-        if not isinstance(value, accepted) or (isinstance(value, bool) and shape is not bool):
-            raise ValueError(f"{where} is {value!r:.40}, not {_NOUNS.get(shape, 'of its kind')}")
 
 
 _ESCAPES = re.compile(r"(\\\\|\\u[dD][89abAB]..\\u[dD][c-fC-F]..)|\\u[dD][89a-fA-F]..|[\ud800-\udfff]")

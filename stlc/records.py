@@ -8,12 +8,25 @@ from __future__ import annotations
 import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
-from functools import cache
+from functools import cache, reduce
+from importlib import import_module
+from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NotRequired,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 from stlc.diagnostics import Diagnostic, RunError
-from stlc.jsontext import Json, Key, data_of, keys_of
+from stlc.jsontext import Json, data_of, keys_of
 
 R = TypeVar("R")
 
@@ -29,21 +42,25 @@ _LISTS = (list, tuple, frozenset, Sequence)
 @cache
 def hints_of(kind: type) -> dict[str, Any]:
     """Key of a record's JSON -> type of its value: that of the field, or what the property returns."""
-    found: dict[str, Any] = {}
-    for key in keys_of(kind):
-        owner = next(each for each in kind.__mro__ if _hint(each, key) is not None)
-        space = {"__annotations__": {key.name: _hint(owner, key)}, "__module__": owner.__module__}
-        found |= get_type_hints(type("Wanted", (), space), include_extras=True)
-    return found
+    return {key.name: reduce(_hint, key.attribute.split("."), kind) for key in keys_of(kind)}
 
 
-def _hint(kind: type, key: Key) -> Any:
-    """Annotation of an attribute that a class itself declares; None if it does not."""
-    own = vars(kind).get(key.attribute)
-    accessor = getattr(own, "fget", None) or getattr(own, "func", None)  # a property, cached or not
-    if accessor is not None:
-        return accessor.__annotations__["return"]
-    return kind.__annotations__.get(key.attribute) if "__annotations__" in vars(kind) else None
+def _hint(kind: type, name: str) -> Any:
+    """Type of an attribute of a class: that of a field, or what a property returns.
+
+    Its `NAMES` are the modules of classes in its annotations that it does not import.
+    """
+    for owner in kind.__mro__:
+        own = vars(owner).get(name)
+        accessor = getattr(own, "fget", None) or getattr(own, "func", None)  # a property, cached or not
+        hint = vars(owner).get("__annotations__", {}).get(name)
+        if accessor is not None or hint is not None:
+            found = hint if accessor is None else accessor.__annotations__["return"]
+            space = {"__annotations__": {name: found}, "__module__": owner.__module__}
+            places = getattr(owner, "NAMES", {}).items()
+            later = {word: getattr(import_module(module), word) for word, module in places}
+            return get_type_hints(type("Wanted", (), space), localns=later, include_extras=True)[name]
+    raise AttributeError(f"{kind.__name__} has no {name}")
 
 
 # ------------------------------------------------------------------------- schemas
@@ -54,14 +71,19 @@ def schema_of(kind: Any) -> dict[str, Any]:
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any:
         return {}
+    if kind is None:
+        return {"type": "null"}
     if kind in _NAMES:
         return {"type": _NAMES[kind]}
     if is_dataclass(kind):
-        keys, hints = keys_of(kind), hints_of(kind)  # type: ignore[arg-type]
-        found: dict[str, Any] = {"type": "object", "properties": {k: schema_of(h) for k, h in hints.items()}}
-        required = [key.name for key in keys if not key.optional]
-        return found | ({"required": required} if required else {})
+        inner = {name: schema_of(hint) for name, hint in hints_of(kind).items()}  # type: ignore[arg-type]
+        needed = [key.name for key in keys_of(kind) if not key.optional]  # type: ignore[arg-type]
+        return {"type": "object", "properties": inner} | ({"required": needed} if needed else {})
     if origin is Annotated:
+        if is_typeddict(args[1]):  # the keys of both
+            one, other = (schema_of(each) for each in args[:2])
+            keys = {**one["properties"], **other["properties"]}
+            return {"type": "object", "properties": keys, "required": [*one["required"], *other["required"]]}
         what = args[1]() if callable(args[1]) else args[1]
         if what == "unbounded":
             return {"type": ["number", "string"]}
@@ -71,13 +93,18 @@ def schema_of(kind: Any) -> dict[str, Any]:
     if origin in (dict, Mapping):
         return {"type": "object"} | ({} if args[1] is Any else {"additionalProperties": schema_of(args[1])})
     if origin is tuple and Ellipsis not in args:
-        of = schema_of(Union[tuple(dict.fromkeys(args))])
+        of = schema_of(reduce(or_, dict.fromkeys(args)))
         return {"type": "array", "items": of, "minItems": len(args), "maxItems": len(args)}
     if origin in _LISTS:
         return {"type": "array", "items": schema_of(args[0])}
     if origin in _UNIONS:
         return _union([schema_of(each) for each in args])
-    return schema_of(kind.__value__) if hasattr(kind, "__value__") else {"type": "array"}
+    if is_typeddict(kind):
+        hints = get_type_hints(kind, include_extras=True)
+        needed = [name for name, hint in hints.items() if get_origin(hint) is not NotRequired]
+        inner = {n: schema_of(get_args(h)[0] if n not in needed else h) for n, h in hints.items()}
+        return {"type": "object", "properties": inner} | ({"required": needed} if needed else {})
+    return {"type": "array", "items": {"type": ["number", "string"]}}  # an array of numbers
 
 
 def _union(parts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -100,7 +127,8 @@ def _union(parts: list[dict[str, Any]]) -> dict[str, Any]:
 def from_json(kind: type[R], document: str | bytes | Json, file: Path | str, *, code: str = "R101") -> R:
     """Read a record that stlc has stored, and that anybody may have changed.
 
-    Keys that the record does not have are left out; a missing key takes the default of its field.
+    Keys that the record does not have are left out; one that is missing or null takes the default of its
+    field.
 
     Args:
         kind: the record, a dataclass; anything that `schema_of` knows.
@@ -141,10 +169,10 @@ def read(kind: Any, value: Json, key: str = "") -> Any:
         return {name: read(args[1], each, _below(key, name)) for name, each in value.items()}
     if origin in _LISTS:
         return _read_list(origin, args, value, key)
-    accepted = {float: (float, int), Path: str}.get(kind, kind)
+    accepted: Any = {float: (float, int), Path: str}.get(kind, kind)
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
         raise _unlike(value, _NOUNS[kind], key)
-    return Path(str(value)) if kind is Path else float(value) if kind is float else value  # type: ignore[arg-type]
+    return Path(str(value)) if kind is Path else float(value) if kind is float else value
 
 
 def _read_record(kind: type, value: Json, key: str) -> Any:
@@ -156,7 +184,7 @@ def _read_record(kind: type, value: Json, key: str) -> Any:
         field = own.get(each.attribute)
         if field is None or not field.init:
             continue
-        if each.name in value:
+        if each.name in value and not (value[each.name] is None and _has_default(field)):
             given[each.attribute] = read(hints[each.name], value[each.name], _below(key, each.name))
         elif not _has_default(field):
             raise ValueError(f"{f'`{key}`' if key else 'it'} has no `{each.name}`")

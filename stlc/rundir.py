@@ -38,7 +38,8 @@ from stlc.files import (
     within,
     write_atomic,
 )
-from stlc.jsontext import Shape, conforming, dumps
+from stlc.jsontext import data_of, dumps
+from stlc.records import read
 from stlc.registry import did_you_mean
 from stlc.source import Source
 
@@ -59,33 +60,90 @@ HELD_OUT = "eval/held_out.npz"
 MOST_JSON, MOST_ARRAYS = 50_000_000, 2_000_000_000
 """Largest sizes in bytes of a file of JSON, and of a file of arrays or tensors."""
 
-_RECORD: Shape = {
-    **dict.fromkeys(("status?", "spec?", "spec_path?", "system?", "system_path?", "device?"), str),
-    **dict.fromkeys(("started?", "schedule?", "spec_hash?", "system_hash?"), str),
-    **dict.fromkeys(("seed?", "threads?", "steps?"), int),
-    **dict.fromkeys(("margin?", "seconds_allowed?"), float),
-    "budget?": float | str,
-    "overrides?": {"*": str},
-    "options?": {},
-    "engine?": {},
-    "versions?": {},
-    "git?": {},
-    "hardware?": {"cores?": int, "memory_gib?": float},
-    "result?": {
-        **dict.fromkeys(("accuracy?", "feasible?", "seconds?", "judged_seconds?"), float),
-        **dict.fromkeys(("held_out?", "searched?"), int),
-        "interval?": (float, float),
-        "requirements?": {"*": float},
-        "closed_loop?": {"share?": float, "recommended?": str},
-        "falsification?": {"last_share?": float},
-    },
-}
-"""Shape of a run's record; see `stlc.jsontext.conforming`."""
-_ROW: Shape = {
-    **dict.fromkeys(("step?", "steps?", "repaired?", "failing?"), int),
-    **dict.fromkeys(("seconds?", "loss?", "accuracy?", "feasible?", "lr?"), float),
-    "requirements?": {"*?": float},
-}
+
+@dataclass(frozen=True, slots=True)
+class Hardware:
+    """Machine of a run; see `stlc.provenance.hardware`."""
+
+    cores: int = 0
+    memory_gib: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StoredDrives:
+    """What a training has stored of its drives; see `stlc.controller.evaluation.closed_loop.ClosedLoop`."""
+
+    share: float | None = None
+    recommended: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRounds:
+    """What a training has stored of its rounds of falsification."""
+
+    last_share: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredResult:
+    """Result of a training, as its run stores it."""
+
+    accuracy: float | None = None
+    feasible: float | None = None
+    seconds: float | None = None
+    judged_seconds: float | None = None
+    held_out: int | None = None
+    searched: int | None = None
+    interval: tuple[float, float] | None = None
+    requirements: dict[str, float] | None = None
+    closed_loop: StoredDrives | None = None
+    falsification: StoredRounds | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """Content of `run.json` as far as it is read; a run that is going on has only a part of it."""
+
+    status: str | None = None
+    spec: str | None = None
+    spec_path: str | None = None
+    system: str | None = None
+    system_path: str | None = None
+    device: str | None = None
+    started: str | None = None
+    schedule: str | None = None
+    spec_hash: str | None = None
+    system_hash: str | None = None
+    seed: int | None = None
+    threads: int | None = None
+    steps: int | None = None
+    margin: float | None = None
+    seconds_allowed: float | None = None
+    budget: float | str | None = None
+    overrides: dict[str, str] | None = None
+    options: dict[str, Any] | None = None
+    engine: dict[str, Any] | None = None
+    versions: dict[str, Any] | None = None
+    git: dict[str, Any] | None = None
+    hardware: Hardware | None = None
+    result: StoredResult | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingRow:
+    """A line of `train.jsonl` as far as it is read."""
+
+    step: int | None = None
+    steps: int | None = None
+    repaired: int | None = None
+    failing: int | None = None
+    seconds: float | None = None
+    loss: float | None = None
+    accuracy: float | None = None
+    feasible: float | None = None
+    lr: float | None = None
+    requirements: dict[str, float | None] | None = None
+
 
 _NUMBERED = re.compile(r"(\d{4,})-(.+)")
 
@@ -236,22 +294,22 @@ class RunDir:
         """Write `value` as the JSON file `name`. Raises the errors of `write`."""
         self.write(name, dumps(value, indent=2) + "\n")
 
-    def read_json(self, name: str, shape: Shape = Any) -> Any:
-        """Read the JSON file `name` of the run.
+    def read_json(self, name: str, kind: Any = Any) -> Any:
+        """Read the JSON file `name` of the run, whose content is that of a record of the type `kind`.
 
         Raises:
-            RunError: R101, it is missing, damaged, or not of the given shape (see `jsontext.fault`); R110, it
-                is no file of the run.
+            RunError: R101, it is missing, damaged, or not of that type (see `stlc.records.read`); R110, it is
+                no file of the run.
         """
         data = self.read(name, MOST_JSON)
         try:
-            return conforming(data, shape)
+            return of_kind(data, kind)
         except (ValueError, RecursionError) as error:
             raise RunError(self.damaged(name, error)) from error
 
     def record(self) -> dict[str, Any]:
         """Content of `run.json`. Raises RunError (R101) if it is missing or damaged."""
-        record: dict[str, Any] = self.read_json(RECORD, _RECORD)
+        record: dict[str, Any] = self.read_json(RECORD, RunRecord)
         return record
 
     def update(self, facts: Mapping[str, object]) -> dict[str, Any]:
@@ -310,7 +368,7 @@ class RunDir:
         data, rows = self.read(name, MOST_JSON), []
         for number, line in enumerate(data[: data.rfind(b"\n") + 1].split(b"\n"), 1):
             try:
-                rows += [conforming(line, _ROW)] if line else []
+                rows += [of_kind(line, TrainingRow)] if line else []
             except (ValueError, RecursionError) as error:
                 message = f"`{self.shown}/{name}`, line {number}, is damaged"
                 raise RunError(replace(self.damaged(name, error), message=message)) from error
@@ -323,6 +381,16 @@ class RunDir:
         """
         kept = [row for row in self.rows(name) if wanted(row)]
         self.write(name, "".join(dumps(row) + "\n" for row in kept))
+
+
+def of_kind(text: bytes, kind: Any) -> Any:
+    """Parse JSON that a run has stored, and check that it is the content of a record of the type `kind`.
+
+    Raises ValueError or RecursionError, as `stlc.jsontext.data_of` and `stlc.records.read`.
+    """
+    found = data_of(text)
+    read(kind, found)
+    return found
 
 
 def every_run(root: Path = RUNS) -> list[RunDir]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from stlc.jsontext import Num
 from stlc.units import DIMENSIONLESS, Unit
 
 Kind = Literal["real", "int", "bool", "enum"]
@@ -35,8 +36,8 @@ class Column:
     unit: Unit = DIMENSIONLESS
     kind: Kind = "real"
     role: Role = "state"
-    low: float | None = None
-    high: float | None = None
+    low: Num | None = None
+    high: Num | None = None
     labels: tuple[tuple[str, float], ...] = ()
     fact: bool = False
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,26 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
+class Position:
+    """Line and column, from 1."""
+
+    line: int
+    column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Positions of the first character, and of that after the last one."""
+
+    start: Position
+    end: Position
+
+
+@dataclass(frozen=True, slots=True)
 class Span:
     """A location in a source: the characters from offset `start` to offset `end` (exclusive)."""
+
+    JSON: ClassVar = "line column"
 
     source: Source
     start: int
@@ -60,6 +79,11 @@ class Span:
     def column(self) -> int:
         """Column of the first character, from 1."""
         return self.source.position(self.start)[1]
+
+    @property
+    def range(self) -> Range:
+        """Positions of both ends."""
+        return Range(*(Position(*self.source.position(offset)) for offset in (self.start, self.end)))
 
     @property
     def text(self) -> str:

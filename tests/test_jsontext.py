@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.jsontext import conforming, dumps, plain
+from stlc.jsontext import data_of, dumps, plain
 
 
 def strict(text: str) -> Any:
@@ -64,25 +64,12 @@ def test_what_is_no_data_is_refused():
         plain([object()])
 
 
-# ---------------------------------------------------------------------- stored data of a shape
-
-
-SHAPE = {"a": int, "b?": float, "c?": {"*": str, "d?": [bool]}, "e?": (float, float), "f?": float | str}
+# ---------------------------------------------------------------------- stored data
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[]", "it is no JSON object"),
-        ("{}", "it has no `a`"),
-        ('{"a": null}', "`a` is None, not a whole number"),
-        ('{"a": 1.5}', "`a` is 1.5, not a whole number"),
-        ('{"a": true}', "`a` is True, not a whole number"),
-        ('{"a": 1, "b": "x"}', "`b` is 'x', not a number"),
-        ('{"a": 1, "c": {"k": 3}}', "`c.k` is 3, not a text"),
-        ('{"a": 1, "c": {"d": [true, 0]}}', "`c.d.1` is 0, not true or false"),
-        ('{"a": 1, "e": [1]}', "`e` is no list of 2"),
-        ('{"a": 1, "f": []}', "`f` is"),
         ('{"a": 1, "z": 1e999}', "`z` is not finite, or is too large"),
         ('{"a": 1, "z": NaN}', "`z` is not finite"),
         ('{"a": 1, "z": -1e101}', "`z` is not finite, or is too large"),
@@ -90,23 +77,23 @@ SHAPE = {"a": int, "b?": float, "c?": {"*": str, "d?": [bool]}, "e?": (float, fl
         (f'{{"a": 1, "z": {"[" * 101}{"]" * 101}}}', "is nested more than 100 deep"),
     ],
 )
-def test_stored_data_of_another_shape_name_the_key(text: str, said: str) -> None:
+def test_stored_data_that_no_reader_accepts_name_the_key(text: str, said: str) -> None:
     with pytest.raises(ValueError, match=re.escape(said)):
-        conforming(text, SHAPE)
+        data_of(text)
 
 
-def test_stored_data_of_the_shape() -> None:
+def test_stored_data() -> None:
     text = '{"a": 1, "b": null, "c": {"k": "t", "d": []}, "e": [1, 2.5], "f": "10 s", "other": [{}]}'
-    assert conforming(text, SHAPE) == conforming(text.encode(), Any) == json.loads(text)
+    assert data_of(text) == data_of(text.encode()) == json.loads(text)
     with pytest.raises(ValueError, match="utf-8"):
-        conforming(b"\xff", Any)
+        data_of(b"\xff")
     with pytest.raises((ValueError, RecursionError)):
-        conforming("[" * 100_000, Any)
+        data_of("[" * 100_000)
 
 
 @given(data)
-def test_whatever_is_written_conforms_or_is_too_large(value: Any) -> None:
+def test_whatever_is_written_is_read_or_is_too_large(value: Any) -> None:
     try:
-        assert conforming(dumps(value), Any) == json.loads(dumps(value))
+        assert data_of(dumps(value)) == json.loads(dumps(value))
     except ValueError as error:
         assert "too large" in str(error)  # noqa: PT017

@@ -359,7 +359,7 @@ def test_latest_leads_to_a_run_below_its_folder_alone(root, tmp_path):
     ("text", "said"),
     [
         ('{"result": {"accuracy": "high"}}', "`result.accuracy` is 'high', not a number"),
-        ('{"result": {"interval": [0.1]}}', "`result.interval` is no list of 2"),
+        ('{"result": {"interval": [0.1]}}', "`result.interval` is [0.1], not a list of 2"),
         ('{"hardware": {"cores": []}}', "`hardware.cores` is [], not a whole number"),
         ('{"seed": 1e999}', "`seed` is not finite"),
         ("[" * 9000, "nested too deeply"),

@@ -13,7 +13,6 @@ structure = load_tool("structure")
 NODES = 463620
 CROSSINGS = 6.84
 CIRCLES = {
-    ("cli/certify", "cli/check"),
     ("compile/backends", "compile/semantics"),
     ("controller/deployment", "controller/evaluation"),
     ("controller/deployment", "controller/guard"),

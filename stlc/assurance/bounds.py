@@ -131,6 +131,11 @@ class Tally:
     values: NDArray[np.float64]
     counts: NDArray[np.int64]
 
+    @property
+    def pairs(self) -> list[list[float]]:
+        """Pairs [value, count]."""
+        return [[float(v), int(count)] for v, count in zip(self.values, self.counts, strict=True)]
+
     @classmethod
     def of(cls, observed: ArrayLike) -> Tally:
         """Group observations, (n,). Raises ValueError if one is outside of [0, 1]."""

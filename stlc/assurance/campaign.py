@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from stlc.assurance.certificate import (
     FORMAT,
@@ -153,11 +153,12 @@ def _answered(found: Assessment, width: float | None) -> bool:
 
 def certificate(order: Campaign, progress: Progress) -> dict[str, Any]:
     """Content of a certificate file: answer, bounds, assumptions, and everything that they depend on."""
+    bounds: Any = plain(progress.assessment)
     document = {
         "certificate": FORMAT,
         "made": now(),
         **order.subject.record(progress.seeds),
-        **progress.assessment.summary(),
+        **bounds,
         "width": order.width,
         "finished": progress.done,
         "batches": progress.batches,
@@ -207,6 +208,19 @@ class CertificateVerification:
     def same(self) -> bool:
         """True if the certificate is about the present inputs, and its numbers are consistent."""
         return not self.inputs and not self.numbers
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateCheck:
+    """Comparison of the certificate in a file with a run, or with a plant or system, whose file is `run`."""
+
+    JSON: ClassVar = (
+        "file run same=found.same inputs=found.inputs numbers=found.numbers software=found.software"
+    )
+
+    file: str
+    run: str
+    found: CertificateVerification
 
 
 def compared(

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +34,13 @@ from stlc.assurance.conformal import (
     parse_shift,
     tolerance_bound,
 )
+from stlc.jsontext import Num
+from stlc.monitor.judgement import RequirementVerdict, Status, Verdict
 
 FORMAT = "stlc-certificate/1"
 ALL = "all requirements"
 Noun: TypeAlias = Literal["world", "drive", "trace", "simulation"]
+Count: TypeAlias = Annotated[int, 0]
 Answer: TypeAlias = Literal["certified", "refuted", "undecided", "measured"]
 _AGREE = 1e-9
 """Largest difference of a recomputed bound that counts as rounding."""
@@ -65,6 +68,13 @@ class Judged:
     satisfied: NDArray[np.bool_]
     violated: NDArray[np.bool_]
     robustness: NDArray[np.float64]
+
+    @classmethod
+    def by(cls, verdict: RequirementVerdict) -> Judged:
+        """Verdicts on the traces of a recording."""
+        statuses, least = np.array(verdict.statuses), verdict.low.min(axis=0)
+        robustness = np.nan_to_num(least, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+        return cls(verdict.name, verdict.unit, statuses == "satisfied", statuses == "violated", robustness)
 
     def of(self, kept: NDArray[np.bool_]) -> Judged:
         """Verdicts on the drives that are kept, (drives,)."""
@@ -129,6 +139,22 @@ class Sample:
         found = np.full(self.count, np.inf)
         np.minimum.at(found, self.units, values)
         return found
+
+
+def sample_of_traces(verdict: Verdict) -> Sample | None:
+    """Sample of the traces to which a specification applies; None if there are none.
+
+    Traces of one deployment that were recorded with the same seed belong to one world; else each trace is
+    independent of the others.
+    """
+    seeds, units = verdict.about.seeds, np.arange(verdict.traces)
+    noun: Noun = "trace"
+    if seeds is not None and seeds.shape == (verdict.traces,):
+        found, units = np.unique(seeds, return_inverse=True)
+        noun = "world" if len(found) < len(units) else "trace"
+    judged = tuple(map(Judged.by, verdict))
+    whole = Sample(together(judged, verdict.factors), judged, units.astype(np.int64), noun)
+    return whole.in_scope(verdict.scope) if verdict.in_scope else None
 
 
 def joined(samples: Sequence[Sample]) -> Sample:
@@ -292,18 +318,25 @@ class Statement:
         high: the same if everything undecided were satisfied.
     """
 
+    JSON: ClassVar = (
+        "name drives satisfied undecided units share lower=shares.lower upper=shares.upper interval method "
+        "lower_any_time=shares.any_time lower_fixed=shares.fixed lower_deployed=deployed upper_deployed=most "
+        "whole_units=whole whole_units_lower=whole_lower next_robustness reached_robustness=reached "
+        "robustness_unit=unit observed observed_high"
+    )
+
     name: str
     unit: str
-    drives: int
-    satisfied: int
-    undecided: int
+    drives: Count
+    satisfied: Count
+    undecided: Count
     shares: Shares
     deployed: float
     most: float
-    whole: int
+    whole: Count
     whole_lower: float
-    next_robustness: float
-    reached: float
+    next_robustness: Num
+    reached: Num
     low: Tally
     high: Tally
 
@@ -313,7 +346,7 @@ class Statement:
         return float(self.low.values @ self.low.counts / self.low.counts.sum())
 
     @property
-    def units(self) -> int:
+    def units(self) -> Count:
         """Number of units."""
         return int(self.low.counts.sum())
 
@@ -325,36 +358,25 @@ class Statement:
             return "certified"
         return "refuted" if self.most < claim.share else "undecided"
 
-    def summary(self) -> dict[str, Any]:
-        """The statement as a JSON object."""
-        bounds = self.shares
-        return {
-            "name": self.name,
-            "drives": self.drives,
-            "satisfied": self.satisfied,
-            "undecided": self.undecided,
-            "units": self.units,
-            "share": self.share,
-            "lower": bounds.lower,
-            "upper": bounds.upper,
-            "interval": [bounds.interval.low, bounds.interval.high],
-            "method": "Clopper-Pearson" if bounds.exact else "betting",
-            "lower_any_time": bounds.any_time,
-            "lower_fixed": bounds.fixed,
-            "lower_deployed": self.deployed,
-            "upper_deployed": self.most,
-            "whole_units": self.whole,
-            "whole_units_lower": self.whole_lower,
-            "next_robustness": self.next_robustness,
-            "reached_robustness": self.reached,
-            "robustness_unit": self.unit,
-            "observed": _pairs(self.low),
-            "observed_high": _pairs(self.high),
-        }
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Two-sided interval of the share."""
+        return self.shares.interval.low, self.shares.interval.high
 
+    @property
+    def method(self) -> Literal["Clopper-Pearson", "betting"]:
+        """Name of the bounds."""
+        return "Clopper-Pearson" if self.shares.exact else "betting"
 
-def _pairs(tally: Tally) -> list[list[float]]:
-    return [[float(value), int(count)] for value, count in zip(tally.values, tally.counts, strict=True)]
+    @property
+    def observed(self) -> list[list[float]]:
+        """Observed values of the units, and how often."""
+        return self.low.pairs
+
+    @property
+    def observed_high(self) -> list[list[float]]:
+        """The same if everything undecided were satisfied."""
+        return self.high.pairs
 
 
 def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
@@ -397,6 +419,14 @@ def _reached(least: NDArray[np.float64], claim: Claim) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class NeededUnits:
+    """Numbers of units without a failure that certify the share, and that bound the next robustness."""
+
+    units: Count
+    robustness: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class Assessment:
     """Bounds on future drives: a statement on each requirement, and the answer to the claim.
 
@@ -411,14 +441,19 @@ class Assessment:
         left_out: number of further drives, in which an assumption of the specification does not hold.
     """
 
+    JSON: ClassVar = (
+        "answer share=claim.share confidence=claim.confidence shift sequential=claim.any_time unit=noun "
+        "calibration left_out needed overall requirements online assumptions"
+    )
+
     claim: Claim
     overall: Statement
     requirements: tuple[Statement, ...]
     noun: Noun
     sizes: tuple[int, int]
     online: OnlineBound | None
-    calibration: int
-    left_out: int = 0
+    calibration: Count
+    left_out: Count = 0
 
     @property
     def answer(self) -> Answer:
@@ -435,37 +470,56 @@ class Assessment:
         """0 if the share is certified or only measured, 1 if it is refuted, 4 if it is undecided."""
         return {"certified": 0, "measured": 0, "refuted": 1, "undecided": 4}[self.answer]
 
+    @property
     def assumptions(self) -> list[str]:
         """Conditions under which the bounds hold, a sentence each; the most specific comes first."""
         return list(_assumptions(self))
 
-    def summary(self) -> dict[str, Any]:
-        """Everything as a JSON object."""
-        claim, online = self.claim, self.online
-        return {
-            "answer": self.answer,
-            "share": claim.share,
-            "confidence": claim.confidence,
-            "shift": f"tv={claim.shift}" if claim.shift else None,
-            "sequential": claim.any_time,
-            "unit": self.noun,
-            "calibration": self.calibration,
-            "left_out": self.left_out,
-            "needed": {
-                "units": drives_needed(claim.target, claim.confidence, any_time=claim.any_time),
-                "robustness": drives_for_bound(claim.confidence, claim.shift),
-            },
-            "overall": self.overall.summary(),
-            "requirements": [each.summary() for each in self.requirements],
-            "online": None
-            if online is None
-            else {
-                "margins": online.margins,
-                "confidence": online.confidence,
-                "units": online.drives,
-            },
-            "assumptions": self.assumptions(),
-        }
+    @property
+    def shift(self) -> str | None:
+        """Shift of future drives in words; None if there is none."""
+        return f"tv={self.claim.shift}" if self.claim.shift else None
+
+    @property
+    def needed(self) -> NeededUnits:
+        """Numbers of units without a failure that certify the share, and that bound the next robustness."""
+        claim = self.claim
+        units = drives_needed(claim.target, claim.confidence, any_time=claim.any_time)
+        return NeededUnits(units, drives_for_bound(claim.confidence, claim.shift))
+
+
+@dataclass(frozen=True)
+class BoundedVerdict(Verdict):
+    """Verdict on several traces, with bounds on the share of satisfied ones."""
+
+    JSON: ClassVar = f"{Verdict.JSON} assurance?"
+
+    assurance: Assessment | None = None
+
+    @classmethod
+    def of(cls, verdict: Verdict, assurance: Assessment) -> BoundedVerdict:
+        """Add bounds to a verdict that was told."""
+        given = {each.name: getattr(verdict, each.name) for each in fields(verdict)}
+        return cls(**given, assurance=assurance).knowing(**vars(verdict))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, slots=True)
+class Unjudged:
+    """A file without a verdict."""
+
+    trace: str
+    verdict: Literal["invalid", "not judged"]
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedFiles:
+    """Verdicts on several files, with the verdict over all of them, and bounds if they were asked for."""
+
+    JSON: ClassVar = "verdict files assurance?"
+
+    verdict: Status
+    files: tuple[Verdict | Unjudged, ...]
+    assurance: Assessment | None = None
 
 
 def assess(sample: Sample, claim: Claim) -> Assessment:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -121,10 +122,12 @@ class OnlineBound:
         drives: number of drives behind the radius.
     """
 
+    JSON: ClassVar = "margins confidence units=drives"
+
     scale: NDArray[np.float64]
     radius: float
     confidence: float
-    drives: int
+    drives: Annotated[int, 0]
 
     def lower(self, step: int, predicted: float) -> float:
         """Bound at a step, given the prediction then, such as the robustness of the plan that is followed."""

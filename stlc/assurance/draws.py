@@ -86,22 +86,14 @@ class PlantDraws:
         for run in self.judge.runs(points, seeds, jobs=self.jobs, stream=self.judge.long):
             if run.finding is not None:
                 self.findings.append(run.finding)
-            sample = _sample(rules, [_judged(run, rule.name) for rule in rules])
-            yield sample.in_scope(np.array([run.status != "out of scope"]))
+            sample = _sample(rules, [_judged(run, rule) for rule in rules])
+            yield sample.in_scope(np.array([run.verdict is None or run.verdict.in_scope > 0]))
 
     def record(self, seeds: Sequence[int]) -> dict[str, Any]:
         """Entries of the certificate on the plant, its files, its failures, and the conditions."""
         decl, monitor = self.judge.plant.decl, self.judge.monitor
-        found = [
-            {
-                "seed": each.seed,
-                "reason": each.reason,
-                "message": each.message,
-                "time": each.time,
-                "point": dict(each.point),
-            }
-            for each in self.findings[:MOST_FINDINGS]
-        ]
+        shown = self.findings[:MOST_FINDINGS]
+        found = [FailedDraw(e.seed, e.reason, e.message, e.time, dict(e.point)) for e in shown]
         return {
             "kind": "plant",
             "spec": monitor.compiled.name,
@@ -192,6 +184,17 @@ class ModelDraws:
         """Do nothing: the system is simulated in this process."""
 
 
+@dataclass(frozen=True, slots=True)
+class FailedDraw:
+    """Simulation of a plant that failed, as a certificate states it; see `stlc.plants.plant.PlantFinding`."""
+
+    seed: int
+    reason: str
+    message: str
+    time: float | None
+    point: dict[str, float]
+
+
 def _conditions(overrides: Mapping[str, str], require: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
     return {"overrides": dict(overrides), "require": list(require), "seeds": seed_ranges(seeds)}
 
@@ -211,14 +214,12 @@ def _sample(rules: Sequence[CompiledRequirement], judged: Sequence[Judged]) -> S
     return Sample(together(judged, weights), tuple(judged), units, "simulation")
 
 
-def _judged(run: JudgedRun, name: str) -> Judged:
+def _judged(run: JudgedRun, rule: CompiledRequirement) -> Judged:
     """Verdict on one simulation under one requirement; one without a trace violates it."""
-    found = next((each for each in run.requirements if each.rule.name == name), None)
-    status = "violated" if found is None else found.status
-    low = -np.inf if found is None or np.isnan(found.low) else found.low
-    unit = "" if found is None else found.rule.unit
-    satisfied, violated = np.array([status == "satisfied"]), np.array([status == "violated"])
-    return Judged(name, unit, satisfied, violated, np.array([low]))
+    if run.verdict is not None:
+        return Judged.by(run.verdict[rule.name])
+    no, yes = np.zeros(1, dtype=np.bool_), np.ones(1, dtype=np.bool_)
+    return Judged(rule.name, rule.unit, no, yes, np.array([-np.inf]))
 
 
 # ---------------------------------------------------------------------- verification

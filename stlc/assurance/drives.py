@@ -17,7 +17,7 @@ from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.guard import Guard
-from stlc.controller.training.checkpoint import FOLDER, POINTER
+from stlc.controller.training.checkpoint import FOLDER, POINTER, CheckpointHead
 from stlc.controller.training.run import CONFIG, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.robots.functions import function_files
@@ -103,22 +103,8 @@ def _judged_by_plans(task: Task, recording: DeploymentRecording) -> _Verdicts:
 
 def _judged_by_rules(task: Task, recording: DeploymentRecording, rules: Rules) -> _Verdicts:
     verdict = verdict_on_runs(rules, task, recording)
-    scope = verdict.requirements[0].scope
-    found = [
-        (
-            judgement.rule,
-            np.array(judgement.statuses),
-            np.nan_to_num(judgement.low.min(0), nan=-np.inf, posinf=np.inf, neginf=-np.inf),
-        )
-        for judgement in verdict
-    ]
-    judged = tuple(
-        Judged(rule.name, rule.unit, statuses == "satisfied", statuses == "violated", least)
-        for rule, statuses, least in found
-    )
-    weights = {rule.name: rule.factor for rule, _, _ in found}
-    inside = np.ones(len(recording.states), dtype=np.bool_) if scope is None else np.asarray(scope)
-    return _Verdicts(judged, weights, np.broadcast_to(inside, (len(recording.states),)))
+    inside = np.broadcast_to(verdict.scope, (len(recording.states),))
+    return _Verdicts(tuple(map(Judged.by, verdict)), verdict.factors, inside)
 
 
 # ---------------------------------------------------------------------- deploying
@@ -255,6 +241,6 @@ def _policy(folder: RunDir) -> str:
     """Hash of the tensors of the newest checkpoint, if there is one, and of the resolved options."""
     parts = [folder.read(CONFIG)]
     if folder.has(f"{FOLDER}/{POINTER}"):
-        name = folder.read_json(f"{FOLDER}/{POINTER}", {"file": str})["file"]
+        name = folder.read_json(f"{FOLDER}/{POINTER}", CheckpointHead)["file"]
         parts.append(folder.read(f"{FOLDER}/{name}", MOST_ARRAYS))
     return sha256(b"\0".join(sha256(part).encode() for part in parts))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from time import perf_counter
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from stlc.assurance.simulation import Simulations, Simulator
 from stlc.assurance.strategies import GradientVertices
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
+from stlc.jsontext import Num
 
 FALSIFIER_VERSION = 13
 """Version of the search; results of older versions are recomputed."""
@@ -53,9 +54,11 @@ class Counterexample:
         simulation: number of simulations until it was found, itself included.
     """
 
+    JSON: ClassVar = "margin half_step strategy simulation"
+
     point: Point = field(repr=False)
-    margin: float
-    half_step: float | None
+    margin: Num
+    half_step: Num | None
     strategy: str
     simulation: int
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
 
 import numpy as np
 import torch
@@ -134,6 +134,8 @@ TIMED = 200
 @dataclass(frozen=True, slots=True)
 class Latency:
     """Decision time of one agent on one thread in milliseconds: median and 99th percentile."""
+
+    JSON: ClassVar = "median_ms=median p99_ms=p99"
 
     median: float
     p99: float

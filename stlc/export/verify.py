@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import torch
 from torch import Tensor
@@ -88,6 +88,8 @@ class Agreement:
             magnitude, whichever is greater.
         ties: number of states in which the export chose another plan than the run, of the same rank.
     """
+
+    JSON: ClassVar = "states guarded plan rho"
 
     states: int
     plan: float

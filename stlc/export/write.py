@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
 
 import torch
 
@@ -53,6 +53,8 @@ class Exported:
     """Result of an export.
 
     Attributes:
+        run: the run.
+        target: the form of the export.
         folder: folder of the written files.
         files: names of the files.
         kept: names of example files that were there already and differ, so that they were left as they are.
@@ -61,6 +63,10 @@ class Exported:
         unchecked: reason why the export could not be verified; "" if it was verified.
     """
 
+    JSON: ClassVar = "run target folder files kept checked=agreement latency"
+
+    run: str
+    target: Target
     folder: Path
     files: tuple[str, ...]
     agreement: Agreement | None
@@ -121,7 +127,7 @@ def export(run: Run, target: Target, folder: Path, precision: Precision = "float
         files = tuple(name for name in texts if name not in kept)
         for name in files:
             write_atomic(place(folder, name), texts[name])
-    return Exported(folder, files, found, latency, unchecked, kept)
+    return Exported(run.dir.shown, target, folder, files, found, latency, unchecked, kept)
 
 
 def _differs(path: Path, content: bytes) -> bool:

@@ -2,139 +2,94 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.ir.support import columns
-from stlc.compile.pipeline import Compiled, CompiledRequirement
-from stlc.compile.semantics.semantics import Semantics
-from stlc.compile.semantics.tolerance import TOLERANCE, weighed
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.compile.ir.discretize import Horizon
+from stlc.compile.pipeline import CompiledRequirement
+from stlc.compile.semantics.semantics import Semantics, semantics_of
+from stlc.compile.semantics.tolerance import TOLERANCE, End, weighed
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.jsontext import Num
+from stlc.monitor.facts.extent import samples_read
 from stlc.monitor.facts.fact import Fact
-from stlc.monitor.signals import Gap, Signals
-from stlc.monitor.values import Record
+from stlc.monitor.prepared import Floats, Part, Prepared, Timeline
+from stlc.monitor.signals import Gap
+from stlc.provenance import sha256
 from stlc.registry import closest
+from stlc.source import Source
+from stlc.trace.recording import Clock
 from stlc.trace.resample import TimeRange
 
+if TYPE_CHECKING:
+    from stlc.monitor.explain.report import Cause
+    from stlc.monitor.uncertain import Uncertainty
+
 Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
-Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
+Ints: TypeAlias = NDArray[np.int64]
 
-_ROUNDING = 1e-6
-"""Share of a step by which times may be off the grid."""
+MOST = 500
+"""Greatest number of violated requirements explained at once; each takes half a millisecond."""
 
 
 @dataclass(frozen=True, slots=True)
-class Prepared:
-    """Signals and compiled requirements, ready for evaluation.
+class Counts:
+    """Summary of the instants of a requirement that are told in one row, as those of a stream.
 
     Attributes:
-        compiled: the specification, compiled for the time step of the signals.
-        rules: the requirements to evaluate.
-        signals: the signals with their shape and times.
-        record: the same signals as arrays (time, batch), and the array library (NumPy or torch).
+        instants: number of instants.
+        held: number of instants at which the requirement certainly holds, (traces,).
+        failed: number of instants at which it is certainly violated, (traces,).
+        low_at: sample of the least lower bound, (traces,).
+        high_at: sample of the least upper bound, (traces,).
     """
 
-    compiled: Compiled
-    rules: tuple[CompiledRequirement, ...]
-    signals: Signals
-    record: Record
-
-    @property
-    def horizon(self) -> int | None:
-        """Horizon `T` of the planning window in steps; None if unknown."""
-        return self.compiled.grid.horizon
-
-    @property
-    def dt(self) -> float | None:
-        """Time step in seconds; None if unknown."""
-        return None if self.compiled.grid.dt is None else float(self.compiled.grid.dt)
-
-    @property
-    def gaps(self) -> dict[str, Gap]:
-        """Unknown samples of each signal that the requirements read, by name."""
-        return self.signals.gaps
-
-    def under(self, semantics: Semantics) -> Prepared:
-        """Return a copy that is evaluated in the given `semantics` (definition of minimum and maximum)."""
-        return replace(self, record=replace(self.record, semantics=semantics))
-
-    def time(self, sample: int) -> float:
-        """Time of a sample in seconds; the sample number if the time step is unknown."""
-        if self.signals.times is not None and 0 <= sample < len(self.signals.times):
-            return float(self.signals.times[sample])
-        return float(sample) if self.dt is None else self.signals.t0 + sample * self.dt
-
-    @property
-    def whole(self) -> TimeRange | None:
-        """Time in which any signal was seen, if signals were seen at different times."""
-        spans = self.signals.spans.values()
-        if self.signals.dt is None or not spans or not self.signals.samples:
-            return None
-        first = min(span.first for span in spans)
-        return TimeRange(first, max(max(span.last for span in spans), first))
-
-    @property
-    def duration(self) -> TimeRange:
-        """Time of the recording, from its first to its last sample."""
-        return self.whole or TimeRange(self.time(0), self.time(self.record.samples - 1))
-
-    def seen(self, rule: CompiledRequirement) -> TimeRange | None:
-        """Time in which all signals of a requirement were seen (E602 without one); None if it is `whole`."""
-        whole = found = self.whole
-        if whole is None or found is None or rule.absolute:
-            return None
-        spans = {name: span for name, span in self.signals.spans.items() if name in columns(rule.formula)}
-        for span in spans.values():
-            found = found.within(span)
-        if found.last < found.first:
-            told = [
-                f"`{name}` is "
-                + (f"seen from {x.first:.6g} s to {x.last:.6g} s" if x.first <= x.last else "never seen")
-                for name, x in spans.items()
-            ]
-            message = f"the signals of `{rule.name}` in `{self.signals.name}` have no time in common"
-            raise TraceError(Diagnostic("E602", message, rule.span, note=("; ".join(told),)))
-        return None if found == whole else found
-
-    def part(self, rule: CompiledRequirement) -> Part:
-        """Return the samples on which a requirement is judged: those at which its signals were seen."""
-        seen, samples, dt = self.seen(rule), self.signals.samples, self.signals.dt
-        if seen is None or dt is None:
-            return Part(0, self.record.samples)
-        first = math.ceil((seen.first - self.signals.t0) / dt - _ROUNDING)
-        stop = math.floor((seen.last - self.signals.t0) / dt + _ROUNDING) + 1
-        stop = max(min(stop, samples), min(first, samples - 1) + 1)
-        return Part(min(max(first, 0), samples - 1), stop, seen)
-
-    def moment(self, sample: int) -> str:
-        """Time of a sample as text: `t = 4.6 s`, or `sample 46` if the time step is unknown."""
-        return f"sample {sample}" if self.dt is None else f"t = {self.time(sample):.10g} s"
+    instants: int
+    held: Ints
+    failed: Ints
+    low_at: Ints
+    high_at: Ints
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """Samples of a trace on which a requirement is judged.
+class WorstStart:
+    """Trace and start of the least robustness, and the time of its cause, in seconds."""
 
-    Attributes:
-        first: index of the first one.
-        stop: index after the last one.
-        seen: time in which all signals of the requirement were seen; None if that is the whole recording.
-    """
-
-    first: int
-    stop: int
-    seen: TimeRange | None = None
+    trace: int
+    start: Num
+    time: Num
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class Robustness:
+    """Least robustness over instants, of all traces: its minimum, mean and bounds; None without a trace."""
+
+    min: Num | None
+    mean: Num | None
+    low: Num | None
+    high: Num | None
+    unit: str
+    argmin: WorstStart
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedPart:
+    """Part of a recording that a requirement could read, in seconds from its first sample, of a duration."""
+
+    first: Num
+    last: Num
+    of: Num
+
+
+@dataclass(frozen=True)
+class RequirementVerdict:
     """Verdict and robustness of one requirement on one or many traces.
 
     Attributes:
@@ -145,12 +100,25 @@ class Judgement:
         holds: whether the requirement is certainly satisfied, (instants, traces).
         fails: whether the requirement is certainly violated, (instants, traces).
         shape: axes of the signals before their time axis; () for a single trace.
+        part: the samples on which the requirement is judged.
+        timeline: times of the samples.
+        tolerance: a requirement is satisfied if its robustness is at least minus this value.
         scope: True for traces that satisfy the assumptions, (traces,); None if all do. The others do not
             affect verdicts over all traces.
         reported: `low` and `high` in the requested semantics (definition of min and max); None: the exact.
-        part: the samples on which the requirement is judged; None for all.
-        tolerance: a requirement is satisfied if its robustness is at least minus this value.
+        counts: the instants, if the arrays have one row for all of them; None if a row is an instant.
+        facts: facts about the requirement that a told verdict has.
+        violated_at: time in seconds from which the requirement is certainly violated, whatever follows; None
+            if it is not violated, or if the time was not looked for.
+        subject: the evaluated signals; None in a told verdict.
     """
+
+    JSON: ClassVar = (
+        "name doc=rule.doc tags robustness=figures cause verdict=overall starts=instants "
+        "satisfied_share=share violated_traces judged facts id?=rule.typed.id"
+    )
+
+    NAMES: ClassVar = {"Cause": "stlc.monitor.explain.report"}
 
     rule: CompiledRequirement
     start: int
@@ -159,10 +127,15 @@ class Judgement:
     holds: Bools = field(repr=False)
     fails: Bools = field(repr=False)
     shape: tuple[int, ...]
+    part: Part
+    timeline: Timeline = field(repr=False)
+    tolerance: float = TOLERANCE
     scope: Bools | None = field(default=None, repr=False)
     reported: tuple[Floats, Floats] | None = field(default=None, repr=False)
-    part: Part | None = None
-    tolerance: float = TOLERANCE
+    counts: Counts | None = field(default=None, repr=False)
+    facts: tuple[Fact, ...] = ()
+    violated_at: float | None = None
+    subject: Prepared | None = field(default=None, repr=False, compare=False)
 
     @property
     def margins(self) -> tuple[Floats, Floats]:
@@ -175,6 +148,11 @@ class Judgement:
         return self.rule.name
 
     @property
+    def tags(self) -> list[str]:
+        """Tags of the requirement."""
+        return sorted(self.rule.tags)
+
+    @property
     def unit(self) -> str:
         """Unit of the robustness: the unit of all predicates, or "" if they have different units."""
         return self.rule.unit
@@ -184,7 +162,7 @@ class Judgement:
         """Status of each trace; `out of scope` if the trace violates the assumptions."""
         inside = np.ones(self.holds.shape[1], dtype=bool) if self.scope is None else self.scope
         return [
-            _status(bool(fails.any()), bool(holds.all())) if counts else "out of scope"
+            status_of(bool(fails.any()), bool(holds.all())) if counts else "out of scope"
             for fails, holds, counts in zip(self.fails.T, self.holds.T, inside, strict=True)
         ]
 
@@ -201,12 +179,22 @@ class Judgement:
     def overall(self) -> Status:
         """Status over traces in scope: violated if any is, satisfied if all are, else inconclusive."""
         holds = self.counted(self.holds)
-        return _status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
+        return status_of(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
     @property
     def satisfied(self) -> bool | None:
         """True if all traces satisfy the requirement, False if any violates it, None if that is unknown."""
         return _known(self.overall)
+
+    @property
+    def violated_traces(self) -> int:
+        """Number of traces that violate the requirement."""
+        return self.statuses.count("violated")
+
+    @property
+    def unjudged(self) -> bool:
+        """True if the requirement is satisfied, but was not fully judged."""
+        return self.overall == "satisfied" and any(fact.unjudged for fact in self.facts)
 
     @property
     def bounds(self) -> tuple[Any, Any]:
@@ -231,68 +219,323 @@ class Judgement:
         return np.where(low == high, low, np.where(self.fails.any(axis=0), high, known))
 
     @property
-    def share(self) -> float:
+    def figures(self) -> Robustness:
+        """Robustness over the traces in scope."""
+        low, high, least = (self.counted(end) for end in (*self.margins, self.least))
+        trace, sample = self.worst
+        start, cause, known = self.timeline.time(sample), self.cause, bool(least.size)
+        with np.errstate(invalid="ignore"):  # +inf and -inf have no mean, and a sum of values could overflow
+            mean = float((least / least.size).sum()) if known else None
+        least_low, least_high = (float(values.min()) if known else None for values in (low, high))
+        unit, time = (
+            self.unit or ("" if cause is None else cause.unit),
+            start if cause is None else cause.time,
+        )
+        where = WorstStart(trace, start, time)
+        return Robustness(float(least.min()) if known else None, mean, least_low, least_high, unit, where)
+
+    @property
+    def share(self) -> Num:
         """Share of the evaluated instants of all traces at which the requirement certainly holds."""
-        holds = self.counted(self.holds)
-        return float(holds.mean()) if holds.size else 0.0
+        held = self.counted(self.held)
+        return float(held.sum() / (held.size * self.instants)) if held.size and self.instants else 0.0
 
     @property
     def instants(self) -> int:
         """Number of evaluated instants per trace."""
-        return len(self.low)
+        return len(self.low) if self.counts is None else self.counts.instants
+
+    @property
+    def held(self) -> Ints:
+        """Number of instants at which the requirement certainly holds, (traces,)."""
+        return self.holds.sum(axis=0) if self.counts is None else self.counts.held
+
+    @property
+    def failed(self) -> Ints:
+        """Number of instants at which the requirement is certainly violated, (traces,)."""
+        return self.fails.sum(axis=0) if self.counts is None else self.counts.failed
 
     @property
     def worst(self) -> tuple[int, int]:
         """Trace and sample with the least `high` if the requirement is violated, else the least `low`."""
-        values = self.high if self.counted(self.fails).any() else self.low
+        violated = bool(self.counted(self.fails).any())
+        values = self.high if violated else self.low
         if self.scope is not None and self.scope.any():
             values = np.where(self.scope, values, np.inf)
-        instant, trace = np.unravel_index(int(np.argmin(values)), values.shape)
-        return int(trace), self.start + int(instant)
+        instant, trace = (int(each) for each in np.unravel_index(int(np.argmin(values)), values.shape))
+        if self.counts is None:
+            return trace, self.start + instant
+        return trace, int((self.counts.high_at if violated else self.counts.low_at)[trace])
+
+    @cached_property
+    def cause(self) -> Cause | None:
+        """Cause of the worst violation; None if there is none, or if no single sample shows it."""
+        return None if self.subject is None or self.overall != "violated" else self.subject.why(self)
+
+    @property
+    def when(self) -> str:
+        """Time of the worst violation, or of the least robustness; "" if the requirement is judged once."""
+        if (cause := self.cause) is not None:
+            return beside(cause.moment, cause.started if self.instants > 1 else cause.moment)
+        return f"from {self.timeline.moment(self.worst[1])}" if self.instants > 1 else ""
+
+    @property
+    def where(self) -> str:
+        """Trace, of several, and time of the worst violation, or of the least robustness."""
+        trace = f"trace {self.worst[0]}" if len(self.low.T) > 1 else ""
+        return ", ".join(filter(None, (trace, self.when)))
+
+    @property
+    def parts_read(self) -> tuple[TimeRange, ...]:
+        """Times in seconds at which the requirement could read the recording; empty for all of it."""
+        first, time = self.part.first, self.timeline.time
+        starts = range(self.start - first, self.start - first + self.instants)
+        found = samples_read(self.rule.formula, starts, self.part.stop - first)
+        if not found:
+            return () if self.part.seen is None else (self.part.seen,)
+        return tuple(TimeRange(time(first + each.start), time(first + each.stop - 1)) for each in found)
+
+    @property
+    def judged(self) -> JudgedPart | None:
+        """The part of the recording that the requirement could read; None for all of it."""
+        parts, whole = self.parts_read, self.timeline.duration
+        if not parts:
+            return None
+        first = whole.first
+        return JudgedPart(parts[0].first - first, parts[-1].last - first, whole.last - first)
+
+    def told(self, facts: Iterable[Fact], *, cause: bool) -> RequirementVerdict:
+        """Return the verdict without signals and instants, but with facts and, if asked for, its cause."""
+        low, high = (None, None) if self.reported is None else self.reported
+        at = (self.start + end.argmin(axis=0) for end in (self.low, self.high))
+        made = replace(
+            self,
+            low=_lowest(self.low),
+            high=_lowest(self.high),
+            holds=np.asarray(self.holds.all(axis=0, keepdims=True)),
+            fails=np.asarray(self.fails.any(axis=0, keepdims=True)),
+            reported=None if low is None or high is None else (_lowest(low), _lowest(high)),
+            counts=self.counts or Counts(self.instants, self.held, self.failed, *at),
+            facts=tuple(facts),
+            subject=None,
+        )
+        found = self.cause if cause else None
+        return made.knowing(None if found is None else found.told())
+
+    def knowing(self, cause: Cause | None) -> RequirementVerdict:
+        """Return the same verdict, of which the cause is known."""
+        self.__dict__["cause"] = cause
+        return self
 
 
-def _no_facts(_: Verdict) -> tuple[Fact, ...]:
-    return ()
+def _lowest(values: Floats) -> Floats:
+    return np.asarray(values.min(axis=0, keepdims=True))
 
 
 @dataclass(frozen=True, slots=True)
+class UnknownSamples:
+    """Number of unknown samples of a signal, and the times of the first and the last one in seconds."""
+
+    samples: int
+    first: float
+    last: float
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """The recording and the specification of a verdict.
+
+    Attributes:
+        trace: name of the recording, with that of the object in it.
+        file: name of its file.
+        track: name of the object in the file; "" if it holds one.
+        source: text of the specification.
+        spec_name: name of the specification.
+        samples: number of samples.
+        shape: axes of the signals before their time axis; () for a single trace.
+        dt: time step in seconds; None if unknown.
+        steps: horizon `T` in steps; None if unknown.
+        clocks: clocks of the recording, and how each was found.
+        seeds: seed of the world of each trace, (traces,), if it is recorded.
+        warnings: warnings of the compiler, and about the file.
+        resampled: whether values between the samples are known.
+    """
+
+    trace: str
+    file: str
+    track: str
+    source: Source
+    spec_name: str
+    samples: int
+    shape: tuple[int, ...]
+    dt: Num | None
+    steps: int | None
+    clocks: tuple[Clock, ...] = ()
+    seeds: NDArray[Any] | None = None
+    warnings: tuple[Diagnostic, ...] = ()
+    resampled: bool = False
+
+    @property
+    def traces(self) -> int:
+        """Number of traces."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class InputFile:
+    """A file that a verdict rests on."""
+
+    path: str
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a verdict was made from: the version, the files, and the options, name -> values."""
+
+    stlc: str
+    trace: InputFile
+    inputs: tuple[InputFile, ...]
+    options: Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True)
 class Verdict:
     """Verdicts of all requirements of a specification on one or many traces.
 
     Attributes:
-        requirements: one judgement per requirement, in the order of the specification.
-        subject: the evaluated signals and the compiled requirements.
-        rules: function that finds the facts.
+        requirements: one verdict per requirement, in the order of the specification.
+        about: the recording and the specification.
+        end: treatment of a trace that is too short.
+        uncertain: signal -> greatest error of its samples.
+        lint: codes of the warnings that the lint rules have of the specification, if they were asked for.
+        evidence: hashes of the inputs and the options, if they were asked for.
+        notes: what was taken that was not asked for, such as the constants of the recording.
+        streamed: whether the samples were judged as they came, so that the shares of instants are bounds.
+        judged_on: the evaluated signals and the compiled requirements; None in a verdict that was told.
     """
 
-    requirements: tuple[Judgement, ...]
-    subject: Prepared = field(repr=False)
-    rules: Callable[[Verdict], tuple[Fact, ...]] = field(default=_no_facts, repr=False, compare=False)
+    JSON: ClassVar = (
+        "trace=about.trace spec=about.source.name spec_sha256 dt=about.dt horizon unknown end uncertain? "
+        "traces samples=about.samples in_scope verdict=scoped robustness=least satisfied_traces "
+        "satisfied_share=share requirements clocks=about.clocks facts=remarks "
+        "lint=lint_codes evidence?"
+    )
+
+    NAMES: ClassVar = {"Uncertainty": "stlc.monitor.uncertain"}
+
+    requirements: tuple[RequirementVerdict, ...]
+    about: About = field(repr=False)
+    end: End = "open"
+    uncertain: Mapping[str, Uncertainty] = field(default_factory=dict)
+    lint: tuple[str, ...] = ()
+    evidence: Evidence | None = None
+    notes: tuple[str, ...] = ()
+    streamed: bool = False
+    judged_on: Prepared | None = field(default=None, repr=False, compare=False)
 
     @property
+    def subject(self) -> Prepared:
+        """The evaluated signals and the compiled requirements, which a told verdict does not have."""
+        assert self.judged_on is not None, "a verdict that was told has no signals"
+        return self.judged_on
+
+    @cached_property
     def facts(self) -> tuple[Fact, ...]:
-        """Facts that the verdict rests on, such as what was read; they are looked for on each call."""
-        return self.rules(self)
+        """Facts that the verdict rests on, such as what was read."""
+        return self.subject.facts(self)
+
+    @cached_property
+    def gaps(self) -> dict[str, Gap]:
+        """Unknown samples of each signal that the requirements read, by name."""
+        return self.subject.signals.gaps
+
+    @property
+    def causes(self) -> dict[str, Cause]:
+        """Causes of the first `MOST` violations, by requirement."""
+        found = {each.name: each.cause for each in self.violated[:MOST]}
+        return {name: cause for name, cause in found.items() if cause is not None}
+
+    @property
+    def violated(self) -> list[RequirementVerdict]:
+        """The verdicts on the requirements that are violated."""
+        return [each for each in self.requirements if each.overall == "violated"]
+
+    def facts_on(self, requirement: str) -> tuple[Fact, ...]:
+        """Facts about a requirement, without places and without warnings; "" for those on the recording."""
+        chosen = (f for f in self.facts if f.requirement == requirement and f.severity == "fact")
+        return tuple(replace(fact, finding=replace(fact.finding, span=None)) for fact in chosen)
+
+    @property
+    def remarks(self) -> tuple[Fact, ...]:
+        """Facts about the recording."""
+        return self.facts_on("")
+
+    @property
+    def warnings(self) -> tuple[Diagnostic, ...]:
+        """Warnings of the compiler, about the file, and about the recording."""
+        return (*self.about.warnings, *(f.finding for f in self.facts if f.severity == "warning"))
+
+    def told(self, *, reasons: bool = True) -> Verdict:
+        """Return the verdict without the signals, but with what it says: shares, gaps, causes and facts.
+
+        It is small, and can be sent to another process. Causes and facts are left out unless `reasons`.
+        """
+        if self.judged_on is None:
+            return self
+        found = self if reasons else self.knowing(facts=())
+        explained = {each.name for each in found.violated[:MOST]} if reasons else ()
+        rows = [each.told(found.facts_on(each.name), cause=each.name in explained) for each in found]
+        known = ("facts", "gaps", "share", "failed_share", "robustness")
+        given = {name: getattr(found, name) for name in known}
+        return replace(self, requirements=tuple(rows), judged_on=None).knowing(**given)
+
+    def knowing(self, **found: object) -> Verdict:
+        """Return the same verdict, of which some members need not be computed."""
+        self.__dict__.update(found)
+        return self
+
+    def but(self, **changes: Any) -> Verdict:
+        """Return a copy of a told verdict with other members."""
+        return replace(self, **changes).knowing(**{**self.__dict__, **changes})
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the signals before their time axis; () for a single trace."""
-        return self.subject.signals.shape
+        return self.about.shape
 
-    def __getitem__(self, name: str) -> Judgement:
-        """Return the judgement of the requirement `name`. Raises UsageError (U101) for an unknown name."""
-        for judgement in self.requirements:
-            if judgement.name == name:
-                return judgement
-        raise unknown_requirement(name, [judgement.name for judgement in self.requirements])
+    @property
+    def spec_sha256(self) -> str:
+        """Hash of the text of the specification."""
+        return sha256(self.about.source.text)
 
-    def __iter__(self) -> Iterator[Judgement]:
+    @property
+    def horizon(self) -> Horizon | None:
+        """Horizon `T`; None if unknown."""
+        steps = self.about.steps
+        return None if steps is None else Horizon(steps * (self.about.dt or 0.0), steps)
+
+    @property
+    def unknown(self) -> dict[str, UnknownSamples]:
+        """Unknown samples of each signal, in time."""
+        time = self.requirements[0].timeline.time
+        return {n: UnknownSamples(g.samples, time(g.first), time(g.last)) for n, g in self.gaps.items()}
+
+    def __getitem__(self, name: str) -> RequirementVerdict:
+        """Return the verdict on the requirement `name`. Raises UsageError (U101) for an unknown name."""
+        for each in self.requirements:
+            if each.name == name:
+                return each
+        raise unknown_requirement(name, [each.name for each in self.requirements])
+
+    def __iter__(self) -> Iterator[RequirementVerdict]:
         return iter(self.requirements)
 
     @property
     def traces(self) -> int:
         """Number of traces."""
-        return self.subject.signals.batch
+        return self.about.traces
 
     @property
     def statuses(self) -> list[Status]:
@@ -300,11 +543,11 @@ class Verdict:
 
         Else it is `inconclusive`; `out of scope` if it violates the assumptions.
         """
-        rows = zip(*(judgement.statuses for judgement in self.requirements), strict=True)
+        rows = zip(*(each.statuses for each in self.requirements), strict=True)
         return [
             "out of scope"
             if "out of scope" in found
-            else _status("violated" in found, found <= {"satisfied"})
+            else status_of("violated" in found, found <= {"satisfied"})
             for found in map(set, rows)
         ]
 
@@ -320,37 +563,62 @@ class Verdict:
         return replace(self, requirements=tuple(replace(j, scope=scope) for j in self.requirements))
 
     @property
+    def lint_codes(self) -> list[str]:
+        """Codes of what the lint rules say, each once."""
+        return sorted(set(self.lint))
+
+    @property
+    def scope(self) -> Bools:
+        """Traces that satisfy the assumptions, (traces,)."""
+        scope = self.requirements[0].scope
+        return np.ones(self.traces, dtype=np.bool_) if scope is None else scope
+
+    @property
     def in_scope(self) -> int:
         """Number of traces that satisfy the assumptions."""
-        scope = self.requirements[0].scope
-        return self.traces if scope is None else int(scope.sum())
+        return int(self.scope.sum())
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """Factor of the robustness of each requirement in that of all, weight / scale."""
+        return {each.name: each.rule.factor for each in self}
 
     @property
     def overall(self) -> Status:
         """Status over traces in scope: violated if a requirement is, satisfied if all, else inconclusive."""
-        found = {judgement.overall for judgement in self.requirements}
-        return _status("violated" in found, found <= {"satisfied"})
+        found = {each.overall for each in self.requirements}
+        return status_of("violated" in found, found <= {"satisfied"})
+
+    @property
+    def scoped(self) -> Status:
+        """Status over traces in scope; `out of scope` if there are none."""
+        return self.overall if self.in_scope else "out of scope"
 
     @property
     def satisfied(self) -> bool | None:
         """True if all traces satisfy all requirements, False if any requirement is violated, else None."""
         return _known(self.overall)
 
-    @property
+    @cached_property
     def robustness(self) -> Any:
         """The least `weight * robustness / scale` of all requirements: a float, or an array for a batch."""
-        rows = [weighed(j.least[None], j.rule.factor, NUMPY) for j in self.requirements]
-        return _shaped(self.subject.record.semantics.join(rows, "min", NUMPY)[0], self.shape)
+        return overall_robustness(self.requirements, self.shape, self.subject.record.semantics)
 
     @property
-    def share(self) -> float:
+    def least(self) -> Num | None:
+        """The least `robustness` of the traces in scope; None if there are none."""
+        found = self.requirements[0].counted(np.ravel(self.robustness))
+        return float(found.min()) if found.size else None
+
+    @cached_property
+    def share(self) -> Num:
         """Share of instants at which all requirements certainly hold; one evaluated once counts at each."""
-        return self._share([judgement.holds for judgement in self.requirements], np.all)
+        return self._share([each.holds for each in self.requirements], np.all)
 
-    @property
+    @cached_property
     def failed_share(self) -> float:
         """Share of the instants of all traces at which at least one requirement is certainly violated."""
-        return self._share([judgement.fails for judgement in self.requirements], np.any)
+        return self._share([each.fails for each in self.requirements], np.any)
 
     def _share(self, truths: Sequence[Bools], join: Callable[..., Bools]) -> float:
         """Share of the instants at which all, or any, of `truths`, each (instants, traces), are true.
@@ -371,6 +639,14 @@ class Verdict:
         return self.statuses.count("satisfied")
 
 
+def overall_robustness(
+    found: Sequence[RequirementVerdict], shape: tuple[int, ...], semantics: Semantics | None = None
+) -> Any:
+    """Return the least `weight * robustness / scale` of requirements: a float, or an array of a shape."""
+    rows = [weighed(each.least[None], each.rule.factor, NUMPY) for each in found]
+    return _shaped((semantics or semantics_of()).join(rows, "min", NUMPY)[0], shape)
+
+
 def beside(moment: str, start: str) -> str:
     """Text of an instant, and of the start of its window if that differs: `t = 4 s (window from 2 s)`."""
     return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"
@@ -384,7 +660,8 @@ def unknown_requirement(name: str, names: list[str]) -> UsageError:
     return UsageError(Diagnostic("U101", f"there is no requirement `{name}`", help=help_, note=note))
 
 
-def _status(violated: bool, satisfied: bool) -> Status:
+def status_of(violated: bool, satisfied: bool) -> Status:
+    """Return the status of what is violated, satisfied, or neither."""
     return "violated" if violated else "satisfied" if satisfied else "inconclusive"
 
 

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast
+from stlc.jsontext import Num
 from stlc.monitor.values import Record
 from stlc.registry import closest
 from stlc.signature import Column
@@ -40,9 +42,16 @@ class Uncertainty:
         unit: unit of `absolute`; without text it is that of the signal.
     """
 
-    absolute: float = 0.0
-    relative: float = 0.0
+    JSON: ClassVar = "absolute relative unit=unit_text"
+
+    absolute: Num = 0.0
+    relative: Num = 0.0
     unit: Unit = DIMENSIONLESS
+
+    @property
+    def unit_text(self) -> str:
+        """Unit of `absolute` in words; "" for that of the signal."""
+        return self.unit.text
 
     @staticmethod
     def parse(text: str) -> Uncertainty:

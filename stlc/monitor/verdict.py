@@ -18,11 +18,12 @@ from stlc.compile.ir.traverse import numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Semantics, semantics_of
-from stlc.compile.semantics.tolerance import TOLERANCE, weighed
+from stlc.compile.semantics.tolerance import TOLERANCE, End, weighed
 from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
+from stlc.monitor.explain.report import cause_of
 from stlc.monitor.facts.rules import facts_of
 from stlc.monitor.given import UNNAMED, Given, is_frame, trace_of_frame
 from stlc.monitor.given import plain as plain_signals
@@ -37,7 +38,8 @@ from stlc.monitor.instants import (
     starts_of,
     window_of,
 )
-from stlc.monitor.judgement import Bools, Judgement, Part, Prepared, Status, Verdict, unknown_requirement
+from stlc.monitor.judgement import About, Bools, RequirementVerdict, Verdict, unknown_requirement
+from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import Need, arrange, needs_of, reading_of
 from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
 from stlc.monitor.values import Ends, Record, decisive
@@ -46,8 +48,6 @@ from stlc.trace import Trace, load_trace
 
 if TYPE_CHECKING:
     from stlc.monitor.online.online import How, Online
-
-__all__ = ["Judgement", "Monitor", "Status", "Verdict"]
 
 Subject: TypeAlias = Given | Trace | Path | str
 """Signals by name, a data frame, a trace, or the path of one."""
@@ -133,7 +133,7 @@ class Monitor:
         signals: Subject,
         *,
         at: At = None,
-        end: Literal["open", "strict", "truncate"] = "open",
+        end: End = "open",
         tolerance: float = TOLERANCE,
         require: Sequence[str] = (),
         semantics: str | Semantics = "exact",
@@ -185,7 +185,9 @@ class Monitor:
         if not reported.exact:
             ready = ready.under(reported)
             judgements = [_reported(judgement, ready, ends) for judgement in judgements]
-        return Verdict(tuple(judgements), ready, facts_of).within(_scope(judged, tolerance))
+        judgements = [replace(judgement, subject=ready) for judgement in judgements]
+        found = Verdict(tuple(judgements), _about(ready), end, uncertain or {}, judged_on=ready)
+        return found.within(_scope(judged, tolerance))
 
     def robustness(
         self,
@@ -278,7 +280,8 @@ class Monitor:
         if key not in self._needs:
             self._needs[key] = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
         signals = arrange(given, self._needs[key], plain=plain)
-        return Prepared(compiled, rules, signals, Record.of(signals.env, signals.ops, signals.cells))
+        record = Record.of(signals.env, signals.ops, signals.cells)
+        return Prepared(compiled, rules, signals, record, cause_of, facts_of)
 
     def _ready(self, recorded: Times) -> Compiled:
         """Return the specification compiled for the time step and horizon that are known.
@@ -377,9 +380,24 @@ def record_of(rule: CompiledRequirement, ready: Prepared, part: Part) -> Record:
     return record if part.stop - part.first == record.samples else record.part(part.first, part.stop)
 
 
+def _about(ready: Prepared) -> About:
+    signals, trace, compiled = ready.signals, ready.signals.trace, ready.compiled
+    given = About(
+        *(signals.name, "", "", compiled.spec.source, compiled.name),
+        *(ready.record.samples, signals.shape, ready.dt, ready.horizon),
+        warnings=compiled.warnings,
+        resampled=ready.record.cells is not None,
+    )
+    if trace is None:
+        return given
+    more = (*trace.remarks, *compiled.warnings)
+    file, track, seeds = trace.file, trace.track, trace.extras.get("seed")
+    return replace(given, file=file, track=track, clocks=trace.clocks, seeds=seeds, warnings=more)
+
+
 def _judge(
     rule: CompiledRequirement, ready: Prepared, starts: range, ends: Ends, tolerance: float, part: Part
-) -> Judgement:
+) -> RequirementVerdict:
     low, high = outer(*rule_bounds(rule, record_of(rule, ready, part), starts, ready.horizon, ends))
     least, most, deciding = low, high, decisive(rule, tolerance, ready.compiled.signature)
     if deciding is not rule:
@@ -387,36 +405,45 @@ def _judge(
         least, most = outer(*rule_bounds(deciding, record, starts, ready.horizon, ends))
     holds, fails = least >= -tolerance, most < -tolerance
     start = part.first + starts.start
-    shape = ready.signals.shape
-    return Judgement(rule, start, low, high, holds, fails, shape, part=part, tolerance=tolerance)
+    where = (ready.signals.shape, part, ready.timeline, tolerance)
+    return RequirementVerdict(rule, start, low, high, holds, fails, *where, subject=ready)
 
 
-def first_violation(judgement: Judgement, subject: Prepared, tolerance: float = TOLERANCE) -> int:
+def first_violation(judgement: RequirementVerdict) -> int:
     """Return the sample from which a violated requirement is certainly violated, whatever follows.
 
     An online monitor reports the violation at this sample; if the end of the trace decides, it is the last.
     It is found by bisection, since a prefix that certainly violates a requirement does so however it goes on.
-    `judgement` is `violated` with `tolerance`, and `subject` is that of its verdict.
     """
-    part = judgement.part or Part(0, subject.record.samples)
+    subject, part = judgement.subject, judgement.part
+    assert subject is not None
     start, first = judgement.start, part.first
 
     def violated(stop: int) -> bool:
         starts = range(start - first, min(start + judgement.instants, stop) - first)
         shorter = replace(part, stop=stop)
-        fails = _judge(judgement.rule, subject, starts, "open", tolerance, shorter).fails
+        fails = _judge(judgement.rule, subject, starts, "open", judgement.tolerance, shorter).fails
         return bool(judgement.counted(fails).any())
 
     return bisect_left(range(part.stop), True, lo=start + 1, key=violated) - 1
 
 
-def _reported(judgement: Judgement, ready: Prepared, ends: Ends) -> Judgement:
+def timed(verdict: Verdict) -> Verdict:
+    """Return the verdict with the times from which requirements are certainly violated; see `violated_at`."""
+    found = {each.name: each.timeline.time(first_violation(each)) for each in verdict.violated}
+    return replace(
+        verdict,
+        requirements=tuple(replace(each, violated_at=found.get(each.name)) for each in verdict),
+    )
+
+
+def _reported(judgement: RequirementVerdict, ready: Prepared, ends: Ends) -> RequirementVerdict:
     """Return the judgement with `reported` bounds in the semantics of `ready`.
 
     If minimum and maximum are means, bounds over unknown samples are not valid. Then only the sign of the
     exact bounds is reported: the lower bound is 0 or -inf, the upper bound 0 or +inf.
     """
-    rule, part = judgement.rule, judgement.part or Part(0, ready.record.samples)
+    rule, part = judgement.rule, judgement.part
     begin = judgement.start - part.first
     starts = range(begin, begin + judgement.instants)
     low, high = rule_bounds(rule, record_of(rule, ready, part), starts, ready.horizon, ends)

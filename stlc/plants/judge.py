@@ -5,25 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.modules import library_of, spec_sha256
-from stlc.compile.semantics.tolerance import weighed
 from stlc.files import find_spec, read_source
 from stlc.grammar.parse.parser import parse
+from stlc.jsontext import Num
+from stlc.monitor.judgement import Verdict
 from stlc.monitor.signals import arrange, needs_of
+from stlc.monitor.streamed import verdict_of
 from stlc.monitor.verdict import Monitor
 from stlc.plants.plant import Plant, PlantFinding, PlantRun, load_plant
 from stlc.trace import Trace
 from stlc.version import __version__
-
-if TYPE_CHECKING:
-    from stlc.compile.pipeline import CompiledRequirement
-    from stlc.monitor.judgement import Status
 
 Floats: TypeAlias = NDArray[np.float64]
 STREAMED = 1_000_000
@@ -31,52 +28,116 @@ STREAMED = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class JudgedRequirement:
-    """Result of one requirement on one simulation.
+class PlantRequirement:
+    """Result of one requirement on one simulation: verdict, robustness, and its bounds."""
 
-    Attributes:
-        rule: the requirement.
-        status: its verdict.
-        low: least robustness over all continuations.
-        high: greatest robustness over all continuations.
-        robustness: the robustness; NaN if it is not known.
-    """
-
-    rule: CompiledRequirement
-    status: Status
-    low: float
-    high: float
-    robustness: float
-
-    @property
-    def share(self) -> float:
-        """Robustness in units of the requirement's scale, by which requirements are compared."""
-        return float(weighed(np.float64(self.low), self.rule.factor, NUMPY))
+    name: str
+    verdict: str
+    robustness: Num
+    low: Num
+    high: Num
+    unit: str
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedRun:
-    """Simulation of a plant with its verdicts.
+    """Simulation of a plant with its verdict.
 
     A simulation fails if the plant crashes, hangs or gives invalid outputs.
 
     Attributes:
         seed: seed of the simulation.
         point: name of each variable of the plant file -> its value.
-        samples: number of samples; 0 if the simulation failed.
-        status: verdict over all requirements; None if the simulation failed.
-        requirements: results of the requirements.
+        verdict: the verdict; None if the simulation failed.
         finding: the failure; None if there was none.
         trace: the trace; None if the simulation failed, or was judged while the plant ran.
     """
 
+    JSON: ClassVar = "seed point samples verdict=outcome requirements finding"
+
     seed: int
     point: Mapping[str, float]
-    samples: int
-    status: Status | None
-    requirements: tuple[JudgedRequirement, ...] = ()
+    verdict: Verdict | None
     finding: PlantFinding | None = None
     trace: Trace | None = None
+
+    @property
+    def samples(self) -> int:
+        """Number of samples; 0 if the simulation failed."""
+        return 0 if self.verdict is None else self.verdict.about.samples
+
+    @property
+    def outcome(self) -> Literal["satisfied", "violated", "inconclusive", "out of scope", "finding"]:
+        """Verdict over all requirements, or that the simulation failed."""
+        return "finding" if self.verdict is None else self.verdict.scoped
+
+    @property
+    def requirements(self) -> tuple[PlantRequirement, ...]:
+        """Results of the requirements."""
+        found = []
+        for each in self.verdict or ():
+            low, high = (float(end.min()) for end in each.margins)
+            status, least = each.statuses[0], float(each.least[0])
+            found.append(PlantRequirement(each.name, status, least, low, high, each.unit))
+        return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class PlantSimulation:
+    """Simulations of a plant, and their verdicts.
+
+    Attributes:
+        spec: name of the specification.
+        plant: name of the plant.
+        kind: kind of the plant.
+        dt: time step in seconds.
+        steps: number of steps.
+        streamed: whether simulations were judged while they ran.
+        trace: file of the traces; None if they were not written.
+        runs: the simulations.
+    """
+
+    JSON: ClassVar = (
+        "spec plant kind dt steps streamed satisfied violated inconclusive out_of_scope findings trace runs"
+    )
+
+    spec: str
+    plant: str
+    kind: str
+    dt: float
+    steps: int
+    streamed: bool
+    trace: str | None
+    runs: tuple[JudgedRun, ...]
+
+    def count(self, outcome: str) -> int:
+        """Number of simulations with an outcome."""
+        return sum(run.outcome == outcome for run in self.runs)
+
+    @property
+    def satisfied(self) -> int:
+        """Number of simulations that satisfy every requirement."""
+        return self.count("satisfied")
+
+    @property
+    def violated(self) -> int:
+        """Number of simulations that violate a requirement."""
+        return self.count("violated")
+
+    @property
+    def inconclusive(self) -> int:
+        """Number of simulations that are too short."""
+        return self.count("inconclusive")
+
+    @property
+    def out_of_scope(self) -> int:
+        """Number of simulations that violate an assumption."""
+        return self.count("out of scope")
+
+    @property
+    def findings(self) -> int:
+        """Number of simulations that failed."""
+        return self.count("finding")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,32 +245,17 @@ class PlantJudge:
     def _judged(self, run: PlantRun) -> JudgedRun:
         point = self._named(run.point)
         if isinstance(run.outcome, PlantFinding):
-            return JudgedRun(run.seed, point, 0, None, finding=run.outcome)
-        verdict = self.monitor.check(run.outcome)
-        rows = []
-        for each in verdict:
-            low, high = (float(end.min()) for end in each.margins)
-            rows.append(JudgedRequirement(each.rule, each.statuses[0], low, high, float(each.least[0])))
-        status, samples = verdict.statuses[0], run.outcome.samples
-        return JudgedRun(run.seed, point, samples, status, tuple(rows), trace=run.outcome)
+            return JudgedRun(run.seed, point, None, run.outcome)
+        return JudgedRun(
+            run.seed, point, self.monitor.check(run.outcome).told(reasons=False), trace=run.outcome
+        )
 
     def _streamed(self, point: Floats, seed: int) -> JudgedRun:
         """Simulate once, and judge while the plant runs; nothing of the trace is kept."""
         online = self.monitor.online(dt=self.plant.decl.dt)
         finding = self.plant.watch(point, online, seed=seed)
         named = self._named(point)
-        if finding is not None:
-            return JudgedRun(seed, named, 0, None, finding=finding)
-        rows = [
-            JudgedRequirement(online.rule(name), tally.status, tally.low, tally.high, tally.robustness)
-            for name, tally in online.finish().items()
-        ]
-        found = {each.status for each in rows}
-        status: Status = "violated" if "violated" in found else "inconclusive"
-        status = "satisfied" if found == {"satisfied"} else status
-        if online.in_scope is False:
-            status, rows = "out of scope", [replace(each, status="out of scope") for each in rows]
-        return JudgedRun(seed, named, online.samples, status, tuple(rows))
+        return JudgedRun(seed, named, None if finding else verdict_of(online), finding)
 
     def _named(self, point: Floats) -> dict[str, float]:
         return {each.name: float(value) for each, value in zip(self.plant.variables, point, strict=True)}

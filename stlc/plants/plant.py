@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,8 @@ class PlantFinding:
         time: time of the simulation that the plant had reached, in seconds; None if unknown.
         stderr: end of what the process printed to its standard error (and standard output).
     """
+
+    JSON: ClassVar = "reason message time stderr"
 
     reason: Reason
     message: str

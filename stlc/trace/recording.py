@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,8 @@ class Clock:
         others: names of further candidates.
         why: reason of the choice: `--clock`, or what states the unit.
     """
+
+    JSON: ClassVar = "name unit why others"
 
     name: str
     unit: str = ""

@@ -15,7 +15,6 @@ from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.scenarios.scenario import under
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.jsontext import Shape
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import MOST_ARRAYS, SIMULATION, SPEC, SYSTEM, TRACE, RunDir
 from stlc.signature import Signature
@@ -27,36 +26,76 @@ T = TypeVar("T")
 Record = Mapping[str, Any]
 
 TEXTS = (SPEC, SYSTEM, "compiled.txt", "config.resolved.yaml")
-_DRIVES = {
-    **dict.fromkeys(("count", "obeyed", "undecided", "lost"), int),
-    "told?": int,
-    "rules": {"*": {"obeyed": int, "*": int}},
-    "broken": [
-        {
-            **{"seed": int, "agent": int, "lost": bool, "rules": {"*?": float}},
-            "cause?": {"why": str, "time": float},
-        }
-    ],
-}
-_SIMULATION: Shape = {
-    "spec": str,
-    **dict.fromkeys(("scenario?", "interval?", "world?"), str),
-    **dict.fromkeys(("agents?", "steps?", "ceiling?"), int),
-    **dict.fromkeys(("time_limit?", "paper_time_limit?"), float),
-    "seeds?": [int],
-    "margin?": {"*": float},
-    "overrides?": {"*": str},
-    "guards?": {
-        "*": {
-            "metrics?": {"*?": {"mean": float, "high?": float}},
-            "drives?": _DRIVES,
-            "units?": {"*": str},
-            "decisions?": {"*?": float},
-            "latency?": {"*?": float},
-        }
-    },
-}
-"""Shape of `eval/simulate.json`; see `stlc.jsontext.conforming`."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCause:
+    """Cause of a loss, and its time in seconds."""
+
+    why: str
+    time: float
+
+
+@dataclass(frozen=True, slots=True)
+class StoredLoss:
+    """A drive that broke rules."""
+
+    seed: int
+    agent: int
+    lost: bool
+    rules: dict[str, float | None]
+    cause: StoredCause | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredVerdicts:
+    """Verdicts on the drives under a guard."""
+
+    count: int
+    obeyed: int
+    undecided: int
+    lost: int
+    rules: dict[str, dict[str, int]]
+    broken: list[StoredLoss]
+    told: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMetric:
+    """A metric over seeds."""
+
+    mean: float
+    high: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredGuard:
+    """Results of the drives under a guard."""
+
+    metrics: dict[str, StoredMetric | None] | None = None
+    drives: StoredVerdicts | None = None
+    units: dict[str, str] | None = None
+    decisions: dict[str, float | None] | None = None
+    latency: dict[str, float | None] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSimulation:
+    """Content of `eval/simulate.json` as far as it is read."""
+
+    spec: str
+    scenario: str | None = None
+    interval: str | None = None
+    world: str | None = None
+    agents: int | None = None
+    steps: int | None = None
+    ceiling: int | None = None
+    time_limit: float | None = None
+    paper_time_limit: float | None = None
+    seeds: list[int] | None = None
+    margin: dict[str, float] | None = None
+    overrides: dict[str, str] | None = None
+    guards: dict[str, StoredGuard] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +178,7 @@ def read_contents(run: RunDir) -> RunContents:
 
 def simulation_of(run: RunDir) -> Record | None:
     """Content of `eval/simulate.json`; None without one. Raises RunError (R101, R110) if it is damaged."""
-    found: Record | None = run.read_json(SIMULATION, _SIMULATION) if run.has(SIMULATION) else None
+    found: Record | None = run.read_json(SIMULATION, StoredSimulation) if run.has(SIMULATION) else None
     return found
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import StlcError
 from stlc.escape import picture
-from stlc.jsontext import conforming
+from stlc.records import from_json
 from stlc.rundir import HELD_OUT, MOST_ARRAYS, RunDir
 from stlc.signature import Signature
 from stlc.trace.formats.npz import read_arrays
@@ -119,6 +119,14 @@ class Weakness:
     axes: tuple[int, int]
 
 
+@dataclass(frozen=True, slots=True)
+class HeldOutNames:
+    """Names of the states and of the requirements of a held-out set."""
+
+    names: tuple[str, ...]
+    requirements: tuple[str, ...]
+
+
 def load_held_out(run: RunDir) -> HeldOut | None:
     """Load the held-out set that training wrote; None if the file is missing or damaged.
 
@@ -127,14 +135,14 @@ def load_held_out(run: RunDir) -> HeldOut | None:
     path = run.file(HELD_OUT, MOST_ARRAYS)
     try:
         file = read_arrays(path)
-        meta = conforming(str(file["meta"]), {"names": [str], "requirements": [str]})
+        meta = from_json(HeldOutNames, str(file["meta"]), path)
         x0, rho, each = (np.asarray(file[key], dtype=float) for key in ("x0", "rho", "requirements"))
         known, searched = (
             np.asarray(file[key], dtype=bool) if key in file else None for key in ("known", "searched")
         )
     except (StlcError, KeyError, ValueError, RecursionError):
         return None
-    names, requirements = tuple(meta["names"]), tuple(meta["requirements"])
+    names, requirements = meta.names, meta.requirements
     shapes_fit = x0.ndim == 2 and each.shape == (len(x0), len(requirements)) and rho.shape == (len(x0),)
     if not shapes_fit or x0.shape[1] != len(names) or not len(x0) or not requirements:
         return None

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import Any, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
@@ -80,23 +80,14 @@ class Learning:
         worst: the worst requirement and the region where it fails, as a sentence; "" if none fails.
     """
 
+    JSON: ClassVar = "level sentence advice worst share_of_feasible=share next=command"
+
     level: Level
     share: float | None
     sentence: str
     advice: tuple[str, ...]
     command: str
     worst: str = ""
-
-    def summary(self) -> dict[str, object]:
-        """The verdict on the training run as a dictionary for JSON."""
-        return {
-            "level": self.level,
-            "share_of_feasible": self.share,
-            "sentence": self.sentence,
-            "worst": self.worst,
-            "advice": list(self.advice),
-            "next": self.command,
-        }
 
 
 EMPTY: Mapping[str, Any] = MappingProxyType({})

@@ -9,9 +9,9 @@ import numpy as np
 from stlc.compile.ir.traverse import margin_unit
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
-from stlc.monitor.explain.report import Cause, explain_all
-from stlc.monitor.judgement import beside
-from stlc.monitor.verdict import Judgement, Monitor, Verdict
+from stlc.monitor.explain.report import Cause
+from stlc.monitor.judgement import RequirementVerdict, Verdict
+from stlc.monitor.verdict import Monitor
 from stlc.trace import Trace
 from stlc.view.contents import RunContents, untagged
 from stlc.view.deployment import WINDOWS
@@ -46,13 +46,13 @@ def recorded_section(contents: RunContents) -> Section | None:
     except StlcError as error:
         return Section("driven", TITLE, el("p", f"The trace could not be judged: {_messages(error)}."))
     names = trace_names(trace)
-    causes = explain_all(verdict)
+    causes = verdict.causes
     robustness = np.atleast_1d(np.asarray(verdict.robustness, dtype=float))
     choices = choose_traces(robustness, names, acted_in(trace))
-    picture = draw_signals(trace, margins, choices, units_of(verdict), marks_of(verdict, causes, trace))
+    picture = draw_signals(trace, margins, choices, units_of(verdict), marks_of(verdict, trace))
     body = join(
         el("p", _summary(verdict, "" if trace.meta.judge_text else " at every instant")),
-        _verdict_table(verdict, causes, names),
+        _verdict_table(verdict, names),
         figure(picture.data_uri(), picture.alt, _caption(trace, judged_at_start(verdict))),
         causes_of(causes, names, monitor.spec),
         _windows_part(contents, trace, names),
@@ -69,7 +69,7 @@ def _windows_part(contents: RunContents, trace: Trace, names: list[str]) -> Html
         verdict = monitor.check(trace)
     except StlcError as error:
         return el("p", f"The planning windows could not be judged: {_messages(error)}.")
-    causes = explain_all(verdict)
+    causes = verdict.causes
     return el(
         "details",
         el("summary", WINDOWS),
@@ -79,7 +79,7 @@ def _windows_part(contents: RunContents, trace: Trace, names: list[str]) -> Html
             el("code", verdict.subject.compiled.name),
             ".",
         ),
-        _verdict_table(verdict, causes, names),
+        _verdict_table(verdict, names),
         causes_of(causes, names, monitor.spec),
     )
 
@@ -112,7 +112,7 @@ def _summary(verdict: Verdict, when: str) -> str:
     return f"{drives} satisfied {verdict.subject.compiled.name}{when}."
 
 
-def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[str]) -> Html:
+def _verdict_table(verdict: Verdict, names: list[str]) -> Html:
     counts = ("violating drives", "least robustness")
     header = ("requirement", "verdict", *counts, "where")
     rows: list[tuple[Child, ...]] = []
@@ -125,28 +125,16 @@ def _verdict_table(verdict: Verdict, causes: Mapping[str, Cause], names: list[st
                 classed("span", _KINDS.get(judgement.overall, "quiet"), judgement.overall),
                 f"{violating:,} of {verdict.traces:,}",
                 _least(judgement),
-                ", ".join(filter(None, (names[trace], where_of(judgement, verdict, causes)))),
+                ", ".join(filter(None, (names[trace], judgement.when))),
             )
         )
     return table(header, rows, numeric=(2, 3))
 
 
-def where_of(judgement: Judgement, verdict: Verdict, causes: Mapping[str, Cause]) -> str:
-    """Return the time of the worst violation of a requirement as text.
-
-    If the requirement is not violated, this is the time at which its robustness is least, or "" if it is
-    evaluated only once.
-    """
-    moment, cause = verdict.subject.moment, causes.get(judgement.name)
-    if cause is None:
-        return f"from {moment(judgement.worst[1])}" if judgement.instants > 1 else ""
-    return beside(cause.moment, cause.started if judgement.instants > 1 else cause.moment)
-
-
 _KINDS = {"satisfied": "good", "violated": "bad"}
 
 
-def _least(judgement: Judgement) -> str:
+def _least(judgement: RequirementVerdict) -> str:
     values = judgement.high if judgement.overall == "violated" else judgement.low
     least = float(values.min())
     if not np.isfinite(least):
@@ -181,12 +169,12 @@ def causes_of(causes: Mapping[str, Cause], names: list[str], spec: ast.Spec) -> 
     if not causes:
         return None
     declared = {item.name: item for item in spec.items if isinstance(item, ast.Require)}
-    listed = [_cause_html(cause, names, declared.get(cause.judgement.name)) for cause in causes.values()]
+    listed = [_cause_html(cause, names, declared.get(cause.name)) for cause in causes.values()]
     return join(el("h3", "Violations and their causes"), listed)
 
 
 def _cause_html(cause: Cause, names: list[str], declared: ast.Require | None) -> Html:
-    written = untagged(declared) if declared else cause.judgement.rule.span
+    written = untagged(declared) if declared else cause.rule.span
     labels = [label for label in (cause.place, *cause.labels) if label.text]
     marks = sorted(
         (max(label.span.start - written.start, 0), label.span.end - written.start)
@@ -195,7 +183,7 @@ def _cause_html(cause: Cause, names: list[str], declared: ast.Require | None) ->
     )
     items = [el("li", el("code", " ".join(label.span.text.split())), f" is {label.text}") for label in labels]
     return join(
-        el("p", el("strong", cause.judgement.name), f" fails worst in {names[cause.trace]}."),
+        el("p", el("strong", cause.name), f" fails worst in {names[cause.trace]}."),
         el("pre", _marked(written.text, marks)),
         el("ul", items, el("li", "because ", with_code(cause.because))),
     )

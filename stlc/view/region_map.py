@@ -18,7 +18,8 @@ from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import StlcError
 from stlc.grammar import ast
 from stlc.grammar.traverse import descendants
-from stlc.monitor.verdict import Monitor, Verdict
+from stlc.monitor.judgement import Verdict
+from stlc.monitor.verdict import Monitor
 from stlc.signature import Signature
 from stlc.source import Span
 from stlc.trace import Trace

@@ -5,7 +5,7 @@ The runs are evaluated by the specification that is stored in their trace.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +17,9 @@ from stlc.compile.ir.traverse import margin_unit, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.monitor.explain.report import Cause, violations
-from stlc.monitor.judgement import Judgement
-from stlc.monitor.verdict import Monitor, Verdict
+from stlc.monitor.explain.report import violations
+from stlc.monitor.judgement import RequirementVerdict, Verdict
+from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 from stlc.trace import Trace
 from stlc.view.signals import Deciding, Marks, Strip
@@ -72,7 +72,7 @@ def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Fl
     return rows
 
 
-def _demanded(judgement: Judgement, verdict: Verdict, whole: Floats) -> Floats:
+def _demanded(judgement: RequirementVerdict, verdict: Verdict, whole: Floats) -> Floats:
     """Robustness at each sample of what a requirement demands at all times, (traces, samples).
 
     The result is `whole` for a trace in which this is not known, or does not decide the requirement.
@@ -116,7 +116,7 @@ def units_of(verdict: Verdict) -> dict[str, str]:
     return {j.name: unit for j in verdict if (unit := margin_unit(j.rule.typed.formula))}
 
 
-def marks_of(verdict: Verdict, causes: Mapping[str, Cause], trace: Trace) -> Marks:
+def marks_of(verdict: Verdict, trace: Trace) -> Marks:
     """Thresholds of the requirements of `verdict` on `trace`, and values that decide its violations."""
     columns = {each.name: each for each in trace.signature.columns}
     thresholds: dict[str, list[float]] = {}
@@ -130,7 +130,7 @@ def marks_of(verdict: Verdict, causes: Mapping[str, Cause], trace: Trace) -> Mar
                     shown = (value - float(unit.offset)) / unit.scale
                     thresholds[name] = list(dict.fromkeys([*thresholds.get(name, ()), shown]))
     deciding = []
-    for cause in causes.values():
+    for cause in verdict.causes.values():
         leaf, first = cause.tree.leaf, cause.first
         window = (first + leaf.during[0], first + leaf.during[-1]) if leaf.during else None
         deciding += [
@@ -139,7 +139,7 @@ def marks_of(verdict: Verdict, causes: Mapping[str, Cause], trace: Trace) -> Mar
     return Marks(thresholds, deciding)
 
 
-def _judged_once(verdict: Verdict) -> list[Judgement]:
+def _judged_once(verdict: Verdict) -> list[RequirementVerdict]:
     planned = verdict.subject.horizon is not None
     return [j for j in verdict if j.rule.absolute or not (j.rule.windowed and planned)]
 

@@ -43,7 +43,7 @@ def test_drives_of_a_world_are_one_observation() -> None:
     assert overall.shares.lower == betting_lower(Tally.of([0.5, 1, 1]))
     assert overall.whole_lower == clopper_pearson_lower(2, 3)
     assert overall.shares.fixed is None
-    assert "a world is one observation" in " ".join(found.assumptions())
+    assert "a world is one observation" in " ".join(found.assumptions)
 
 
 def test_a_drive_without_a_verdict_counts_against_both_bounds() -> None:
@@ -85,7 +85,7 @@ def test_a_certificate_is_consistent(
 ) -> None:
     units = [index // 2 for index in range(len(values))]
     found = assess(sample(values, units, "world"), Claim(share, shift=shift, any_time=any_time))
-    assert wrong_numbers(plain(found.summary())) == []  # type: ignore[arg-type]
+    assert wrong_numbers(plain(found)) == []  # type: ignore[arg-type]
     bounds = found.overall.shares
     assert 0 <= bounds.interval.low <= bounds.lower <= bounds.upper <= bounds.interval.high <= 1
     assert found.overall.deployed <= bounds.lower

@@ -121,15 +121,15 @@ def test_drives_that_violate_an_assumption_are_left_out(tmp_path: Path) -> None:
         assert found.requirements[0].violated.tolist() == [False, True]
         assert len(found.predicted) == 2
     bounds = assess(found, Claim(0.9))
-    assert bounds.summary()["left_out"] == 2
-    assert "2 drives that violate an assumption of the specification are left out" in bounds.assumptions()
+    assert bounds.left_out == 2
+    assert "2 drives that violate an assumption of the specification are left out" in bounds.assumptions
 
 
 def test_a_campaign_is_repeatable_and_counts_its_seeds(run: Run) -> None:
     drives = PolicyDrives(run, rules_of(run), "none", Setting((), 4, 2, 1))
     order = Campaign(drives, Claim(0.999), most=FIRST + 20)
     first, again = list(campaign(order)), next(campaign(order))
-    assert plain(first[0].assessment.summary()) == plain(again.assessment.summary())
+    assert plain(first[0].assessment) == plain(again.assessment)
     last = first[-1]
     assert last.done
     assert last.seeds == tuple(range(SEED, SEED + last.assessment.overall.units // 4))

@@ -17,7 +17,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import typed
 from stlc.diagnostics import UsageError
 from stlc.monitor.explain.causes import CauseFinder, CauseNode
-from stlc.monitor.explain.report import explain, explain_all, names_in, shown
+from stlc.monitor.explain.report import explain, names_in, shown
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column
@@ -241,7 +241,7 @@ def test_a_deep_formula_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> No
 def test_all_causes_are_those_of_each() -> None:
     text = "signal x\nrequire a: always x > 0\nrequire b: x > -5\nrequire c: eventually x > 2"
     verdict = Monitor(text, dt=0.1).check({"x": -np.ones(12)})
-    causes = explain_all(verdict)
+    causes = verdict.causes
     assert list(causes) == ["a", "c"]
     assert causes == {name: explain(verdict, name) for name in causes}
 

@@ -49,9 +49,13 @@ def check_cause(seed: int) -> bool:
     case, monitor = found
     verdict = monitor.check(case.signals)
     cause = explain(verdict, "r")
-    if cause is None or _known_by_folding(case, monitor, cause):
+    if cause is None:
         return False
-    wrong = [*_values(case, cause), *_statements(case, monitor, cause), *_change(case, monitor, cause)]
+    rho = float(verdict["r"].high[cause.start - verdict["r"].start, cause.trace])
+    if _known_by_folding(case, monitor, cause, rho):
+        return False
+    wrong = [*_values(case, cause, rho), *_statements(case, monitor, cause)]
+    wrong += _change(case, monitor, cause, rho)
     assert not wrong, f"{', '.join(wrong)}\n{cause.because}\n{cause.place.text} {cause.labels}\n{case}"
     return True
 
@@ -79,23 +83,18 @@ def _told(cause: Cause) -> tuple[object, ...]:
     return cause.start, cause.sample, cause.time, cause.because, cause.readings, cause.alone, labels
 
 
-def _rho(cause: Cause) -> float:
-    high = cause.judgement.high
-    return float(high[cause.start - cause.judgement.start, cause.trace])
-
-
-def _known_by_folding(case: Case, monitor: Monitor, cause: Cause) -> bool:
+def _known_by_folding(case: Case, monitor: Monitor, cause: Cause, rho: float) -> bool:
     """True if `true` and `false` tell the compiler what the definition leaves open: nothing is behind it."""
-    if not case.folds or np.isfinite(_rho(cause)):
+    if not case.folds or np.isfinite(rho):
         return False
     (rule,) = monitor.compiled.requirements
     ends = _Definition(_seen(case, monitor, cause)).at(rule.typed.formula, cause.start)
     return ends is not None and ends[1] > -np.inf
 
 
-def _values(case: Case, cause: Cause) -> Iterator[str]:
+def _values(case: Case, cause: Cause, rho: float) -> Iterator[str]:
     """Check that the leaf and the readings have their reported values."""
-    leaf, rho = cause.tree.leaf, _rho(cause)
+    leaf = cause.tree.leaf
     if not np.isclose(-leaf.rho if leaf.holds else leaf.rho, rho, rtol=0, atol=1e-9):
         yield f"value: {leaf.rho} at the leaf, {rho} is the robustness"
     for reading in cause.readings:
@@ -202,9 +201,9 @@ def _read(declarations: str, text: str) -> typed.Formula | None:
     return alone.compiled.requirements[0].typed.formula
 
 
-def _change(case: Case, monitor: Monitor, cause: Cause) -> Iterator[str]:
+def _change(case: Case, monitor: Monitor, cause: Cause, rho: float) -> Iterator[str]:
     """Check that a change of the predicate towards the wanted value raises the robustness."""
-    rho, leaf = _rho(cause), cause.tree.leaf
+    leaf = cause.tree.leaf
     if not cause.alone or not np.isfinite(rho):
         return
     own = _margin(leaf, _seen(case, monitor, cause))

@@ -10,11 +10,11 @@ import typer
 
 from stlc.diagnostics import usage
 from stlc.escape import visible
+from stlc.jsontext import plain
 from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment
-    from stlc.cli.framework.assured import Assurance
 
 GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS.installed), help="Guard of the policy.")]
 CertifyOption = Annotated[
@@ -45,19 +45,11 @@ def require_claim(share: float | None, fail_under: float | None) -> None:
         raise usage("`--certify` does not go with `--fail-under`", "each of them says what the exit code is")
 
 
-def bounds_record(found: Assessment) -> Assurance:
-    """JSON record of bounds."""
-    from stlc.jsontext import plain
-
-    made: Any = plain(found.summary())
-    record: Assurance = made
-    return record
-
-
-def bounds_lines(record: Mapping[str, Any]) -> Iterator[str]:
+def bounds_lines(found: Assessment | Mapping[str, Any]) -> Iterator[str]:
     """Lines of text that show bounds: the answer, a table of the requirements, and the assumptions."""
     from stlc.cli.framework.output import table
 
+    record: Any = plain(found)
     noun, overall = record["unit"], record["overall"]
     target = record["share"] or record["confidence"]
     each = [overall, *(record["requirements"] if len(record["requirements"]) > 1 else ())]

@@ -9,12 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from stlc.cli.check.judge import Question, monitor_of, options_of
-from stlc.cli.check.options import Traces
-from stlc.cli.framework.documents import EvidenceRecord, FileRecord
+from stlc.cli.check.options import Judging
 from stlc.diagnostics import Diagnostic, StlcError, UsageError, usage
 from stlc.files import find_spec, find_system, read_source
 from stlc.jsontext import dumps
+from stlc.monitor.check import Question, monitor_of
+from stlc.monitor.judgement import Evidence, InputFile
+from stlc.records import read
 from stlc.version import __version__
 
 MAX_BYTES = 64_000_000
@@ -24,14 +25,9 @@ _COMPARED = ("traces", "samples", "in_scope", "verdict", "satisfied_traces", "sa
 _EACH = ("name", "verdict", "robustness", "starts", "satisfied_share", "violated_traces", "judged")
 
 
-def evidence_of(path: Path, question: Question) -> EvidenceRecord:
+def evidence_of(path: Path, question: Question, words: Mapping[str, Sequence[str]]) -> Evidence:
     """Evidence of the result on the trace file `path`: its inputs with their hashes, and the options."""
-    return {
-        "stlc": __version__,
-        "trace": _file(path),
-        "inputs": [_file(each) for each in _inputs(question)],
-        "options": {name: list(values) for name, values in options_of(question).items()},
-    }
+    return Evidence(__version__, _file(path), tuple(map(_file, _inputs(question))), words)
 
 
 def _inputs(question: Question) -> list[Path]:
@@ -49,20 +45,20 @@ def _inputs(question: Question) -> list[Path]:
     return [each for each in dict.fromkeys(files) if each.is_file()]
 
 
-def _file(path: Path) -> FileRecord:
+def _file(path: Path) -> InputFile:
     found, size = hashlib.sha256(), 0
     if path.is_file():
         with path.open("rb") as stream:
             while block := stream.read(_BLOCK):
                 found.update(block)
                 size += len(block)
-        return {"path": str(path), "sha256": found.hexdigest(), "bytes": size}
+        return InputFile(str(path), found.hexdigest(), size)
     for each in sorted(path.rglob("*")):  # a bag is a folder
         if each.is_file():
             inner = _file(each)
-            found.update(f"{each.relative_to(path)}\0{inner['sha256']}\0".encode())
-            size += inner["bytes"]
-    return {"path": str(path), "sha256": found.hexdigest(), "bytes": size}
+            found.update(f"{each.relative_to(path)}\0{inner.sha256}\0".encode())
+            size += inner.bytes
+    return InputFile(str(path), found.hexdigest(), size)
 
 
 # ---------------------------------------------------------------------- repetition
@@ -84,20 +80,19 @@ class Repetition:
         result = _result(path)
         self.entries: list[Mapping[str, Any]] = result.get("files", [result])
         try:
-            evidence = [entry["evidence"] for entry in self.entries if "evidence" in entry]
-            options = evidence[0]["options"]
-            alike = all(each["options"] == options for each in evidence)
-            if not alike or not all(map(_is_option, options.items())):
-                raise ValueError("options that check does not have")
-            self.question = _question(options)
-            files = {each["path"]: each for e in evidence for each in (e["trace"], *e["inputs"])}
-            self.traces = [str(each["trace"]["path"]) for each in evidence]
-            for name, known in files.items():
-                _require_same(path, str(name), str(known["sha256"]))
+            evidence = [
+                read(Evidence, entry["evidence"], "evidence") for entry in self.entries if "evidence" in entry
+            ]
+            if not evidence or any(each.options != evidence[0].options for each in evidence):
+                raise ValueError("its results have no options, or different ones")
+            self.options = Judging.from_words(evidence[0].options)
+            self.traces = [each.trace.path for each in evidence]
+            for file in {each.path: each for e in evidence for each in (e.trace, *e.inputs)}.values():
+                _require_same(path, file.path, file.sha256)
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise usage(f"`{path}` holds no evidence of a result: {error}", "stlc check … --json") from None
 
-    def differences(self, entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    def differences(self, entries: Sequence[Any]) -> list[str]:
         """Differences of new results from the stored ones, a line each; none if they are the same."""
         if len(entries) != len(self.entries):
             return [f"{len(self.entries)} results then, {len(entries)} now"]
@@ -132,49 +127,11 @@ def _result(path: Path) -> Mapping[str, Any]:
     return result
 
 
-def _is_option(item: tuple[Any, Any]) -> bool:
-    name, values = item
-    texts = isinstance(values, list) and all(isinstance(value, str) for value in values)
-    return texts and bool(values) and name in {*_SINGLE, *_REPEATED, *_OTHERS}
-
-
-_SINGLE = {
-    "--system": "system",
-    "--resample": "resample",
-    "--dt": "dt",
-    "--max-gap": "max_gap",
-    "--clock": "clock",
-}
-_SINGLE |= {"--group": "group", "--columns": "columns"}
-_OTHERS = ("--spec", "--fps", "--uncertain", "--at", "--end", "--tolerance", "--semantics", "--strict")
-_REPEATED = {"--map": "map_", "--set": "set_", "--require": "require", "--between": "between"}
-
-
-def _question(options: Mapping[str, Sequence[str]]) -> Question:
-    """The question that options state, read as from a command line."""
-    from stlc.cli.check.judge import uncertainties
-    from stlc.cli.framework.options import parse_pairs
-
-    given: dict[str, Any] = {field: options[name][0] for name, field in _SINGLE.items() if name in options}
-    given |= {field: list(options[name]) for name, field in _REPEATED.items() if name in options}
-    one = {name: values[0] for name, values in options.items()}
-    pairs = parse_pairs(options.get("--uncertain"), "--uncertain", "SIGNAL=ERROR", "x=0.1m")
-    return Traces(**given, fps=float(one["--fps"]) if "--fps" in one else None).question(
-        spec=Path(one["--spec"]) if "--spec" in one else None,
-        at=one.get("--at"),
-        end=one["--end"],
-        tolerance=float(one["--tolerance"]),
-        semantics=one["--semantics"],
-        uncertain=uncertainties(pairs),
-        strict="--strict" in options,
-    )
-
-
 def _require_same(result: Path, name: str, digest: str) -> None:
     """Raise UsageError (U102) unless there is a file or folder `name` with this hash."""
     path = Path(name)
     if not (path.is_file() or path.is_dir()):
         message = f"`{name}`, from which {result} was made, is not here"
         raise UsageError(Diagnostic("U102", message, help=("run it in the folder of the first check",)))
-    if _file(path)["sha256"] != digest:
+    if _file(path).sha256 != digest:
         raise UsageError(Diagnostic("U102", f"`{name}` has changed since {result} was made"))

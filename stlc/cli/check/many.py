@@ -9,24 +9,159 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from stlc.cli.check.judge import Work, found, judge
-from stlc.cli.check.outcome import WORDS, Outcome, VerdictRow, overall
-from stlc.cli.framework.documents import InvalidTrace
-from stlc.cli.framework.output import COLOR, table
+from stlc.cli.check.text import WORDS, robustness_of
+from stlc.cli.framework.output import table
 from stlc.diagnostics import CODES, Diagnostic, MissingError, StlcError, usage
 from stlc.escape import operand, visible
-from stlc.files import require_folder
+from stlc.files import find_trace, require_folder
 
 if TYPE_CHECKING:
-    from stlc.assurance.certificate import Sample
-    from stlc.cli.check.judge import Question
-    from stlc.cli.check.outcome import Checked
-    from stlc.controller.parallel.workers import LostCall
+    from collections.abc import Mapping
 
-SMALL = 1_000_000
-"""File size in bytes below which the unpacked content always fits into memory."""
+    from stlc.controller.parallel.workers import LostCall
+    from stlc.monitor.check import Question
+    from stlc.monitor.facts.fact import Fact
+    from stlc.monitor.judgement import RequirementVerdict, Status, Verdict
+
+SATISFIED, VIOLATED, INVALID, INCONCLUSIVE = 0, 1, 3, 4
+EXIT_CODES: dict[Status, int] = {
+    "satisfied": SATISFIED,
+    "violated": VIOLATED,
+    "inconclusive": INCONCLUSIVE,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Request to judge one trace file, as sent to a worker process.
+
+    Attributes:
+        name: name of the file as given.
+        question: options of reading and judging.
+        runs: folder of all runs.
+        out: file to which the robustness signals are written.
+        chunk: samples per chunk; 0: the file is read as a whole if it fits into memory.
+        table: whether the times of first violations are looked for.
+        words: the options as they were given, if the result says what it was made from; else None.
+    """
+
+    name: str
+    question: Question
+    runs: Path
+    out: Path | None = None
+    chunk: int = 0
+    table: bool = False
+    words: Mapping[str, Sequence[str]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Verdict on one trace file, or on one object in it, or the reasons for which there is none.
+
+    Attributes:
+        name: name of the file, and of the object in it.
+        verdict: the verdict, told; None if the file could not be judged.
+        seconds: time it took to judge the file.
+        errors: reasons for which the file could not be judged.
+        exit_code: exit code of the command for these errors; 0 without errors.
+        lost: whether the process that judged the file was lost.
+    """
+
+    name: str
+    verdict: Verdict | None = None
+    seconds: float = 0.0
+    errors: tuple[Diagnostic, ...] = ()
+    exit_code: int = 0
+    lost: bool = False
+
+    @property
+    def status(self) -> Status:
+        """Verdict over all traces and requirements."""
+        return "inconclusive" if self.verdict is None else self.verdict.scoped
+
+    @property
+    def rows(self) -> tuple[RequirementVerdict, ...]:
+        """Verdicts on the requirements."""
+        return () if self.verdict is None else self.verdict.requirements
+
+    @property
+    def word(self) -> Literal["invalid", "not judged"]:
+        """Why there is no verdict."""
+        return "not judged" if self.lost else "invalid"
+
+    @property
+    def file(self) -> str:
+        """Name of the file."""
+        track = "" if self.verdict is None else self.verdict.about.track
+        return self.name.removesuffix(f" ({track})")
+
+    def sharing(self, known: dict[Any, Any]) -> Outcome:
+        """Return the outcome with the parts that are equal to those of others, which `known` holds."""
+        if (verdict := self.verdict) is None:
+            return self
+        about, digest = verdict.about, verdict.spec_sha256
+        warnings = tuple(known.setdefault(each, each) for each in about.warnings)
+        rows = tuple(
+            replace(each, rule=known.setdefault((digest, each.rule), each.rule)).knowing(each.cause)
+            for each in verdict
+        )
+        about = replace(about, warnings=warnings, source=known.setdefault(digest, about.source))
+        return replace(self, verdict=verdict.but(requirements=rows, about=about))
+
+
+def exit_code(outcomes: Sequence[Outcome], fail_under: float | None = None, *, strict: bool = False) -> int:
+    """Return the exit code: 0 satisfied, 1 violated, 4 inconclusive; other codes if a file cannot be judged.
+
+    With `fail_under`, the code depends on the share of the judged instants at which all requirements hold.
+    The code is 0 if this share is at least `fail_under`. It is 1 if the share stays below `fail_under`
+    whatever samples follow. It is 4 if this is undecided. With `strict`, it is 4 instead of 0 if a satisfied
+    requirement was not fully judged. If a file cannot be judged, its exit code is
+    returned, whatever the verdicts of the other files. Traces to which the specification does not apply (out
+    of scope) do not count.
+    """
+    broken = [outcome.exit_code for outcome in outcomes if outcome.errors]
+    if broken:
+        return max(broken)
+    code = _verdict_code(outcomes, fail_under)
+    unjudged = any(row.unjudged for outcome in outcomes for row in outcome.rows)
+    return INCONCLUSIVE if strict and unjudged and code == SATISFIED else code
+
+
+def _verdict_code(outcomes: Sequence[Outcome], fail_under: float | None) -> int:
+    verdicts = [outcome.verdict for outcome in outcomes if outcome.verdict is not None]
+    traces = sum(each.in_scope for each in verdicts)
+    if fail_under is not None and traces:
+        holds = sum(each.share * each.in_scope for each in verdicts) / traces
+        fails = sum(each.failed_share * each.in_scope for each in verdicts) / traces
+        return SATISFIED if holds >= fail_under else VIOLATED if 1.0 - fails < fail_under else INCONCLUSIVE
+    if fail_under is not None:
+        return INCONCLUSIVE
+    return EXIT_CODES.get(overall(outcomes), INCONCLUSIVE)
+
+
+def overall(outcomes: Sequence[Outcome]) -> Status:
+    """Return the verdict over all judged files.
+
+    Files to which the specification does not apply do not count.
+    """
+    found = {outcome.status for outcome in outcomes if not outcome.errors}
+    if "violated" in found:
+        return "violated"
+    return "satisfied" if found - {"out of scope"} == {"satisfied"} else "inconclusive"
+
+
+def seen_at(name: str, runs: Path) -> Path:
+    """Return the path of a trace file called `name`.
+
+    It is `name` itself if that file exists, else the file of that name in the newest run below `runs`.
+    """
+    path = find_trace(name, runs)
+    if path == Path(name):
+        return path
+    path = path.resolve()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +201,9 @@ def all_outcomes(
     if places.cluster is None and len(works) == 1:
         return outcomes_of(works[0])
     outcomes: list[list[Outcome]] = [[]] * len(works)
-    known: dict[Diagnostic, Diagnostic] = {}
+    known: dict[Any, Any] = {}
     for done, (index, found_) in enumerate(_judged(works, places), start=1):
-        outcomes[index] = []
-        for outcome in found_:
-            warnings = tuple(known.setdefault(each, each) for each in outcome.warnings)
-            shown = outcome.text if outcome.status != "satisfied" or len(works) == 1 else ""
-            outcomes[index].append(replace(outcome, warnings=warnings, text=shown))
+        outcomes[index] = [outcome.sharing(known) for outcome in found_]
         progress(f"{done:,} of {len(works):,} files judged")
     return [outcome for each in outcomes for outcome in each]
 
@@ -108,14 +239,13 @@ def _lost(work: Work, lost: LostCall) -> Outcome:
         note=(lost.reason,),
         help=("--chunk reads a large file in pieces", f"stlc check … {operand(work.name)} judges it alone"),
     )
-    entry: InvalidTrace = {"trace": work.name, "verdict": "not judged"}
-    return Outcome(work.name, entry, errors=(finding,), exit_code=MissingError.exit_code)
+    return Outcome(work.name, errors=(finding,), exit_code=MissingError.exit_code, lost=True)
 
 
 def _seen(work: Work) -> str:
     """Path of a file, which may lie in the newest run; the name as given if there is no such file."""
     with suppress(StlcError):
-        return str(found(work.name, work.runs))
+        return str(seen_at(work.name, work.runs))
     return work.name
 
 
@@ -132,103 +262,39 @@ def safe_outcomes(work: Work) -> list[Outcome]:
     try:
         return outcomes_of(work)
     except StlcError as error:
-        entry: InvalidTrace = {"trace": work.name, "verdict": "invalid"}
-        return [Outcome(work.name, entry, errors=error.diagnostics, exit_code=error.exit_code)]
+        return [Outcome(work.name, errors=error.diagnostics, exit_code=error.exit_code)]
 
 
 def outcomes_of(work: Work) -> list[Outcome]:
     """Judge one file and return the outcomes of its objects, usually one. Raises StlcError if that fails."""
-    COLOR.set(work.mode)
-    path = found(work.name, work.runs)
-    outcomes = _outcomes(path, work)
-    if not work.evidence:
-        return outcomes
-    from stlc.cli.check.evidence import evidence_of
+    from stlc.monitor.check import judge, too_large, write_robustness
 
-    made: Any = {"evidence": evidence_of(path, work.question)}
-    return [replace(each, entry=each.entry | made) for each in outcomes]
-
-
-def _outcomes(path: Path, work: Work) -> list[Outcome]:
     begun = time.perf_counter()
-    if work.chunk or _too_large(path):
-        if work.question.uncertain:
-            raise usage(f"`--uncertain` needs the whole trace, and {path} does not fit into memory")
-        from stlc.cli.check.online import outcome_in_chunks
-
-        outcome = outcome_in_chunks(path, work)
-        return [with_sample(outcome) if work.certify else outcome]
-    results = judge(work.name, work.question, work.runs)
+    path = seen_at(work.name, work.runs)
+    notes = () if path == Path(work.name) else (f"taking {path}, of the newest run",)
+    if work.out is not None and (work.chunk or too_large(path)):
+        advice = "leave out --chunk" if work.chunk else "cut out what is of interest"
+        raise usage(f"`--out` needs the whole trace, and `{path}` is read in pieces", advice)
+    verdicts = judge(path, work.question, chunk=work.chunk)
     if work.out is not None:
-        from stlc.cli.check.document import write_robustness
+        if len(verdicts) > 1:
+            raise usage(f"`--out` writes one trace, and `{path}` holds {len(verdicts)} of different times")
+        write_robustness(work.out, verdicts[0], work.question)
+    if work.table:
+        from stlc.monitor.verdict import timed
 
-        if len(results) > 1:
-            raise usage(f"`--out` writes one trace, and `{path}` holds {len(results)} of different times")
-        write_robustness(work.out, results[0], work.question)
-    each = (time.perf_counter() - begun) / len(results)
-    return [_outcome(result, work, each) for result in results]
+        verdicts = [each if each.streamed else timed(each) for each in verdicts]
+    told = [each.told() for each in verdicts]
+    if work.words is not None:
+        from stlc.cli.check.evidence import evidence_of
 
-
-def _outcome(result: Checked, work: Work, seconds: float) -> Outcome:
-    from stlc.cli.check.document import result_record
-    from stlc.cli.check.text import lint_text, result_text, rows_of
-
-    rows = rows_of(result, violated_at=_violated_at(result, work.question) if work.table else {})
-    return Outcome(
-        name=result.trace.name,
-        track=result.trace.track,
-        entry=result_record(result, work.question.end),
-        status=result.verdict.overall if result.verdict.in_scope else "out of scope",
-        rows=rows,
-        text=result_text(result, rows, color=work.color),
-        traces=result.verdict.in_scope,
-        holds=result.verdict.share,
-        fails=result.verdict.failed_share,
-        seconds=seconds,
-        warnings=result.warnings,
-        remarks=result.remarks,
-        sample=_sample(result) if work.certify else None,
-        facts=result.facts_on(""),
-        lint=lint_text(result),
-    )
-
-
-def _violated_at(result: Checked, question: Question) -> dict[str, float]:
-    """Times in seconds from which violated requirements are certainly violated, by name."""
-    from stlc.monitor.verdict import first_violation
-
-    verdict = result.verdict
-    samples = {
-        judged.name: first_violation(judged, verdict.subject, question.tolerance)
-        for judged in verdict
-        if judged.overall == "violated"
-    }
-    return {name: verdict.subject.time(sample) for name, sample in samples.items()}
-
-
-def _sample(result: Checked) -> Sample | None:
-    from stlc.cli.certify.traces import sample_of_verdict
-
-    return sample_of_verdict(result)
-
-
-def with_sample(outcome: Outcome) -> Outcome:
-    """Return the outcome of a trace that was judged in chunks with its observation for bounds."""
-    from stlc.cli.certify.traces import sample_of_rows
-
-    return replace(outcome, sample=sample_of_rows(outcome.rows))
-
-
-def _too_large(path: Path) -> bool:
-    """True if the unpacked content of a file is too large for memory; the file is then read in chunks.
-
-    A file of less than `SMALL` bytes is never too large, however well it is compressed.
-    """
-    if path.stat().st_size < SMALL:
-        return False
-    from stlc.trace.chunks import LARGE, size_of
-
-    return size_of(path) > LARGE
+        evidence = evidence_of(path, work.question, work.words)
+        told = [each.but(evidence=evidence) for each in told]
+    seconds = (time.perf_counter() - begun) / len(told)
+    notes = () if told[0].streamed else notes
+    return [
+        Outcome(each.about.trace, each.but(notes=(*notes, *each.notes)), seconds=seconds) for each in told
+    ]
 
 
 # -------------------------------------------------------------------------- summary
@@ -242,7 +308,7 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     satisfied = sum(outcome.status == "satisfied" for outcome in outcomes)
     each = "files" if len({outcome.file for outcome in outcomes}) == len(outcomes) else "objects"
     parts = [f"{satisfied} of {len(outcomes)} {each} satisfy every requirement"]
-    lost = sum(outcome.entry["verdict"] == "not judged" for outcome in outcomes)
+    lost = sum(outcome.lost for outcome in outcomes)
     broken = sum(bool(outcome.errors) for outcome in outcomes) - lost
     outside = sum(outcome.status == "out of scope" for outcome in outcomes)
     parts += [f"{broken} cannot be judged"] if broken else []
@@ -255,22 +321,27 @@ def summary(outcomes: Sequence[Outcome]) -> str:
 def _line(outcome: Outcome) -> tuple[str, ...]:
     if outcome.errors:
         first = outcome.errors[0]
-        word = "NOT JUDGED" if outcome.entry["verdict"] == "not judged" else "INVALID"
+        word = "NOT JUDGED" if outcome.lost else "INVALID"
         return (outcome.name, word, "", "", f"{first.code}: {first.message}")
-    if not outcome.rows:
-        return (outcome.name, WORDS[outcome.status])
     worst = _worst(outcome.rows)
-    return (outcome.name, WORDS[outcome.status], worst.robustness, worst.name, worst.where)
+    robustness = robustness_of(worst, outcome.verdict)
+    return (outcome.name, WORDS[outcome.status], robustness, worst.name, worst.where)
 
 
-def _worst(rows: Sequence[VerdictRow]) -> VerdictRow:
+def _worst(rows: Sequence[RequirementVerdict]) -> RequirementVerdict:
     """Return the row of a file's worst requirement; the summary shows this row for the file.
 
     Violated requirements are worse than inconclusive ones, and inconclusive ones are worse than satisfied
     ones. Among requirements with the same verdict, the one with the least robustness is the worst.
     """
     order = {"violated": 0, "inconclusive": 1, "satisfied": 2, "out of scope": 3}
-    return min(rows, key=lambda row: (order[row.status], row.least))
+
+    def rank(row: RequirementVerdict) -> tuple[int, float]:
+        figures = row.figures
+        least = figures.low if row.overall == "inconclusive" else figures.min
+        return order[row.overall], 0.0 if least is None else least
+
+    return min(rows, key=rank)
 
 
 _COUNTED = {"W711": "read in part in", "W712": "never triggered in", "": "other facts in"}
@@ -283,7 +354,7 @@ def _per_requirement(names: Sequence[str], outcomes: Sequence[Outcome]) -> str:
     for name in names:
         rows = [row for outcome in outcomes for row in outcome.rows if row.name == name]
         told = [{f.code if f.code in _COUNTED else "" for f in row.facts} for row in rows]
-        counts = [sum(row.status == status for row in rows) for status in ("violated", "inconclusive")]
+        counts = [sum(row.overall == status for row in rows) for status in ("violated", "inconclusive")]
         columns.append([*counts, *(sum(code in codes for codes in told) for code in _COUNTED)])
     heads = ["violated in", "inconclusive in", *_COUNTED.values()]
     kept = [i for i in range(len(heads)) if i < 2 or any(counts[i] for counts in columns)]
@@ -296,7 +367,7 @@ def _per_requirement(names: Sequence[str], outcomes: Sequence[Outcome]) -> str:
 
 def _about_recordings(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Yield a paragraph with the number of files in which each fact about a recording is true, if any is."""
-    counts = Counter((fact.code, fact.signal) for outcome in outcomes for fact in outcome.facts)
+    counts = Counter((fact.code, fact.signal) for outcome in outcomes for fact in _remarks(outcome))
     total = f"of {len(outcomes):,} files"
     lines = [
         f"  {f'`{visible(signal)}`: ' if signal else ''}{CODES[code]}, in {count:,} {total}"
@@ -304,6 +375,10 @@ def _about_recordings(outcomes: Sequence[Outcome]) -> Iterator[str]:
     ]
     if lines:
         yield "\n".join(lines)
+
+
+def _remarks(outcome: Outcome) -> tuple[Fact, ...]:
+    return () if outcome.verdict is None else outcome.verdict.remarks
 
 
 def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from stlc.cli.check.outcome import Outcome, VerdictRow
+from stlc.cli.check.many import Outcome
 from stlc.diagnostics import usage
 from stlc.escape import encodable, spreadsheet
 from stlc.files import write_atomic
@@ -80,16 +80,10 @@ def _rows(outcome: Outcome) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a file, in the order of `COLUMNS`; one row if it could not be judged."""
     if outcome.errors:
         error = "; ".join(f"{each.code}: {'; '.join([each.message, *each.note])}" for each in outcome.errors)
-        yield (outcome.name, None, outcome.entry["verdict"], None, None, None, None, error)
-    samples = outcome.entry.get("samples")
+        yield (outcome.name, None, outcome.word, None, None, None, None, error)
     for row in outcome.rows:
-        verdict = outcome.status if outcome.status == "out of scope" else row.status
-        yield (
-            *(outcome.name, row.name, verdict, _robustness(row), row.unit or None, row.violated_at),
-            *(samples, None),
-        )
-
-
-def _robustness(row: VerdictRow) -> float | None:
-    """Least robustness; None if there is none, or if only bounds are known."""
-    return row.least if row.robustness and row.status != "inconclusive" else None
+        status = "out of scope" if outcome.status == "out of scope" else row.overall
+        figures = row.figures
+        least = None if row.overall == "inconclusive" else figures.min
+        samples = None if outcome.verdict is None else outcome.verdict.about.samples
+        yield (outcome.name, row.name, status, least, figures.unit or None, row.violated_at, samples, None)

@@ -1,62 +1,74 @@
-"""Output of `stlc check`: a table, and the place and reason of each violation."""
+"""Terminal rendering of a verdict: a table, and the place and reason of each violation."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from stlc.cli.check.outcome import Checked, VerdictRow
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import render_place
-from stlc.compile.ir.support import columns
-from stlc.compile.ir.traverse import margin_units
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.escape import operand, shell, visible
-from stlc.monitor.explain.report import Cause
-from stlc.monitor.judgement import Judgement, Part, Verdict, beside
-from stlc.monitor.signals import gap_text
 
 if TYPE_CHECKING:
+    from stlc.monitor.explain.report import Cause
     from stlc.monitor.facts.fact import Fact
-    from stlc.monitor.judgement import Status
+    from stlc.monitor.judgement import RequirementVerdict, Status, Verdict
+
+WORDS: dict[Status, str] = {
+    "satisfied": "satisfied",
+    "violated": "VIOLATED",
+    "inconclusive": "inconclusive",
+    "out of scope": "out of scope",
+}
 
 
-def result_text(result: Checked, rows: Sequence[VerdictRow], *, color: bool) -> str:
-    """Text that `stlc check` prints for one judged trace: table, reasons of violations, and verdict.
+def verdict_text(verdict: Verdict, replay: Sequence[str], *, color: bool) -> str:
+    """Text that `stlc check` prints for one judged file: table, reasons of violations, and verdict.
 
-    `rows` are the rows of the table, one per requirement.
+    `replay` are the words of a command line that reads the same trace, to explain one of its violations.
     """
-    trace, verdict = result.trace, result.verdict
-    title = (
-        f"{visible(result.source.name)} on {visible(trace.name)}    "
-        f"{trace.traces} trace{'s' if trace.traces != 1 else ''} x {trace.samples} samples, dt {trace.dt:g} s"
-    )
-    reasons = []
-    for judged in verdict:
-        cause = result.causes.get(judged.name)
-        if cause is not None:
-            reasons.append(_violation(judged, cause, result, color).rstrip("\n"))
-        elif judged.overall == "inconclusive" and verdict.in_scope:
-            reasons.append(_inconclusive(judged, result))
-    unexplained = sum(judged.overall == "violated" for judged in verdict) - len(result.causes)
-    if unexplained > 0:
-        reasons.append(f"{unexplained:,} more are violated; --require NAME says why.")
-    ending, folder = [_summary(verdict)], Path(trace.name).parent
+    about, several = verdict.about, verdict.traces > 1
+    yes = "s" if verdict.traces != 1 else ""
+    size = f"{verdict.traces} trace{yes} x {about.samples} samples, dt {about.dt or 0.0:g} s"
+    title = f"{visible(about.source.name)} on {visible(about.trace)}    {size}"
+    least = "robustness (min over traces)" if several else "robustness"
+    cells = [_cells(row, verdict) for row in verdict]
+    lines = [title, "", table(cells, header=("requirement", "verdict", least, "starts", "where"))]
+    lines += [f"  clock {visible(str(clock))}" for clock in about.clocks if not clock.plain]
+    lines += [f"  `{visible(name)}` may be off by {error}" for name, error in verdict.uncertain.items()]
+    lines += [f"  {text}" for text in (*_gap_texts(verdict).values(), *map(fact_text, verdict.remarks))]
+    for row in verdict:
+        if (cause := row.cause) is not None:
+            lines += ["", _violation(row, cause, verdict, replay, color=color).rstrip("\n")]
+        elif row.overall == "inconclusive" and verdict.in_scope:
+            lines += ["", inconclusive(row, verdict)]
+    unexplained = len(verdict.violated) - len(verdict.causes)
+    if unexplained > 0 and not verdict.streamed:
+        lines += ["", f"{unexplained:,} more are violated; --require NAME says why."]
+    lines += ["", _summary(verdict)]
+    folder = Path(about.trace).parent
     if (folder / "run.json").is_file():
-        ending.append(f"next: {shell(('stlc', 'report', str(folder)))}")
-    gaps = (
-        *(
-            *[f"clock {visible(str(clock))}" for clock in result.trace.clocks if not clock.plain],
-            *[f"`{visible(name)}` may be off by {error}" for name, error in result.uncertain.items()],
-            *_gap_texts(result).values(),
-        ),
-        *map(fact_text, result.facts_on("")),
-    )
-    return text_of(title, rows, gaps, reasons, ending, several=verdict.traces > 1)
+        lines.append(f"next: {shell(('stlc', 'report', str(folder)))}")
+    return "\n".join(lines)
+
+
+def _cells(row: RequirementVerdict, verdict: Verdict) -> tuple[str, ...]:
+    share = "" if row.holds.size == 1 and row.instants == 1 else percent(row.share)
+    where = "; ".join(filter(None, (row.where, *remarks_of(row))))
+    return row.name, words_of(row), robustness_of(row, verdict), share, where
+
+
+def words_of(row: RequirementVerdict) -> str:
+    """The verdict with the facts that stand beside it: `satisfied, never triggered (0 of 5)`."""
+    return ", ".join([WORDS[row.overall], *(fact.text for fact in row.facts if fact.beside)])
+
+
+def remarks_of(row: RequirementVerdict) -> list[str]:
+    """The facts about a requirement that do not stand beside its verdict."""
+    return [fact.text for fact in row.facts if not fact.beside]
 
 
 def fact_text(fact: Fact) -> str:
@@ -64,41 +76,17 @@ def fact_text(fact: Fact) -> str:
     return "; ".join([fact.text, *fact.advice])
 
 
-def text_of(
-    title: str,
-    rows: Iterable[VerdictRow],
-    gaps: Iterable[str],
-    reasons: Iterable[str],
-    ending: Iterable[str],
-    *,
-    several: bool = False,
-) -> str:
-    """Text of a result: table of requirements, unknown samples, reasons, and last lines.
+def robustness_of(row: RequirementVerdict, verdict: Verdict | None) -> str:
+    """Least robustness of a requirement, with its unit; bounds, if it is inconclusive; "" without a trace."""
+    from stlc.compile.ir.traverse import margin_units
 
-    Args:
-        title: first line.
-        rows: results of the requirements.
-        gaps: lines about unknown and uncertain samples, one line per signal.
-        reasons: paragraphs on requirements that are not satisfied.
-        ending: last lines.
-        several: whether the file has several traces.
-    """
-    least = "robustness (min over traces)" if several else "robustness"
-    cells = [
-        (
-            row.name,
-            row.verdict,
-            row.robustness,
-            row.share,
-            "; ".join(filter(None, (row.where, *row.remarks))),
-        )
-        for row in rows
-    ]
-    lines = [title, "", table(cells, header=("requirement", "verdict", least, "starts", "where"))]
-    lines += [f"  {text}" for text in gaps]
-    for reason in reasons:
-        lines += ["", reason]
-    return "\n".join([*lines, "", *ending])
+    found = row.figures
+    if found.low is None or found.high is None or found.min is None:
+        return ""
+    several = margin_units(row.rule.typed.formula)[:3]
+    units = found.unit or ("|".join(each or "1" for each in several) if any(several) else "")
+    shown: Status = "inconclusive" if verdict is not None and verdict.uncertain else row.overall
+    return robustness_text(shown, found.low, found.high, found.min, units, row.tolerance)
 
 
 def robustness_text(
@@ -138,85 +126,50 @@ def percent(share: float) -> str:
     return f"{percent:.1f} %" if percent % 1 else f"{percent:.0f} %"
 
 
-def _where(judged: Judgement, result: Checked) -> str:
-    trace, sample = judged.worst
-    cause = result.causes.get(judged.name)
-    words = [f"trace {trace}"] if result.verdict.traces > 1 else []
-    if cause is not None:
-        words.append(beside(cause.moment, cause.started if judged.instants > 1 else cause.moment))
-    elif judged.instants > 1:
-        words.append(f"from {result.verdict.subject.moment(sample)}")
-    return ", ".join(words)
-
-
-def rows_of(result: Checked, violated_at: Mapping[str, float]) -> tuple[VerdictRow, ...]:
-    """The rows of the table, with a reason for each unsatisfied requirement.
-
-    `violated_at` is the time of the first violation in seconds, by requirement, where it is known.
-    """
-    rows = []
-    for judged in result.verdict:
-        cause, status = result.causes.get(judged.name), judged.overall
-        low, high = (float(judged.counted(end).min(initial=np.inf)) for end in judged.margins)
-        robustness, least = "", 0.0
-        unit = judged.unit or ("" if cause is None else cause.unit)
-        several = margin_units(judged.rule.typed.formula)[:3]
-        units = unit or ("|".join(each or "1" for each in several) if any(several) else "")
-        if judged.counted(judged.least).size:
-            least = low if status == "inconclusive" else float(judged.counted(judged.least).min())
-            shown = "inconclusive" if result.uncertain else status
-            robustness = robustness_text(shown, low, high, least, units, judged.tolerance)
-        share = "" if judged.holds.size == 1 else percent(judged.share)
-        why = _inconclusive(judged, result) if status == "inconclusive" else ""
-        why, where = why if cause is None else cause.because, _where(judged, result)
-        at = violated_at.get(judged.name)
-        rows.append(
-            VerdictRow(
-                *(judged.name, status, robustness, share, where, why, least, unit, at),
-                facts=result.facts_on(judged.name),
-            )
-        )
-    return tuple(rows)
-
-
 # ------------------------------------------------------------------------ reasons
 
 
-def _violation(judged: Judgement, cause: Cause, result: Checked, color: bool) -> str:
-    verdict = result.verdict
-    start = f"{verdict.subject.time(cause.start):.10g}s"
-    track = ("--group", result.trace.track) if result.trace.track else ()
-    words = (*result.options, operand(result.trace.file), *track, "--require", judged.name, "--at", start)
-    advice = [("because", cause.because), ("replay", shell(("stlc", "check", *words)))]
-    headline = f"{visible(judged.name)} is violated"
+def _violation(
+    row: RequirementVerdict, cause: Cause, verdict: Verdict, replay: Sequence[str], *, color: bool
+) -> str:
+    about, advice = verdict.about, [("because", cause.because)]
+    if about.file:
+        start = f"{row.timeline.time(cause.start):.10g}s"
+        track = ("--group", about.track) if about.track else ()
+        words = (*replay, operand(about.file), *track, "--require", row.name, "--at", start)
+        advice.append(("replay", shell(("stlc", "check", *words))))
+    headline = f"{visible(row.name)} is violated"
     if verdict.traces > 1:
-        headline += f" in {judged.statuses.count('violated')} of {verdict.in_scope} traces"
-    if judged.instants > 1:
-        fails = judged.counted(judged.fails)
-        headline += f", at {int(fails.sum()):,} of {fails.size:,} starts"
+        headline += f" in {row.violated_traces} of {verdict.in_scope} traces"
+    if row.instants > 1:
+        failed = row.counted(row.failed)
+        headline += f", at {int(failed.sum()):,} of {row.instants * failed.size:,} starts"
     return f"{headline}.\n{render_place(cause.place, cause.labels, advice, color=color)}"
 
 
-def _gap_texts(result: Checked) -> dict[str, str]:
+def _gap_texts(verdict: Verdict) -> dict[str, str]:
     """Return a line of text for each signal with unknown samples that a requirement reads.
 
     The result maps the name of the signal to the line.
     """
-    subject = result.verdict.subject
-    samples = subject.signals.samples * subject.signals.batch
-    moment = subject.moment
+    from stlc.monitor.signals import gap_text
+
+    samples, moment = verdict.about.samples * verdict.traces, verdict.requirements[0].timeline.moment
     return {
         name: gap_text(name, gap, samples, (moment(gap.first), moment(gap.last)))
-        for name, gap in subject.gaps.items()
+        for name, gap in verdict.gaps.items()
     }
 
 
-def _inconclusive(judged: Judgement, result: Checked) -> str:
-    name = visible(judged.name)
-    part = judged.part or Part(0, result.trace.samples)
-    last = judged.start - part.first + judged.instants - 1 + judged.rule.reach
-    needed, length = last * result.trace.dt, (part.stop - part.first - 1) * result.trace.dt
-    gaps = [text for signal, text in _gap_texts(result).items() if signal in columns(judged.rule.formula)]
+def inconclusive(row: RequirementVerdict, verdict: Verdict | None) -> str:
+    """Sentence on why a requirement is inconclusive."""
+    from stlc.compile.ir.support import columns
+
+    assert verdict is not None
+    name, part, dt = visible(row.name), row.part, verdict.about.dt or 0.0
+    last = row.start - part.first + row.instants - 1 + row.rule.reach
+    needed, length = last * dt, (part.stop - part.first - 1) * dt
+    gaps = [text for signal, text in _gap_texts(verdict).items() if signal in columns(row.rule.formula)]
     if gaps and needed <= length:
         return f"{name} is inconclusive: {', '.join(gaps)}."
     if needed > length:
@@ -224,10 +177,9 @@ def _inconclusive(judged: Judgement, result: Checked) -> str:
         return (
             f"{name} is inconclusive: it needs {needed:.6g} s of signal, the trace has {length:.6g} s{more}."
         )
-    if result.uncertain:
+    if verdict.uncertain:
         return f"{name} is inconclusive: the errors of the signals decide it."
-    cells = result.verdict.subject.record.cells
-    if cells is not None:
+    if verdict.about.resampled:
         return (
             f"{name} is inconclusive: values between the instants of the grid leave it open.\n"
             "A shorter step (--resample), or --between SIGNAL=hold or =linear, may decide it."
@@ -235,25 +187,25 @@ def _inconclusive(judged: Judgement, result: Checked) -> str:
     return f"{name} is inconclusive: it has no value where it was judged."
 
 
-def lint_text(result: Checked) -> str:
+def lint_text(verdict: Verdict) -> str:
     """Line on what `stlc lint` would say of a specification; "" if nothing."""
-    if not result.lint:
+    if not verdict.lint:
         return ""
-    count = f"{len(result.lint)} warning{'s' if len(result.lint) > 1 else ''}"
-    file = result.source.name
+    count = f"{len(verdict.lint)} warning{'s' if len(verdict.lint) > 1 else ''}"
+    file = verdict.about.source.name
     command = f"; {shell(('stlc', 'lint', operand(file)))}" if Path(file).is_file() else ""
-    return f"lint: {count}: {', '.join(sorted(set(result.lint)))}{command}"
+    return f"lint: {count}: {', '.join(verdict.lint_codes)}{command}"
 
 
 def _summary(verdict: Verdict) -> str:
     traces, outside = verdict.in_scope, verdict.traces - verdict.in_scope
     if not traces:
-        return "out of scope: the assumptions do not hold"
-    count = max(judged.instants for judged in verdict) * traces
+        return "out of scope" if verdict.streamed else "out of scope: the assumptions do not hold"
+    count = max(row.instants for row in verdict) * traces
     starts = f"{percent(verdict.share)} of {count:,} starts"
     if verdict.traces > 1:
         text = f"{verdict.satisfied_traces} of {traces} traces satisfy every requirement; {starts}"
-    elif count > 1:
+    elif count > 1 and not verdict.streamed:
         text = f"{verdict.overall}; all requirements hold at {starts}"
     else:
         text = verdict.overall

@@ -12,14 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stlc.cli.certify.text import GuardOption, bounds_lines, checked_share, floored, raised
-from stlc.cli.framework.assured import (
-    Certificate,
-    CertificateCheck,
-    CertifiedFinding,
-    CertifyResult,
-    DifferentEntry,
-    DrawnCertificate,
-)
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
     AgentsOption,
@@ -44,8 +36,16 @@ from stlc.foreign import driving
 from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
-    from stlc.assurance.campaign import Campaign, CertificateVerification, Progress, Subject
+    from stlc.assurance.campaign import (
+        Campaign,
+        CertificateCheck,
+        CertificateVerification,
+        Difference,
+        Progress,
+        Subject,
+    )
     from stlc.assurance.drives import PolicyDrives
+    from stlc.cli.framework.assured import BoundedDraws, BoundedDrives
 
 FILE = "eval/certificate.json"
 DRAWN_FOLDER = "certificates"
@@ -155,7 +155,7 @@ def certify(
     ] = None,
     set_: SetOption = None,
     runs: RunsOption = Path("runs"),
-) -> Answer[CertifyResult]:
+) -> Answer[BoundedDrives | BoundedDraws | CertificateCheck]:
     """Certify that a share of all drives satisfies the requirements.
 
     The policy is deployed world by world until the share is certified or refuted with the given confidence,
@@ -187,7 +187,7 @@ def certify(
     chosen = _Chosen(run, how, what, tuple(require or ()), parse_overrides(set_), runs)
     subject, home, shown = chosen.subject()
     order = Campaign(subject, claim, width, drives, fixed)
-    result = _observed(order, out or home)
+    result: Any = _observed(order, out or home)
     name = shown if out is None else str(out)
 
     def show() -> None:
@@ -282,7 +282,7 @@ def require_drawn(name: str | None, how: Driving, what: DrawnSubject) -> None:
             raise usage(f"`--{each.name.replace('_', '-')}` is for a policy, and `{option}` has none")
 
 
-def _observed(order: Campaign, path: Path) -> Certificate | DrawnCertificate:
+def _observed(order: Campaign, path: Path) -> Mapping[str, Any]:
     """Observe, write the certificate after each batch, and return the last one."""
     from stlc.assurance.campaign import campaign, certificate
     from stlc.jsontext import dumps
@@ -294,8 +294,8 @@ def _observed(order: Campaign, path: Path) -> Certificate | DrawnCertificate:
             write_atomic(path, dumps(document, indent=2) + "\n")
             if not progress.done:
                 say(_progress_text(progress))
-    made: Certificate | DrawnCertificate = document
-    return made
+    found: Mapping[str, Any] = document
+    return found
 
 
 def _progress_text(progress: Progress) -> str:
@@ -304,7 +304,7 @@ def _progress_text(progress: Progress) -> str:
     return f"{found.units:,} {progress.assessment.noun}s: share from {floored(low)} to {raised(high)}"
 
 
-def _exit_code(result: Certificate | DrawnCertificate) -> int:
+def _exit_code(result: Mapping[str, Any]) -> int:
     """0 certified or as narrow as asked, 1 refuted, 4 undecided or too wide."""
     codes = {"certified": 0, "refuted": 1, "undecided": 4, "measured": 0}
     low, high = result["overall"]["interval"]
@@ -312,7 +312,7 @@ def _exit_code(result: Certificate | DrawnCertificate) -> int:
     return codes[result["answer"]] or (4 if wide else 0)
 
 
-def _lines(result: Certificate | DrawnCertificate, path: str) -> Iterator[str]:
+def _lines(result: Mapping[str, Any], path: str) -> Iterator[str]:
     yield visible(_title(result))
     yield ""
     yield from bounds_lines(result)
@@ -323,7 +323,7 @@ def _lines(result: Certificate | DrawnCertificate, path: str) -> Iterator[str]:
     yield f"  next         {shell(('stlc', 'certify', '--verify', operand(path)))}"
 
 
-def _title(result: Certificate | DrawnCertificate) -> str:
+def _title(result: Mapping[str, Any]) -> str:
     from stlc.controller.guard.kind import named_guard
 
     overall = result["overall"]
@@ -340,7 +340,7 @@ def _title(result: Certificate | DrawnCertificate) -> str:
     return " · ".join((result["spec"], f"run {Path(result['run']).name}", title, *scenario, size))
 
 
-def _finding_lines(result: DrawnCertificate) -> Iterator[str]:
+def _finding_lines(result: Mapping[str, Any]) -> Iterator[str]:
     findings = result["findings"]
     shown = findings["first"][:MOST_SHOWN]
     if not shown:
@@ -353,7 +353,7 @@ def _finding_lines(result: DrawnCertificate) -> Iterator[str]:
     yield f"  again        {shell(('stlc', 'simulate', operand(result['spec_file']), *where))}"
 
 
-def _finding_text(each: CertifiedFinding) -> str:
+def _finding_text(each: Mapping[str, Any]) -> str:
     at = "" if each["time"] is None else f" at t = {each['time']:.10g} s"
     return f"seed {each['seed']}: {each['reason']}{at}: {visible(each['message'])}"
 
@@ -361,18 +361,16 @@ def _finding_text(each: CertifiedFinding) -> str:
 # ------------------------------------------------------------------------- verification
 
 
-def _verified(path: Path, name: str | None, what: DrawnSubject, runs: Path) -> Answer[CertifyResult]:
+def _verified(path: Path, name: str | None, what: DrawnSubject, runs: Path) -> Answer[CertificateCheck]:
     """Compare the certificate in a file with what it names, or with what is given instead."""
-    from stlc.jsontext import plain
+    from stlc.assurance.campaign import CertificateCheck
 
     document = _read(path)
     try:
         shown, found = _compared(document, name, what, runs)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, ArithmeticError) as error:
         raise _damaged(path, str(error) or type(error).__name__) from error
-    fields_: Any = plain(found)
-    made: Any = {"file": str(path), "run": shown, "same": found.same, **fields_}
-    result: CertificateCheck = made
+    result = CertificateCheck(str(path), shown, found)
     noun = str(document.get("kind", "run"))
 
     def show() -> None:
@@ -399,19 +397,20 @@ def _compared(
 
 
 def _compared_lines(result: CertificateCheck, made: str, noun: str) -> Iterator[str]:
-    for each in result["inputs"]:
+    found = result.found
+    for each in found.inputs:
         yield f"  {_difference(each)}"
-    for name in result["numbers"]:
+    for name in found.numbers:
         yield f"  {visible(name)} does not follow from the counts"
-    for each in result["software"]:
+    for each in found.software:
         yield f"  {_difference(each)} (software, only a remark)"
-    changed = f"is not about this {noun} as it is now" if result["inputs"] else "has been changed"
-    told = f"is about this {noun}" if result["same"] else changed
-    yield f"the certificate of {visible(made)} {told}: {visible(result['run'])}"
+    changed = f"is not about this {noun} as it is now" if found.inputs else "has been changed"
+    told = f"is about this {noun}" if found.same else changed
+    yield f"the certificate of {visible(made)} {told}: {visible(result.run)}"
 
 
-def _difference(each: DifferentEntry) -> str:
-    return f"{visible(each['name'])} differs: {_short(each['certificate'])}, now {_short(each['present'])}"
+def _difference(each: Difference) -> str:
+    return f"{visible(each.name)} differs: {_short(each.certificate)}, now {_short(each.present)}"
 
 
 def _short(text: str) -> str:

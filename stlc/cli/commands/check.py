@@ -2,42 +2,43 @@
 
 from __future__ import annotations
 
-import math
 import sys
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
+from stlc.cli.certify.text import CertifyOption, bounds_lines, require_claim
 from stlc.cli.check import options as given
-from stlc.cli.check.judge import End, Work, uncertainties
-from stlc.cli.framework.assured import Assurance
-from stlc.cli.framework.documents import CheckResult
 from stlc.cli.framework.options import (
     SPEC_SUFFIXES,
     STDIN,
     ClusterOption,
     FailUnderOption,
     JsonOption,
-    parse_pairs,
     require_no_jobs,
     require_separate,
 )
-from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
+from stlc.cli.framework.output import PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
-from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import visible
 from stlc.files import has_wildcard, matching_traces, real, write_atomic
-from stlc.registry import SEMANTICS
+from stlc.jsontext import plain
 
 if TYPE_CHECKING:
+    from stlc.assurance.certificate import Assessment, BoundedVerdict, JudgedFiles, Unjudged
     from stlc.cli.check.evidence import Repetition
-    from stlc.cli.check.outcome import Outcome
+    from stlc.cli.check.many import Outcome
+    from stlc.monitor.check import Question
+    from stlc.monitor.judgement import Verdict
+    from stlc.monitor.online.online import Decision, Online
 
+NAME = "standard input"
 MOST_SAMPLES = 2**31 - 1
 """Samples of a chunk at most, as readers count them."""
 
@@ -60,33 +61,6 @@ def check(
             "names such as 'logs/**/*.csv', after a spec.",
         ),
     ] = None,
-    at: Annotated[
-        str | None,
-        typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts."),
-    ] = None,
-    end: Annotated[
-        End, typer.Option(help="If the trace is too short: bounds, an error, or cut windows.")
-    ] = "open",
-    semantics: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help=f"Reported robustness: {', '.join(SEMANTICS.names)}. Verdicts are exact."
-        ),
-    ] = "exact",
-    tolerance: Annotated[
-        float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
-    ] = TOLERANCE,
-    uncertain: Annotated[
-        list[str] | None,
-        typer.Option(metavar="SIGNAL=ERROR", help="Greatest error of each sample, as x=0.1m or v=2%."),
-    ] = None,
-    strict: Annotated[
-        bool,
-        typer.Option(
-            "--strict",
-            help="Times at which signals were not seen are unknown; 4 if a requirement was not fully judged.",
-        ),
-    ] = False,
     fail_under: FailUnderOption = None,
     certify: CertifyOption = None,
     out: Annotated[
@@ -119,9 +93,9 @@ def check(
             metavar="RESULT.json", help="Judge the files of a stored --json result again, and compare."
         ),
     ] = None,
-    reading: given.Traces = given.TRACES,
+    judging: given.Judging = given.JUDGING,
     json: JsonOption = False,
-) -> Answer[CheckResult]:
+) -> Answer[Verdict | BoundedVerdict | JudgedFiles]:
     """Judge recorded traces: verdicts, and the reasons of violations.
 
     A trace is looked for at the given path, then in the newest run. It is judged by SPEC or --spec, if given.
@@ -134,73 +108,115 @@ def check(
     each time; with --certify 0 certified, 1 refuted, 4 undecided; with --again 0 the same result, 1 another;
     with -q nothing is printed.
     """
-    from stlc.cli.check.document import document
-    from stlc.cli.check.document import junit as junit_xml
-    from stlc.cli.check.many import Places, all_outcomes, out_paths
-    from stlc.cli.check.outcome import exit_code
+    from stlc.cli.check.junit import junit as junit_xml
+    from stlc.cli.check.many import Places, Work, all_outcomes, exit_code, out_paths
     from stlc.cli.check.table import require_table, write_table
 
     repetition = None if again is None else _repetition(again, files)
     if repetition is None:
-        spec, names = _split_files(files or [], reading.spec)
+        spec, names = _split_files(files or [], judging.spec)
         traces = _expanded(names, [path for path in (table, out) if path is not None])
+        judging = replace(judging, spec=spec)
     else:
-        spec, traces = None, repetition.traces
+        spec, traces, judging = None, repetition.traces, repetition.options
     require_table(table)
     require_no_jobs(cluster, jobs)
-    if not 0 <= tolerance < math.inf:
-        raise usage(f"`--tolerance {tolerance}` is not a number from 0 on")
+    question = judging.question()
     require_claim(certify, fail_under)
     if certify is not None:
         _require_distinct(traces)
     if STDIN in traces:
         _require_alone(traces, certify, out, cluster)
-    errors = uncertainties(parse_pairs(uncertain, "--uncertain", "SIGNAL=ERROR", "x=0.1m"))
-    if errors and (STDIN in traces or chunk):
+    if question.uncertain and (STDIN in traces or chunk):
         raise usage("`--uncertain` needs the whole trace, and this one is judged in pieces")
-    if errors and out is not None:
+    if question.uncertain and out is not None:
         raise usage("`--out` writes the robustness of the samples as they are: leave `--uncertain` out")
-    question = reading.question(
-        spec=spec, at=at, end=end, tolerance=tolerance, semantics=semantics, uncertain=errors, strict=strict
-    )
-    if repetition is not None:
-        question = repetition.question
     paths = out_paths(out, traces)
     written = [("--table", table), ("--junit", junit), *(("--out", path) for path in paths)]
-    require_separate(written, (spec, reading.system, *traces))
+    require_separate(written, (spec, judging.system, *traces))
     talk = not (QUIET.get() or json)
     if STDIN in traces:
-        from stlc.cli.check.online import outcome_of_stream
-
         with PULSE.doing(""):  # waits for samples
-            outcomes = [outcome_of_stream(question, talk=talk)]
+            outcomes = [_of_stream(question, talk=talk)]
     else:
-        color = wants_color(sys.stdout)
+        words = judging.words() if json or again is not None else None
         works = [
-            Work(
-                *(name, question, reading.runs, path, min(chunk, MOST_SAMPLES), color, COLOR.get()),
-                certify=certify is not None,
-                table=table is not None,
-                evidence=json or again is not None,
-            )
+            Work(name, question, judging.runs, path, min(chunk, MOST_SAMPLES), table is not None, words)
             for name, path in zip(traces, paths, strict=True)
         ]
         outcomes = all_outcomes(works, Places(jobs, cluster), PULSE.now)
     if table is not None:
         write_table(table, outcomes)
     if junit is not None:
-        write_atomic(junit, junit_xml(outcomes, strict=strict))
-    findings = dict.fromkeys(f for outcome in outcomes for f in (*outcome.errors, *outcome.warnings))
-    code, record = exit_code(outcomes, fail_under, strict=strict), document(outcomes)
+        write_atomic(junit, junit_xml(outcomes, strict=question.strict))
+    verdicts = [outcome.verdict for outcome in outcomes if outcome.verdict is not None]
+    findings = [finding for outcome in outcomes for finding in outcome.errors]
+    findings += [finding for verdict in verdicts for finding in verdict.warnings]
+    code, assurance = exit_code(outcomes, fail_under, strict=question.strict), None
     if certify is not None:
-        code = _bounded(record, outcomes, certify, code)
-    open_ = dict.fromkeys(row.name for outcome in outcomes for row in outcome.rows if strict and row.unjudged)
+        code, assurance = _bounded(outcomes, certify, code)
+    record = _record(outcomes, assurance)
+    open_ = dict.fromkeys(row.name for v in verdicts for row in v if question.strict and row.unjudged)
     compared: list[str] = []
     if repetition is not None:
-        compared = repetition.differences([outcome.entry for outcome in outcomes])
+        compared = repetition.differences([*map(plain, _entries(outcomes))])
         code, compared = int(bool(compared)), compared or [f"the same result as {visible(str(again))}"]
-    show = partial(_print, outcomes, record.get("assurance"), [*open_], compared) if talk else lambda: None
-    return Answer(record, show, code, findings)
+    show = partial(_print, outcomes, assurance, [*open_], compared, judging.replay) if talk else lambda: None
+    return Answer(record, show, code, dict.fromkeys(findings))
+
+
+def _record(
+    outcomes: Sequence[Outcome], assurance: Assessment | None
+) -> Verdict | BoundedVerdict | JudgedFiles:
+    """Result of the command: for one file its verdict, else all verdicts; with bounds, if there are any."""
+    from stlc.assurance.certificate import BoundedVerdict, JudgedFiles, Unjudged
+    from stlc.cli.check.many import overall
+
+    found = _entries(outcomes)
+    if len(found) > 1 or isinstance(found[0], Unjudged):
+        return JudgedFiles(overall(outcomes), tuple(found), assurance)
+    return found[0] if assurance is None else BoundedVerdict.of(found[0], assurance)
+
+
+def _entries(outcomes: Sequence[Outcome]) -> list[Verdict | Unjudged]:
+    from stlc.assurance.certificate import Unjudged
+
+    return [each.verdict or Unjudged(each.name, each.word) for each in outcomes]
+
+
+def _of_stream(question: Question, *, talk: bool) -> Outcome:
+    """Judge the standard input; with `talk`, print each verdict as soon as it is decided.
+
+    Raises:
+        UsageError: U101, there is no specification, or an option needs the whole trace.
+        TraceError: a line is not a sample, or signals are missing or not finite.
+    """
+    from stlc.cli.check.many import Outcome
+    from stlc.monitor.check import judge_lines
+    from stlc.trace.live import MAX_LINE
+
+    begun = time.perf_counter()
+    raw = iter(lambda: sys.stdin.buffer.readline(MAX_LINE + 1), b"")
+    verdict = judge_lines(raw, question, NAME, _tell if talk else lambda *_: None)
+    return Outcome(NAME, verdict, time.perf_counter() - begun)
+
+
+def _tell(decision: Decision, online: Online) -> None:
+    """Print the verdict `decision`, which the monitor `online` has just reached.
+
+    For a requirement that is judged at many instants, only violations are printed.
+    """
+    from stlc.cli.check.text import WORDS, in_unit, signed
+
+    repeated = online.repeats(decision.requirement)
+    if decision.status == "satisfied" and repeated:
+        return
+    low, high = decision.low, decision.high
+    bounds = signed(low) if low == high else f"[{signed(low)}, {signed(high)}]"
+    value = in_unit(bounds, online.rule(decision.requirement).unit)
+    judged = f", judged from t = {decision.time:.10g} s" if repeated else ""
+    now = f"t = {online.time(decision.sample):.10g} s"
+    emit(f"{now}  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")
 
 
 def _repetition(result: Path, files: Sequence[str] | None) -> Repetition:
@@ -226,54 +242,59 @@ def _require_alone(
         raise usage("`--cluster` is for files, and the standard input is judged here")
 
 
-def _bounded(record: CheckResult, outcomes: Sequence[Outcome], share: float, code: int) -> int:
-    """Add bounds on the share of satisfied traces to the record, and return the exit code.
+def _bounded(outcomes: Sequence[Outcome], share: float, code: int) -> tuple[int, Assessment | None]:
+    """Return the exit code, and bounds on the share of satisfied traces, if a trace is in scope.
 
     The code is that of the answer, or `code` if a file cannot be judged; 4 if no trace is in scope.
     """
-    from stlc.cli.certify.traces import assess_outcomes
-    from stlc.cli.check.outcome import INCONCLUSIVE, INVALID
+    from stlc.assurance.certificate import Claim, assess, joined, sample_of_traces
+    from stlc.cli.check.many import INCONCLUSIVE, INVALID
 
-    found = assess_outcomes(outcomes, share)
-    if found is None:
-        return code if code >= INVALID else INCONCLUSIVE
-    record["assurance"] = bounds_record(found)
-    return code if any(outcome.errors for outcome in outcomes) else found.exit_code
+    samples = [sample for each in outcomes if each.verdict and (sample := sample_of_traces(each.verdict))]
+    if not samples:
+        return (code if code >= INVALID else INCONCLUSIVE), None
+    try:
+        found = assess(joined(samples), Claim(share))
+    except ValueError as error:
+        raise usage(f"`--certify`: {error}", "--spec SPEC judges all traces by one specification") from None
+    return (code if any(outcome.errors for outcome in outcomes) else found.exit_code), found
 
 
 def _print(
     outcomes: Sequence[Outcome],
-    assurance: Assurance | None,
+    assurance: Assessment | None,
     unjudged: Sequence[str],
     compared: Sequence[str],
+    replay: Sequence[str],
 ) -> None:
     """Print remarks, errors and warnings, then the results of the judged files, then bounds, if any.
 
-    `unjudged` are the requirements that `--strict` counts as not fully judged, and `compared` the lines of a
-    comparison with a stored result.
+    `unjudged` are the requirements that `--strict` counts as not fully judged, `compared` the lines of a
+    comparison with a stored result, and `replay` the words of a command line that reads the same trace.
 
     A single result is printed in full. Of several results, those that are not satisfied are printed in full,
     and a summary table follows.
     """
     from stlc.cli.check.many import summary
+    from stlc.cli.check.text import lint_text, verdict_text
 
-    shown = set()
+    shown, color, parts = set(), wants_color(sys.stdout), []
     for outcome in outcomes:
-        for line in outcome.remarks:
+        verdict = outcome.verdict
+        for line in () if verdict is None else verdict.notes:
             say(line)
         show_diagnostics(outcome.errors)
-        fresh = [warning for warning in outcome.warnings if warning not in shown]
+        fresh = [] if verdict is None else [each for each in verdict.warnings if each not in shown]
         show_diagnostics(fresh)
         shown.update(fresh)
-    if len(outcomes) == 1:
-        emit(outcomes[0].text, styled=True)
-    else:
-        parts = [outcome.text for outcome in outcomes if outcome.text and outcome.status != "satisfied"]
-        emit("\n\n".join([*parts, summary(outcomes)]), styled=True)
+        if verdict is not None and (len(outcomes) == 1 or verdict.scoped != "satisfied"):
+            parts.append(verdict_text(verdict, replay, color=color))
+    emit("\n\n".join([*parts, *([summary(outcomes)] if len(outcomes) > 1 else [])]), styled=True)
     if unjudged:
         emit(f"not fully judged (--strict): {', '.join(map(visible, unjudged))}")
-    for line in dict.fromkeys(outcome.lint for outcome in outcomes if outcome.lint):
-        emit(line)
+    for line in dict.fromkeys(lint_text(each.verdict) for each in outcomes if each.verdict is not None):
+        if line:
+            emit(line)
     if assurance is not None:
         emit("\n".join(["", *bounds_lines(assurance)]))
     for line in compared:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stlc.cli.framework import documents
 from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides, spec_files
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 
 if TYPE_CHECKING:
-    from stlc.compile.pipeline import Compiled, CompiledRequirement
-    from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.cli.framework.documents import ParsedFile, ParsedFiles
+    from stlc.compile.described import CompiledSpec
 
 Part = Literal["all", "steps", "states", "ir", "ast", "dot"]
 
@@ -36,7 +35,7 @@ def compile_(
     ] = "all",
     watch: Annotated[bool, typer.Option("--watch", help="Compile again whenever a file changes.")] = False,
     json: JsonOption = False,
-) -> Answer[documents.CompileResult]:
+) -> Answer[CompiledSpec | ParsedFile | ParsedFiles]:
     """Show the compiled form of a specification, or its syntax tree.
 
     The compiled form lists the intervals of the temporal operators in seconds and in steps, the states that
@@ -63,9 +62,7 @@ def compile_(
     raise typer.Exit
 
 
-def _trees(
-    names: Sequence[str], show: Literal["ast", "dot"]
-) -> Answer[documents.ParsedFile | documents.ParsedFiles]:
+def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFile | ParsedFiles]:
     """Return the answer of `stlc compile` that shows the syntax trees of the specification files `names`.
 
     If `show` is "ast", the trees are printed as indented text. If it is "dot", they are printed as a graph
@@ -84,7 +81,7 @@ def _trees(
             findings += error.diagnostics
     if findings:
         raise SpecError(*findings)
-    trees: list[documents.ParsedFile] = [
+    trees: list[ParsedFile] = [
         {"file": name, "tree": as_values(spec)} for name, spec in zip(names, specs, strict=True)
     ]
     return Answer(
@@ -112,12 +109,13 @@ def _compiled(
     system: str | None,
     set_: list[str] | None,
     show: Literal["all", "steps", "states", "ir"],
-) -> Answer[documents.CompiledSpec]:
+) -> Answer[CompiledSpec]:
     """Compile the specification `path` for a system, without importing torch; print the part `show`.
 
     `system` is the system file of `--system`, and `set_` are the values of `--set`. The specification is
     compiled for recorded traces if the system file names it as the judge of closed-loop runs.
     """
+    from stlc.compile.described import CompiledSpec
     from stlc.compile.dump import dump
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose, compile_spec
@@ -143,76 +141,6 @@ def _compiled(
         show_diagnostics(compiled.warnings)
         emit(dump(compiled, show).rstrip("\n"))
 
-    return Answer(_record(compiled, decl), tell, diagnostics=compiled.warnings)
-
-
-def _record(compiled: Compiled, decl: SystemDecl) -> documents.CompiledSpec:
-    from stlc.provenance import sha256
-
-    steps = compiled.grid.horizon or 0
-    source = compiled.spec.source
-    added: list[documents.AddedState] = [
-        {
-            "name": each.column.name,
-            "kind": "param",
-            "initial": None,
-            "range": [each.column.low, each.column.high],
-            "about": f"{each.text}, drawn for every trajectory",
-        }
-        for each in compiled.parameters
-    ]
-    added += [
-        {
-            "name": timer.name,
-            "kind": timer.kind,
-            "initial": timer.initial,
-            "range": [timer.low, timer.high],
-            "about": timer.about,
-        }
-        for timer in compiled.timers
-    ]
-    return {
-        "spec": source.name,
-        "spec_sha256": sha256(source.text),
-        "system": str(decl.path),
-        "dt": float(decl.dt),
-        "horizon": {"seconds": float(decl.dt * steps), "steps": steps},
-        "states": [*decl.signature.names, *(state["name"] for state in added)],
-        "added": added,
-        "safety": [rule.name for rule in compiled.safety],
-        "requirements": [_requirement(rule, float(decl.dt)) for rule in compiled.requirements],
-    }
-
-
-def _requirement(rule: CompiledRequirement, dt: float) -> documents.RequirementInSteps:
-    return {
-        "name": rule.name,
-        "doc": rule.doc,
-        "tags": sorted(rule.tags),
-        "weight": rule.weight,
-        "scale": rule.scale,
-        "reach": {"seconds": rule.reach * dt, "steps": rule.reach},
-        "intervals": list(_intervals(rule, dt)),
-    }
-
-
-def _intervals(rule: CompiledRequirement, dt: float) -> Iterator[documents.WrittenInterval]:
-    """Yield a record of each interval of a temporal operator in the requirement `rule`.
-
-    The ends of the interval are given in seconds and in steps. If the upper end is None, the interval extends
-    to the end of the trace. `dt` is the time step in seconds.
-    """
-    from stlc.compile.ir import nodes as ir
-    from stlc.compile.ir.traverse import nodes
-
-    for node in nodes(rule.formula):
-        if not isinstance(node, ir.Windowed):
-            continue
-        steps = [node.window.lo, node.window.hi]
-        yield {
-            "operator": node.op,
-            "steps": steps,
-            "seconds": [None if step is None else step * dt for step in steps],
-            "written": node.span.text if node.span else "",
-            "line": node.span.line if node.span else None,
-        }
+    return Answer(
+        CompiledSpec.of(compiled, str(decl.path), decl.signature.names), tell, diagnostics=compiled.warnings
+    )

@@ -7,16 +7,18 @@ import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stlc.cli.framework.documents import InstallationFinding, InstallationReport
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import StlcError
 from stlc.extras import commands
 from stlc.plugins import installed
+
+if TYPE_CHECKING:
+    from stlc.cli.framework.documents import InstallationFinding, InstallationReport
 
 MISSING = 5
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Annotated
@@ -12,15 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.framework import documents
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, JsonOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, usage
+from stlc.grammar.show.manual import CodeList, read_page
 from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
-    from stlc.controller.guard.coverage import Axis, Chance
+    from stlc.controller.guard.coverage import Chance, Guarantee
+    from stlc.grammar.show.manual import Page, RequirementInWords, SpecInWords
+    from stlc.monitor.explain.tree import Explanation
 
 _CODE = re.compile(r"[A-Za-z]\d{3}")
 _TOPICS = ("precedence",)
@@ -47,13 +48,7 @@ def explain(
     ] = False,
     reading: given.Traces = given.TRACES,
     json: JsonOption = False,
-) -> Answer[
-    documents.CodeList
-    | documents.ManualPage
-    | documents.SpecInWords
-    | documents.Explanation
-    | documents.Guarantee
-]:
+) -> Answer[CodeList | Page | SpecInWords | Explanation | Guarantee]:
     """Explain a code, a specification, or the violations of a trace.
 
     A code's page has a wrong and a right example; without an argument all codes are listed. `precedence`
@@ -63,7 +58,7 @@ def explain(
     if guarantee:
         return _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_))
     if what is None:
-        return Answer({"codes": CODES}, lambda: emit(table(list(CODES.items()), indent="")))
+        return Answer(CodeList(dict(CODES)), lambda: emit(table(list(CODES.items()), indent="")))
     if _CODE.fullmatch(what):
         return _page(_code(what.upper()))
     if what in _TOPICS:
@@ -85,107 +80,30 @@ def _code(code: str) -> str:
     return code
 
 
-def _page(name: str) -> Answer[documents.ManualPage]:
+def _page(name: str) -> Answer[Page]:
     page = read_page(name)
     assert page is not None, f"{name} has no page"
-    return Answer(
-        {
-            "name": name,
-            "title": page.title,
-            "text": page.text,
-            "examples": [
-                {"language": example.language, "notes": list(example.notes), "text": example.body}
-                for example in page.examples
-            ],
-        },
-        lambda: emit("\n".join([page.title, "", *_plain_lines(page.text)]).rstrip()),
-    )
+    return Answer(page, lambda: emit("\n".join([page.title, "", *_plain_lines(page.text)]).rstrip()))
 
 
-def _spec(name: str, wanted: list[str]) -> Answer[documents.SpecInWords]:
+def _spec(name: str, wanted: list[str]) -> Answer[SpecInWords]:
     """Translate requirements of a specification into English: those in `wanted`, or all if it is empty."""
     from stlc.files import find_spec, read_source
-    from stlc.grammar import ast
     from stlc.grammar.parse.parser import parse
-    from stlc.grammar.show.english import Meanings
+    from stlc.grammar.show.manual import in_words
 
-    spec = parse(read_source(find_spec(name)))
-    items = [item for item in spec.items if isinstance(item, ast.Require | ast.Assume)]
-    for one in wanted:
-        if one not in [item.name for item in items]:
-            advice = did_you_mean(one, [item.name for item in items])
-            raise usage(f"`{name}` has no requirement `{one}`", *advice)
-    meanings = Meanings(spec)
-    found: list[documents.RequirementInWords] = [
-        {
-            "name": item.name,
-            "kind": "require" if isinstance(item, ast.Require) else "assume",
-            "tags": [tag.name for tag in item.tags],
-            "doc": item.doc,
-            "sentence": meanings.sentence(item),
-            "where": dict(meanings.of(item)),
-        }
-        for item in items
-        if not wanted or item.name in wanted
-    ]
-    text = "\n\n".join("\n".join(_in_words(each)) for each in found)
-    return Answer({"spec": name, "requirements": found}, lambda: emit(text or f"{name} requires nothing"))
+    found = in_words(parse(read_source(find_spec(name))), name, wanted)
+    text = "\n\n".join("\n".join(_in_words(each)) for each in found.requirements)
+    return Answer(found, lambda: emit(text or f"{name} requires nothing"))
 
 
-def _in_words(requirement: documents.RequirementInWords) -> Iterator[str]:
-    tags = f"  [{', '.join(requirement['tags'])}]" if requirement["tags"] else ""
-    yield requirement["name"] + (" (assumed)" if requirement["kind"] == "assume" else "") + tags
-    yield from (f"  # {line}" for line in requirement["doc"].splitlines())
-    yield fill(requirement["sentence"], 96, initial_indent="  ", subsequent_indent="  ")
-    for name, meaning in requirement["where"].items():
+def _in_words(requirement: RequirementInWords) -> Iterator[str]:
+    tags = f"  [{', '.join(requirement.tags)}]" if requirement.tags else ""
+    yield requirement.name + (" (assumed)" if requirement.kind == "assume" else "") + tags
+    yield from (f"  # {line}" for line in requirement.doc.splitlines())
+    yield fill(requirement.sentence, 96, initial_indent="  ", subsequent_indent="  ")
+    for name, meaning in requirement.where.items():
         yield fill(f"{name}: {meaning}", 96, initial_indent="    where ", subsequent_indent="          ")
-
-
-# -------------------------------------------------------------------------- pages of codes
-
-FOLDER = Path(__file__).parents[2] / "pages"
-
-_FENCE = re.compile(r"^```(?P<language>\w*)(?P<notes>[^\n]*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
-
-
-@dataclass(frozen=True, slots=True)
-class Example:
-    """An example in a manual page: a code block with a language and notes.
-
-    Attributes:
-        language: `stl`, `yaml`, `csv` or `console`.
-        notes: words after the language, such as `wrong` and `right`.
-        body: text of the block.
-    """
-
-    language: str
-    notes: tuple[str, ...]
-    body: str
-
-
-@dataclass(frozen=True, slots=True)
-class Page:
-    """Manual page of a code (such as E101): its headline and its text in Markdown."""
-
-    title: str
-    text: str
-
-    @property
-    def examples(self) -> tuple[Example, ...]:
-        """Examples in the page, in order."""
-        return tuple(
-            Example(match["language"], tuple(match["notes"].split()), match["body"])
-            for match in _FENCE.finditer(self.text)
-        )
-
-
-def read_page(name: str) -> Page | None:
-    """Return the manual page `name` (an error code or `precedence`); None if there is no such page."""
-    path = FOLDER / f"{name}.md"
-    if not path.is_file():
-        return None
-    title, _, text = path.read_text(encoding="utf-8").partition("\n")
-    return Page(title.removeprefix("# "), text.strip("\n") + "\n")
 
 
 def _plain_lines(text: str) -> Iterator[str]:
@@ -206,15 +124,8 @@ def _plain_lines(text: str) -> Iterator[str]:
 
 # -------------------------------------------------------------------------- guarantees
 
-ASSUMED = (
-    "there is a prefix of T0 actions such that every prefix within the radius of it, in every control at "
-    "every step, leads to a plan that satisfies the specification when the policy finishes it",
-    "that prefix lies anywhere in the ranges of the controls with equal probability, independently of the "
-    "grid",
-)
 
-
-def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[documents.Guarantee]:
+def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[Guarantee]:
     """Compute lower bounds on the probability that the backup policy of a run finds a satisfying plan.
 
     The backup policy tries many candidates for the first steps of a plan (its prefix); the candidates form a
@@ -223,30 +134,20 @@ def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[doc
     returned record lists all assumptions. `runs` is the folder of all runs, and `overrides` gives new values
     of constants.
     """
-    from stlc.controller.guard.candidates import grid_of
-    from stlc.controller.guard.coverage import axes_of, chances
+    from stlc.controller.guard.coverage import guarantee
     from stlc.controller.training.run import task_of_run
     from stlc.rundir import RunDir
 
     folder = RunDir.open(run, runs)
-    task = task_of_run(folder, overrides)
-    grid = grid_of(task)
-    axes, found = axes_of(task, grid), chances(task, grid)
-    return Answer(
-        {
-            "run": folder.name,
-            "assumptions": list(ASSUMED),
-            "controls": [documents.record(documents.TriedControl, axis) for axis in axes],
-            "chances": [documents.record(documents.ChanceOfPrefix, each) for each in found],
-        },
-        lambda: emit("\n".join(_guarantee_lines(folder.name, axes, found))),
-    )
+    found = guarantee(folder.name, task_of_run(folder, overrides))
+    return Answer(found, lambda: emit("\n".join(_guarantee_lines(found))))
 
 
-def _guarantee_lines(run: str, axes: Sequence[Axis], found: Sequence[Chance]) -> list[str]:
+def _guarantee_lines(told: Guarantee) -> list[str]:
+    run, axes, found = told.run, told.controls, told.chances
     tried = ", ".join(f"{len(axis.values)} of {axis.name} in [{axis.low:g}, {axis.high:g}]" for axis in axes)
     lines = [f"run {run}: the backup policy tries {tried} at every step of a prefix", "", "Suppose that"]
-    lines += [fill(each, 96, initial_indent="  - ", subsequent_indent="    ") for each in ASSUMED]
+    lines += [fill(each, 96, initial_indent="  - ", subsequent_indent="    ") for each in told.assumptions]
     lines += ["", "Then a prefix of the grid leads to satisfaction with a probability of at least", ""]
     radii = list(dict.fromkeys(each.radius for each in found))
     rows = []

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.documents import ExportCheck, ExportedRun, record
 from stlc.cli.framework.options import PythonOption, RunArgument, RunsOption
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 from stlc.foreign import driving
+
+if TYPE_CHECKING:
+    from stlc.export.write import Exported
 
 
 @command(
@@ -40,7 +42,7 @@ def export(
     ] = None,
     python: PythonOption = False,
     runs: RunsOption = Path("runs"),
-) -> Answer[ExportedRun]:
+) -> Answer[Exported]:
     """Export a trained controller, monitor included.
 
     `torch` is a torch.export program that maps states to plans and their robustness. `c` is a C99 header with
@@ -82,15 +84,4 @@ def export(
         for name in done.kept:
             say(f"kept {visible(str(shown / name))}, which was there and differs")
 
-    return Answer(
-        {
-            "run": opened.dir.shown,
-            "target": target,
-            "folder": str(shown),
-            "files": list(done.files),
-            "kept": list(done.kept),
-            "checked": None if found is None else record(ExportCheck, found),
-            "latency": None if taken is None else {"median_ms": taken.median, "p99_ms": taken.p99},
-        },
-        show,
-    )
+    return Answer(done, show)

@@ -14,14 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from stlc.cli.certify.text import GuardOption
-from stlc.cli.check.outcome import INCONCLUSIVE
+from stlc.cli.check.many import INCONCLUSIVE
 from stlc.cli.falsify import findings
-from stlc.cli.framework.assured import (
-    FalsifiedRequirement,
-    FalsifiedSystem,
-    FalsifyResult,
-    ReplayedCounterexample,
-)
 from stlc.cli.framework.options import (
     MOST_SEED,
     ClusterOption,
@@ -48,10 +42,16 @@ if TYPE_CHECKING:
     import numpy as np
 
     from stlc.assurance.drive_simulator import DriveSimulator
-    from stlc.assurance.falsify import Counterexample, Falsification
+    from stlc.assurance.falsify import Falsification
     from stlc.assurance.model_simulator import ModelSimulator
     from stlc.assurance.plant_simulator import PlantSimulator
     from stlc.assurance.sharing import SimulatorWorkers
+    from stlc.cli.framework.assured import (
+        FalsifiedRequirement,
+        FalsifiedSystem,
+        ReplayedCounterexample,
+        ReplayedFinding,
+    )
     from stlc.controller.parallel.workers import CallFiles
     from stlc.trace import Trace
 
@@ -110,7 +110,7 @@ def falsify(
     ] = None,
     set_: SetOption = None,
     runs: RunsOption = RUNS,
-) -> Answer[FalsifyResult]:
+) -> Answer[FalsifiedSystem | ReplayedCounterexample | ReplayedFinding]:
     """Search for simulations that violate requirements.
 
     Of a system without controls, the search chooses initial states, parameters and input signals; of a run,
@@ -374,9 +374,9 @@ def _written(
         "simulations": result.simulations,
         "inconclusive": result.inconclusive,
         "least": result.least,
-        "found": None if result.found is None else _violation(result.found),
-        "simpler": None if result.shrunk is None else _violation(result.shrunk),
-        "spurious": [_violation(each) for each in result.spurious],
+        "found": result.found,
+        "simpler": result.shrunk,
+        "spurious": list(result.spurious),
         "coverage": result.coverage,
         "rejected": result.rejected,
         "seconds": result.seconds,
@@ -384,15 +384,6 @@ def _written(
         "file": None if best is None else str(path),
         "replay": None if best is None else _command(source, path),
         "trace_margin": None if best is None else margin,
-    }
-
-
-def _violation(found: Counterexample) -> Any:
-    return {
-        "margin": found.margin,
-        "half_step": found.half_step,
-        "strategy": found.strategy,
-        "simulation": found.simulation,
     }
 
 
@@ -407,7 +398,9 @@ def _command(source: _Source, path: Path) -> str:
     return shlex.join([*words, "--replay", str(path)])
 
 
-def _replayed(target: _Target, path: Path, overrides: Mapping[str, str], runs: Path) -> Answer[FalsifyResult]:
+def _replayed(
+    target: _Target, path: Path, overrides: Mapping[str, str], runs: Path
+) -> Answer[FalsifiedSystem | ReplayedCounterexample | ReplayedFinding]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
     from stlc.compile.semantics.tolerance import TOLERANCE
     from stlc.trace import load_trace
@@ -569,17 +562,17 @@ def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:
             f"  pairwise coverage of the search space {share(each['coverage'])}; this is no proof",
             *told,
         ]
-    half = "" if found["half_step"] is None else f", {float(found['half_step']):.4g} at half the time step"
+    half = "" if found.half_step is None else f", {found.half_step:.4g} at half the time step"
     half = half.replace("nan at", "but no verdict at")
     lines = [
-        f"{name}: violated, robustness {float(found['margin']):.4g}{half}; simulation "
-        f"{found['simulation']:,}, {found['strategy']}{spurious}"
+        f"{name}: violated, robustness {found.margin:.4g}{half}; simulation "
+        f"{found.simulation:,}, {found.strategy}{spurious}"
     ]
     simpler = each["simpler"]
-    if simpler is not None and simpler["margin"] != found["margin"]:
-        lines.append(f"  simpler: robustness {float(simpler['margin']):.4g}")
+    if simpler is not None and simpler.margin != found.margin:
+        lines.append(f"  simpler: robustness {simpler.margin:.4g}")
     kept = each["trace_margin"]
-    if kept is not None and kept != (simpler or found)["margin"]:
+    if kept is not None and kept != (simpler or found).margin:
         lines += [
             f"  the plant does not repeat itself: simulated again for the trace, {float(kept):.4g}",
             "  (`limit: {fresh: true}` starts a process per simulation; seed random numbers in `reset`)",

@@ -5,15 +5,17 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from difflib import unified_diff
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.documents import FormattedFiles
 from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, spec_files
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, SpecError
+
+if TYPE_CHECKING:
+    from stlc.cli.framework.documents import FormattedFiles
 
 DIFFERS, INVALID = 1, 3
 

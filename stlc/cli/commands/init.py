@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.documents import CreatedFiles
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
@@ -19,6 +18,7 @@ from stlc.files import SPECS, SYSTEMS, write_atomic
 from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
+    from stlc.cli.framework.documents import CreatedFiles
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.signature import Column
 

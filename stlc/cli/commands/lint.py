@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stlc.cli.framework.documents import LintedFiles
 from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, SystemOption, spec_files
 from stlc.cli.framework.output import Answer, emit, emit_json, say, wants_color
 from stlc.cli.framework.program import command
@@ -21,6 +20,7 @@ from stlc.source import Span
 from stlc.version import __version__
 
 if TYPE_CHECKING:
+    from stlc.cli.framework.documents import LintedFiles
     from stlc.lint.lint import Selection, Surroundings
     from stlc.source import Source
 

@@ -21,7 +21,6 @@ from stlc.cli.framework.options import (
     require_separate,
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
-from stlc.cli.framework.plan_documents import Plans, PlanTubes
 from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
 from stlc.registry import PLANNERS
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from stlc.assurance.verification.tubes import TubeModel
+    from stlc.cli.framework.plan_documents import Plans, PlanTubes
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner import PlanResult
     from stlc.controller.training.config import PlannerChoice

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.framework.documents import PlottedTrace
 from stlc.cli.framework.options import require_separate
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
@@ -17,6 +16,7 @@ from stlc.diagnostics import usage
 from stlc.escape import visible
 
 if TYPE_CHECKING:
+    from stlc.cli.framework.documents import PlottedTrace
     from stlc.grammar import ast
     from stlc.monitor.verdict import Monitor
     from stlc.signature import Column
@@ -55,8 +55,7 @@ def plot(
     trace are shown unless --trace selects one. With --places all paths are drawn over the regions of the
     requirements, such as `dock` in `[x, y] in dock`. The suffix of -o selects the format: .svg, .png or .pdf.
     """
-    from stlc.cli.check.judge import load
-    from stlc.monitor.explain.report import explain_all
+    from stlc.monitor.check import load
     from stlc.rundir import recorded_trace
     from stlc.view import require_drawing
     from stlc.view.signals import draw_signals
@@ -81,7 +80,7 @@ def plot(
         margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
         choices = _choices(recorded, margins, trace, path.name)
         drawn = _as_declared(recorded, monitor.spec)
-        marks = marks_of(verdict, explain_all(verdict), drawn)
+        marks = marks_of(verdict, drawn)
         picture = draw_signals(drawn, margins, choices, units, marks)
         shown = [choice.index for choice in choices]
     _save(picture, target)

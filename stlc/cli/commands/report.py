@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from stlc.cli.framework.documents import WrittenReport, verdict_record
 from stlc.cli.framework.options import PythonOption, RunArgument, RunsOption
 from stlc.cli.framework.output import PULSE, Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
 from stlc.foreign import driving
+
+if TYPE_CHECKING:
+    from stlc.cli.framework.documents import WrittenReport
 
 
 @command("stlc report latest")
@@ -38,7 +41,7 @@ def report(
     learning = learning_of_run(folder, Commands.of(folder.shown, record))
     result: WrittenReport = {"run": folder.shown, "report": path}
     if learning is not None:
-        result["verdict"] = verdict_record(learning)
+        result["verdict"] = learning
 
     def show() -> None:
         if world and not python:

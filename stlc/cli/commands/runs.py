@@ -6,11 +6,10 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stlc.cli.framework import documents
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import RunArgument, RunsOption
 from stlc.cli.framework.output import Answer, emit, say, table
@@ -18,6 +17,9 @@ from stlc.cli.framework.program import group, subcommand
 from stlc.diagnostics import StlcError, usage
 from stlc.escape import visible
 from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, every_run, remove_run
+
+if TYPE_CHECKING:
+    from stlc.cli.framework import documents
 
 Sort = Literal["time", "acc", "name"]
 

@@ -9,10 +9,11 @@ import typer
 
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
+from stlc.cli.framework.results import RESULTS, result_of
 from stlc.diagnostics import usage
 from stlc.registry import did_you_mean
 
-SYSTEM_FILE, PLANT_FILE = "system-file", "plant-file"
+SYSTEM_FILE, PLANT_FILE, LINE = "system-file", "plant-file", "robustness-line"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
@@ -38,9 +39,7 @@ def names() -> list[str]:
     Most schemas describe the output of a command. `system-file/1` describes system files, and
     `plant-file/1` plant files.
     """
-    from stlc.cli.framework.documents import LINES, RESULTS
-
-    return sorted(f"{name}/1" for name in (*RESULTS, *LINES, SYSTEM_FILE, PLANT_FILE))
+    return sorted(f"{name}/1" for name in (*RESULTS, LINE, SYSTEM_FILE, PLANT_FILE))
 
 
 def load_schema(name: str) -> dict[str, Any]:
@@ -65,10 +64,11 @@ def load_schema(name: str) -> dict[str, Any]:
         from stlc.plants.declaration import plant_schema
 
         return {"$schema": _DIALECT, "title": wanted, **plant_schema()}
-    from stlc.cli.framework.documents import LINES, RESULTS, DocumentRecord, schema_of
+    from stlc.cli.framework.documents import DocumentRecord, RobustnessLine
+    from stlc.records import schema_of
 
-    if command in LINES:
-        return {"$schema": _DIALECT, "title": wanted, **schema_of(LINES[command])}
+    if command == LINE:
+        return {"$schema": _DIALECT, "title": wanted, **schema_of(RobustnessLine)}
     frame = schema_of(DocumentRecord)
-    frame["properties"] |= {"schema": {"const": wanted}, "result": schema_of(RESULTS[command] | None)}
+    frame["properties"] |= {"schema": {"const": wanted}, "result": schema_of(result_of(command))}
     return {"$schema": _DIALECT, "title": wanted, **frame}

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.certify.text import CertifyOption, bounds_lines, bounds_record, require_claim
-from stlc.cli.framework.assured import Assurance
-from stlc.cli.framework.documents import ScenarioResult, SimulateResult, Simulation
+from stlc.cli.certify.text import CertifyOption, bounds_lines, require_claim
 from stlc.cli.framework.options import (
     AgentsOption,
     DriveStepsOption,
@@ -39,12 +37,15 @@ from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.diagnostics import Diagnostic, RunError, usage
+from stlc.jsontext import plain
 from stlc.registry import GUARDS, PLANNERS
 from stlc.units import time_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from stlc.assurance.certificate import Assessment
+    from stlc.cli.framework.documents import ScenarioResult, Simulation
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.deployment.simulator import Setting
     from stlc.controller.evaluation.deployment import Deployment
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from stlc.controller.training.config import PlannerChoice
     from stlc.controller.training.run import Run
     from stlc.dynamics.declaration.deployment import ScenarioDecl
+    from stlc.plants.judge import PlantSimulation
 
 ALL, USUAL = "all", "disturbed"
 SCENARIOS = "eval/scenarios.json"
@@ -150,7 +152,7 @@ def simulate(
     pictures: PicturesOption = False,
     window: Annotated[bool, typer.Option("--window", help="Show robots in PyBullet's window, too.")] = False,
     json: JsonOption = False,
-) -> Answer[SimulateResult]:
+) -> Answer[Simulation | PlantSimulation]:
     """Deploy a trained policy in the world of its system.
 
     RUN is by default the newest run. With --method, a planner controls the system: without training, if RUN
@@ -389,7 +391,7 @@ def _satisfied(document: Simulation, guard: str) -> float:
     return min(float(each["obeyed"] / each["count"]) for each in runs)
 
 
-def _bounds(document: Simulation, guard: str) -> dict[str, Assurance]:
+def _bounds(document: Simulation, guard: str) -> dict[str, Any]:
     """Bounds on the drives with a guard: scenario -> bounds; empty without `--certify`."""
     each = {"": document["guards"], **{k: v["guards"] for k, v in document.get("scenarios", {}).items()}}
     return {name: guards[guard]["assurance"] for name, guards in each.items() if "assurance" in guards[guard]}
@@ -507,13 +509,13 @@ def _save(
             if assurance is None:
                 say(f"guard `{name}`: no bounds, as every drive violates an assumption of the specification")
             else:
-                made["guards"][name]["assurance"] = assurance
+                made["guards"][name]["assurance"] = plain(assurance)
     document: Simulation = made
     run.dir.write_json(SIMULATION, document)
     return document
 
 
-def _assured(run: Run, found: Deployment, rules: Rules | None, share: float) -> Assurance | None:
+def _assured(run: Run, found: Deployment, rules: Rules | None, share: float) -> Assessment | None:
     """Bounds on the share of drives that satisfy everything; the number of drives was fixed in advance.
 
     None if every drive violates an assumption of the specification.
@@ -522,7 +524,7 @@ def _assured(run: Run, found: Deployment, rules: Rules | None, share: float) -> 
     from stlc.assurance.drives import sample_of
 
     sample = sample_of(run.task, found.recording, rules)
-    return bounds_record(assess(sample, Claim(share, online=True))) if sample.drives else None
+    return assess(sample, Claim(share, online=True)) if sample.drives else None
 
 
 # ------------------------------------------------------------------------- pictures

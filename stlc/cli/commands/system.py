@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework import documents
 from stlc.cli.framework.options import SeedOption, SetOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.cli.framework.program import group, subcommand
@@ -17,6 +16,7 @@ from stlc.escape import visible
 if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
     from stlc.dynamics.declaration.decl import SystemDecl
+    from stlc.dynamics.declaration.facts import ListedSystem, SystemFacts, SystemList
     from stlc.dynamics.robots.crosscheck import Comparison
 
 _File = Annotated[
@@ -28,9 +28,10 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 
 
 @subcommand(GROUP, "show", "stlc system show car.yaml")
-def show(system: _File, set_: SetOption = None) -> Answer[documents.SystemFacts]:
+def show(system: _File, set_: SetOption = None) -> Answer[SystemFacts]:
     """Show the declarations of a system file, from states to scenarios."""
     from stlc.dynamics.declaration.decl import describe as in_words
+    from stlc.dynamics.declaration.facts import SystemFacts
 
     decl = _load(system, parse_overrides(set_))
 
@@ -39,7 +40,7 @@ def show(system: _File, set_: SetOption = None) -> Answer[documents.SystemFacts]
         show_diagnostics(decl.warnings)
         emit(in_words(decl))
 
-    return Answer(_facts(decl), tell, diagnostics=decl.warnings)
+    return Answer(SystemFacts(decl), tell, diagnostics=decl.warnings)
 
 
 @subcommand(GROUP, "check", "stlc system check car.yaml", "stlc system check examples/car.yaml --steps 64")
@@ -50,13 +51,15 @@ def check(
     ] = 32,
     seed: SeedOption = 0,
     set_: SetOption = None,
-) -> Answer[documents.SystemFacts]:
+) -> Answer[SystemFacts]:
     """Validate a system file with random rollouts.
 
     With --steps 0 the file is only read, without torch. Otherwise, random rollouts are simulated. They detect
     dynamics that diverge, and conditions in the section `init` that reject nearly all states. Kinematics from
     a URDF are compared with pytorch-kinematics if that is installed.
     """
+    from stlc.dynamics.declaration.facts import DrivenSteps, SystemFacts
+
     decl = _load(system, parse_overrides(set_))
     warnings = _roll_out(decl, steps, seed) if steps else decl.warnings
     compared = _kinematics(decl) if steps else []
@@ -72,27 +75,25 @@ def check(
         size = f"{_counted(len(decl.signature), 'state')}, {_counted(len(decl.controls), 'control')}"
         emit(f"{visible(str(decl.path))} is valid: {size}{ran}")
 
-    result = _facts(decl)
-    result["driven"] = {"steps": steps, "seed": seed}
-    result["kinematics"] = [
-        {"name": one.name, "distance_m": one.distance, "why_not": one.why or None} for one in compared
-    ]
+    result = SystemFacts(decl, DrivenSteps(steps, seed), tuple(compared))
     return Answer(result, tell, diagnostics=warnings)
 
 
 @subcommand(GROUP, "list", "stlc system list")
-def list_() -> Answer[documents.SystemList]:
+def list_() -> Answer[SystemList]:
     """List the systems that are found by name."""
+    from stlc.dynamics.declaration.facts import SystemList
+
     found = list(_all_systems())
 
     def tell() -> None:
         if found:
-            rows = [(each["name"], each["path"], each["doc"]) for each in found]
+            rows = [(each.name, each.path, each.doc) for each in found]
             emit(table(rows, header=("name", "file", "")))
         else:
             say("no system here; write one: stlc init --system cart")
 
-    return Answer({"systems": found}, tell)
+    return Answer(SystemList(tuple(found)), tell)
 
 
 _DRAWN = 256
@@ -146,44 +147,10 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
     return [compared(function) for function in robots]
 
 
-def _facts(decl: SystemDecl) -> documents.SystemFacts:
-    """Record of the declarations of a system, which `stlc system show` prints."""
-    flow = {assign.name: assign.text for assign in decl.flow}
-    return {
-        "name": decl.name,
-        "doc": decl.doc,
-        "path": str(decl.path),
-        "dt": float(decl.dt),
-        "horizon": {"seconds": float(decl.dt * decl.horizon), "steps": decl.horizon},
-        "states": [
-            documents.record(
-                documents.StateFacts,
-                column,
-                **{"unit": str(column.unit), "labels": dict(column.labels), "flow": flow.get(column.name)},
-            )
-            for column in decl.signature.columns
-        ],
-        "controls": [
-            documents.record(documents.ControlRange, control, unit=str(control.unit))
-            for control in decl.controls
-        ],
-        "inputs": [
-            documents.record(
-                documents.InputSignal,
-                each,
-                **{"unit": str(each.unit), "seconds": float(each.duration), "columns": list(each.columns)},
-            )
-            for each in decl.inputs
-        ],
-        "constants": {name: value for name, (value, _) in decl.constants.items()},
-        "jumps": [jump.name for jump in decl.jumps],
-        "situations": [situation.name for situation in decl.init.mixture],
-    }
-
-
-def _all_systems() -> Iterator[documents.ListedSystem]:
+def _all_systems() -> Iterator[ListedSystem]:
     """Yield a record of every system file in the search path: name, path, and description or first error."""
     from stlc.diagnostics import StlcError
+    from stlc.dynamics.declaration.facts import ListedSystem
     from stlc.dynamics.declaration.load import load_system_decl
     from stlc.files import SYSTEMS
 
@@ -198,6 +165,6 @@ def _all_systems() -> Iterator[documents.ListedSystem]:
             except StlcError as error:
                 finding = error.diagnostics[0]
                 invalid = f"invalid: {finding.code}, {finding.message}"
-                yield {"name": path.stem, "path": str(path), "doc": invalid}
+                yield ListedSystem(path.stem, str(path), invalid)
             else:
-                yield {"name": decl.name, "path": str(path), "doc": decl.doc}
+                yield ListedSystem(decl.name, str(path), decl.doc)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.documents import TrainedRun, TrainedRuns
 from stlc.cli.framework.options import (
     MOST_SEED,
     ClusterOption,
@@ -41,6 +40,7 @@ from stlc.rundir import RUNS, RunDir
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from stlc.cli.framework.documents import TrainedRun, TrainedRuns
     from stlc.cli.train.session import Session
     from stlc.controller.problem.task import Task
     from stlc.controller.training.budget import StepSchedule

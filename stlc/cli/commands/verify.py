@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.certify.text import floored
-from stlc.cli.framework.assured import Verified, VerifiedMode
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
     FailUnderOption,
@@ -30,10 +29,10 @@ from stlc.escape import visible
 from stlc.foreign import driving
 
 if TYPE_CHECKING:
-    from stlc.assurance.verification.around import Around
     from stlc.assurance.verification.loop import NetworkLoop
     from stlc.assurance.verification.plans import PolicySource
-    from stlc.assurance.verification.verify import ModeResult, Verification
+    from stlc.assurance.verification.verified import Verified
+    from stlc.assurance.verification.verify import Verification
 
 _MOST = 3
 """Counterexamples that the text shows."""
@@ -98,6 +97,7 @@ def verify(
 
     from stlc.assurance.verification.examine import SharedExaminer
     from stlc.assurance.verification.plans import PolicySource
+    from stlc.assurance.verification.verified import Verified
     from stlc.assurance.verification.verify import Verifier
     from stlc.controller.parallel.workers import LocalProcesses
     from stlc.controller.training.budget import clock_of
@@ -124,7 +124,7 @@ def verify(
             found = verifier.run(seconds, boxes=boxes)
     with PULSE.doing("proving boxes around random states"):
         near = verifier.around(states, seed=seed)
-    record = _record(name, found, near)
+    record = Verified(name, found, near)
     lost = () if shared is None or not shared.lost else (_lost(shared.lost),)
 
     def show() -> None:
@@ -181,75 +181,37 @@ def _exit_code(found: Verification, fail_under: float | None) -> int:
     return 4 if found.open > 0.0 else 0
 
 
-def _record(run: str, found: Verification, near: Sequence[Around]) -> Verified:
-    """Result as a record; `near` has one entry for each mode."""
-    from stlc.assurance.bounds import clopper_pearson_lower
-
-    drawn, proved, violated = (
-        sum(getattr(each, name) for each in near) for name in ("states", "proved", "violated")
-    )
-    return {
-        "run": run,
-        "seconds": found.seconds,
-        "proved": found.proved,
-        "refuted": found.refuted,
-        "open": found.open,
-        "states": drawn,
-        "states_proved": proved,
-        "states_violated": violated,
-        "states_share": clopper_pearson_lower(proved, drawn) if drawn else 0.0,
-        "modes": [
-            _mode(each, found.probability(each), around)
-            for each, around in zip(found.modes, near, strict=True)
-        ],
-    }
-
-
-def _mode(each: ModeResult, probability: float, near: Around) -> VerifiedMode:
-    return {
-        "name": each.mode.name,
-        "probability": probability,
-        "proved": each.proved,
-        "refuted": each.refuted,
-        "open": each.open,
-        "proved_boxes": len(each.boxes),
-        "examined_boxes": each.examined,
-        "witness": None if each.witness is None else dict(each.witness.state),
-        "robustness": None if each.witness is None else each.witness.robustness,
-        "states": near.states,
-        "states_proved": near.proved,
-        "states_violated": near.violated,
-    }
-
-
-def _lines(found: Verified) -> Iterator[str]:
+def _lines(told: Verified) -> Iterator[str]:
     """Lines of text that show the result of `stlc verify`."""
-    shares = [(mode["proved"], mode["refuted"], mode["open"]) for mode in found["modes"]]
+    found, modes = told.found, told.modes
     rows = [
-        (visible(mode["name"] or "initial set"), _percent(mode["probability"]), *map(_percent, each))
-        for mode, each in zip(found["modes"], shares, strict=True)
+        (
+            visible(mode.result.mode.name or "initial set"),
+            *map(_percent, (mode.probability, mode.result.proved, mode.result.refuted, mode.result.open)),
+        )
+        for mode in modes
     ]
-    rows.append(("all", *map(_percent, (1.0, found["proved"], found["refuted"], found["open"]))))
-    yield f"{visible(found['run'])}    {float(found['seconds']):.0f} s"
+    rows.append(("all", *map(_percent, (1.0, found.proved, found.refuted, found.open))))
+    yield f"{visible(told.run)}    {found.seconds:.0f} s"
     yield ""
     yield table(rows, header=("initial states", "probability", "proved", "refuted", "open"))
-    if found["states"]:
-        certain = floored(float(found["states_share"]))
+    if told.states:
         yield ""
         yield (
-            f"{found['states_proved']} of {found['states']} random initial states are in a proved box, "
-            f"{found['states_violated']} are violated; so at least {certain} of all initial states have such "
-            "a box (95 % confidence)"
+            f"{told.states_proved} of {told.states} random initial states are in a proved box, "
+            f"{told.states_violated} are violated; so at least {floored(told.states_share)} of all initial "
+            "states have such a box (95 % confidence)"
         )
-    known = [mode for mode in found["modes"] if mode["witness"] is not None]
-    for mode in sorted(known, key=lambda mode: float(mode["robustness"] or 0.0))[:_MOST]:
-        state = ", ".join(f"{name}={float(value):.6g}" for name, value in (mode["witness"] or {}).items())
-        least = float(mode["robustness"] or 0.0)
+    known = [(mode.result.mode.name, each) for mode in modes if (each := mode.result.witness) is not None]
+    for name, witness in sorted(known, key=lambda pair: pair[1].robustness)[:_MOST]:
+        state = ", ".join(f"{each}={value:.6g}" for each, value in witness.state.items())
         yield ""
-        name = visible(mode["name"] or "initial set")
-        yield f"{name}: violated from {visible(state)}, robustness {least:+.3g}"
+        yield (
+            f"{visible(name or 'initial set')}: violated from {visible(state)}, "
+            f"robustness {witness.robustness:+.3g}"
+        )
 
 
-def _percent(share: float | str) -> str:
-    value = 100.0 * float(share)
+def _percent(share: float) -> str:
+    value = 100.0 * share
     return f"{value:.1f} %" if value >= 0.05 or value == 0.0 else f"{value:.1g} %"

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stlc.cli.framework.assured import FalsifiedFinding, ReplayedFinding
 from stlc.cli.framework.output import Answer, emit
 from stlc.escape import file_part, visible
 from stlc.files import write_atomic
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from stlc.assurance.plant_simulator import FailedSimulation, PlantSimulator
+    from stlc.cli.framework.assured import FalsifiedFinding, ReplayedFinding
     from stlc.plants.plant import PlantFinding
 
 FORMAT = "stlc-finding/1"

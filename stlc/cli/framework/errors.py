@@ -84,7 +84,7 @@ def _schema(argv: Sequence[str]) -> str:
 
     A command without a result has `stlc/1`, the schema of the keys that all commands share.
     """
-    from stlc.cli.framework.documents import RESULTS
+    from stlc.cli.framework.results import RESULTS
 
     return f"{argv[0]}/1" if argv and argv[0] in RESULTS else "stlc/1"
 

@@ -69,7 +69,6 @@ def emit_json(
         diagnostics: errors and warnings.
         result: record of the command; numbers that are not finite are written as texts.
     """
-    from stlc.cli.framework.render import to_json
     from stlc.version import __version__
 
     document = {
@@ -77,7 +76,7 @@ def emit_json(
         "schema": schema,
         "ok": ok,
         "exit_code": exit_code,
-        "diagnostics": [to_json(finding) for finding in diagnostics],
+        "diagnostics": plain(list(diagnostics)),
         "result": plain(result),
     }
     emit(dumps(document, indent=2))

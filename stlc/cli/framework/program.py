@@ -117,11 +117,13 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     the parameter's default. A function declared to return an `Answer` gets the option `--json`; its value is
     passed to the function only if the function has a parameter `json`.
     """
-    signature = inspect.signature(function, eval_str=True)
-    groups: dict[str, Any] = {
-        name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)
-    }
-    answers, passed = get_origin(signature.return_annotation) is Answer, "json" in signature.parameters
+    hints = _parameter_hints(function)
+    signature = inspect.signature(function)
+    given = [each.replace(annotation=hints.get(name)) for name, each in signature.parameters.items()]
+    signature = signature.replace(parameters=given)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    answers = str(signature.return_annotation).startswith("Answer[")
+    passed = "json" in signature.parameters
     if not groups and not answers:
         return function
     spread: list[inspect.Parameter] = []
@@ -154,6 +156,13 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     run.__signature__ = signature.replace(parameters=spread)  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in spread}
     return run
+
+
+def _parameter_hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Types of the parameters of a function; its result may be of a type that is not loaded yet."""
+    hints = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
+    holder = type("Hints", (), {"__annotations__": hints, "__module__": function.__module__})
+    return get_type_hints(holder, include_extras=True)
 
 
 @dataclass(frozen=True, slots=True)

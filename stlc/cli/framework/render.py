@@ -1,4 +1,4 @@
-"""Errors and warnings (diagnostics) as text with the underlined source, and as JSON.
+"""Errors and warnings (diagnostics) as text with the underlined source.
 
 The main source location is underlined with `^`, further ones with `-`. Each label has a line of its own. Then
 follow advice (`help`, `fix`) and reasons (`note`).
@@ -9,7 +9,6 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from stlc.diagnostics import Diagnostic, Label
 from stlc.escape import visible
@@ -199,38 +198,3 @@ def _width(char: str) -> int:
     if unicodedata.category(char) in ("Mn", "Me"):
         return 0
     return 2 if unicodedata.east_asian_width(char) in ("W", "F") else 1
-
-
-# -------------------------------------------------------------------------- JSON
-
-
-def to_json(diagnostic: Diagnostic) -> dict[str, Any]:
-    """A finding as JSON values: `{code, severity, message, file, range, label, labels, help, note, fix}`.
-
-    Lines and columns count from 1, and the end of a range is exclusive; `file`, `range` and `fix` may be
-    None.
-    """
-    span, fix = diagnostic.span, diagnostic.fix
-    edits = [] if fix is None else [{**_place(at), "replacement": text} for at, text in fix.edits]
-    return {
-        "code": diagnostic.code,
-        "severity": diagnostic.severity,
-        "message": diagnostic.message,
-        **({"file": None, "range": None} if span is None else _place(span)),
-        "label": diagnostic.label,
-        "labels": [{**_place(label.span), "text": label.text} for label in diagnostic.labels],
-        "help": list(diagnostic.help),
-        "note": list(diagnostic.note),
-        "fix": None if fix is None else {"text": fix.text, "edits": edits},
-    }
-
-
-def _place(span: Span) -> dict[str, Any]:
-    start, end = span.source.position(span.start), span.source.position(span.end)
-    return {
-        "file": span.source.name,
-        "range": {
-            "start": {"line": start[0], "column": start[1]},
-            "end": {"line": end[0], "column": end[1]},
-        },
-    }

@@ -8,7 +8,6 @@ from dataclasses import fields
 from fractions import Fraction
 from typing import Any
 
-from stlc.cli.framework.documents import SyntaxTree
 from stlc.escape import dot
 from stlc.grammar import ast
 from stlc.grammar.traverse import children
@@ -68,13 +67,13 @@ def _short(value: object) -> str:
             return str(value)
 
 
-def as_values(node: ast.Node) -> SyntaxTree:
+def as_values(node: ast.Node) -> dict[str, Any]:
     """JSON record of a syntax tree: class, line and column of the node, and its fields."""
     values: Any = {"node": type(node).__name__, "line": node.span.line, "column": node.span.column}
     for part in fields(node):
         if part.name not in _HIDDEN:
             values[part.name] = _value(getattr(node, part.name))
-    record: SyntaxTree = values
+    record: dict[str, Any] = values
     return record
 
 

@@ -9,25 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stlc.cli.check.outcome import WORDS
-from stlc.cli.check.text import in_unit, robustness_text
+from stlc.cli.check.text import WORDS, in_unit, robustness_text
 from stlc.cli.framework.options import parse_seeds
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics, table
-from stlc.cli.framework.plant_documents import (
-    PlantFailure,
-    PlantRequirement,
-    PlantRunRecord,
-    PlantSimulation,
-)
 from stlc.diagnostics import usage
 from stlc.escape import operand, shell, visible
 from stlc.registry import did_you_mean
 from stlc.units import parse_quantity, time_text
 
 if TYPE_CHECKING:
-    from stlc.monitor.judgement import Status
     from stlc.monitor.verdict import Monitor
-    from stlc.plants.judge import JudgedRun
+    from stlc.plants.judge import JudgedRun, PlantSimulation
     from stlc.plants.plant import Plant, PlantVariable
     from stlc.trace import Trace
 
@@ -71,7 +63,7 @@ def simulate_plant(order: PlantOrder) -> Answer[PlantSimulation]:
         StlcError: the plant file, the specification or an option is invalid, or the two files do not fit
             together.
     """
-    from stlc.plants.judge import PlantJudge
+    from stlc.plants.judge import PlantJudge, PlantSimulation
     from stlc.trace import check_writable, save_trace
 
     if order.record is not None:
@@ -94,8 +86,10 @@ def simulate_plant(order: PlantOrder) -> Answer[PlantSimulation]:
                 PULSE.now(f"simulating {plant.decl.name}, {len(runs)} of {len(points)}")
     if order.record is not None and traces:
         save_trace(order.record, judge.stored(traces))
-    document = _document(plant, monitor, runs, order, stream=stream)
-    return Answer(document, lambda: _show(plant, monitor, runs, order), _code(runs, order.fail_under))
+    decl, written = plant.decl, None if order.record is None else str(order.record)
+    about = (monitor.compiled.name, decl.name, decl.kind, float(decl.dt), decl.steps)
+    found = PlantSimulation(*about, stream, written, tuple(runs))
+    return Answer(found, lambda: _show(plant, monitor, found, order), _code(found, order.fail_under))
 
 
 # ---------------------------------------------------------------------------------- points
@@ -151,67 +145,14 @@ def _value(variable: PlantVariable, part: str, text: str) -> float:
 # --------------------------------------------------------------------------------- results
 
 
-def _code(runs: Sequence[JudgedRun], fail_under: float | None) -> int:
+def _code(found: PlantSimulation, fail_under: float | None) -> int:
     """Exit code: 1 if the share of satisfying simulations is too small, or if one has no trace; else 0."""
-    found = [run.status for run in runs]
-    few = fail_under is not None and found.count("satisfied") / len(found) < fail_under
-    return int(few or (fail_under is None and None in found))
+    few = fail_under is not None and found.satisfied / len(found.runs) < fail_under
+    return int(few or (fail_under is None and found.findings > 0))
 
 
-def _document(
-    plant: Plant, monitor: Monitor, runs: Sequence[JudgedRun], order: PlantOrder, *, stream: bool
-) -> PlantSimulation:
-    found = [run.status for run in runs]
-    return {
-        "spec": monitor.compiled.name,
-        "plant": plant.decl.name,
-        "kind": plant.decl.kind,
-        "dt": float(plant.decl.dt),
-        "steps": plant.decl.steps,
-        "streamed": stream,
-        "satisfied": found.count("satisfied"),
-        "violated": found.count("violated"),
-        "inconclusive": found.count("inconclusive"),
-        "out_of_scope": found.count("out of scope"),
-        "findings": found.count(None),
-        "trace": None if order.record is None else str(order.record),
-        "runs": [_run_record(run) for run in runs],
-    }
-
-
-def _run_record(run: JudgedRun) -> PlantRunRecord:
-    requirements: list[PlantRequirement] = [
-        {
-            "name": each.rule.name,
-            "verdict": each.status,
-            "robustness": each.robustness,
-            "low": each.low,
-            "high": each.high,
-            "unit": each.rule.unit,
-        }
-        for each in run.requirements
-    ]
-    failure: PlantFailure | None = None
-    if run.finding is not None:
-        finding = run.finding
-        failure = {
-            "reason": finding.reason,
-            "message": finding.message,
-            "time": finding.time,
-            "stderr": finding.stderr,
-        }
-    return {
-        "seed": run.seed,
-        "point": dict(run.point),
-        "samples": run.samples,
-        "verdict": "finding" if run.status is None else run.status,
-        "requirements": requirements,
-        "finding": failure,
-    }
-
-
-def _show(plant: Plant, monitor: Monitor, runs: Sequence[JudgedRun], order: PlantOrder) -> None:
-    decl = plant.decl
+def _show(plant: Plant, monitor: Monitor, found: PlantSimulation, order: PlantOrder) -> None:
+    decl, runs = plant.decl, found.runs
     count = f"{len(runs)} simulation{'s' if len(runs) != 1 else ''}"
     emit(
         f"{visible(monitor.compiled.name)} on {visible(decl.name)}    "
@@ -223,7 +164,7 @@ def _show(plant: Plant, monitor: Monitor, runs: Sequence[JudgedRun], order: Plan
         for line in _finding_lines(run):
             emit(line)
     emit("")
-    emit(_summary(runs))
+    emit(_summary(found))
     if order.record is not None:
         say(f"the traces are in {order.record}")
         emit(f"next: {shell(('stlc', 'check', *_judging(order), operand(str(order.record))))}")
@@ -245,12 +186,14 @@ def _rows(plant: Plant, runs: Sequence[JudgedRun]) -> Iterator[tuple[str, ...]]:
             for each in plant.variables[:4]
         )
         point += ", …" if len(plant.variables) > 4 else ""
-        if run.status is None:
+        if run.verdict is None:
             yield str(run.seed), "FINDING", "", run.finding.reason if run.finding else "", point
             continue
-        worst = min(run.requirements, key=lambda each: each.share)
-        value = robustness_text(worst.status, worst.low, worst.high, worst.robustness, worst.rule.unit)
-        yield str(run.seed), WORDS[run.status], worst.rule.name, value, point
+        factors, word = run.verdict.factors, run.verdict.scoped
+        worst = min(run.verdict, key=lambda each: float(each.low.min()) * factors[each.name])
+        low, high = (float(end.min()) for end in worst.margins)
+        value = robustness_text(worst.statuses[0], low, high, float(worst.least[0]), worst.unit)
+        yield str(run.seed), WORDS[word], worst.name, value, point
 
 
 def _finding_lines(run: JudgedRun) -> Iterator[str]:
@@ -266,16 +209,12 @@ def _finding_lines(run: JudgedRun) -> Iterator[str]:
         yield f"  | {visible(line)}"
 
 
-def _summary(runs: Sequence[JudgedRun]) -> str:
-    found = [run.status for run in runs]
-    text = f"{found.count('satisfied')} of {len(runs)} simulations satisfy every requirement"
-    others: dict[Status | None, str] = {
-        "violated": "violated",
-        "inconclusive": "inconclusive",
-        "out of scope": "out of scope",
-        None: "without a trace",
+def _summary(found: PlantSimulation) -> str:
+    text = f"{found.satisfied} of {len(found.runs)} simulations satisfy every requirement"
+    others = {
+        "violated": found.violated,
+        "inconclusive": found.inconclusive,
+        "out of scope": found.out_of_scope,
+        "without a trace": found.findings,
     }
-    for status, words in others.items():
-        if number := found.count(status):
-            text += f"; {number} {words}"
-    return text
+    return text + "".join(f"; {number} {words}" for words, number in others.items() if number)

@@ -9,11 +9,11 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from stlc.cli.framework.documents import TrainedJob, TrainedRuns
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.escape import operand
 
 if TYPE_CHECKING:
+    from stlc.cli.framework.documents import TrainedJob, TrainedRuns
     from stlc.controller.parallel.jobs import Job, JobResult
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch

@@ -7,17 +7,19 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from stlc.cli.framework.assured import FalsificationRounds
-from stlc.cli.framework.documents import TrainedRun
 from stlc.cli.framework.output import console as open_console
 from stlc.units import time_text
 from stlc.view.learning import driven_lines
+
+if TYPE_CHECKING:
+    from stlc.cli.framework.assured import FalsificationRounds
+    from stlc.cli.framework.documents import TrainedRun
 
 LINE_EVERY = 25.0  # seconds between lines without a terminal
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -320,12 +322,12 @@ def final_screen(
         rows.append(("judged", f"on missions of {time_text(judged)}; what is required has no end"))
     verdict, requirements = result.get("verdict"), result["requirements"]
     if verdict is not None:
-        rows.append(("verdict", f"{verdict['level']}: {verdict['sentence']}"))
+        rows.append(("verdict", f"{verdict.level}: {verdict.sentence}"))
     if requirements and min(requirements.values()) < 1.0:
         worst = min(requirements, key=requirements.__getitem__)
         rows += [("worst", f"{worst} {requirements[worst]:.3f}"), ("worst", region)]
     rows += [("unsolved", unsolved), ("picture", picture)]
-    rows += [("what helps", advice) for advice in ([] if verdict is None else verdict["advice"])]
+    rows += [("what helps", advice) for advice in ([] if verdict is None else verdict.advice)]
     steps = f", {result['steps']:,} steps" if result.get("steps") else ""
     took = f"{result['seconds']:.0f} s of training and verdict{steps}   {result['run']}"
     rows.append(("finished", took))
@@ -335,7 +337,7 @@ def final_screen(
         f"{'' if label == above else label:<15} {text}"
         for above, (label, text) in zip(labels, rows, strict=False)
     ]
-    return lines if verdict is None else [*lines, "", f"Next:  {verdict['next']}"]
+    return lines if verdict is None else [*lines, "", f"Next:  {verdict.command}"]
 
 
 def rounds_text(found: FalsificationRounds) -> str:

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 import typer
 
-from stlc.cli.framework.documents import TrainedRun, verdict_record
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import PULSE, Answer, console, say, show_diagnostics
 from stlc.cli.train.progress import TrainingDisplay, final_screen
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
+from stlc.jsontext import plain
 from stlc.rundir import LATEST, RUNS
 from stlc.stopping import age, leaving
 from stlc.view.learning import Commands, learning_of_run
@@ -24,6 +24,7 @@ from stlc.view.learning import Commands, learning_of_run
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
+    from stlc.cli.framework.documents import TrainedRun
     from stlc.controller.training.tensorboard import Opener, TensorBoardLogger
     from stlc.rundir import RunDir, Status
 
@@ -176,11 +177,11 @@ class Session:
         summary: Any = outcome.score.summary()
         result |= summary
         if outcome.simulated is not None:
-            closed_loop: Any = outcome.simulated.summary()
+            closed_loop: Any = plain(outcome.simulated)
             result["closed_loop"] = closed_loop
         learning = learning_of_run(folder, _commands(folder, outcome.ranks))
         if learning is not None:
-            result["verdict"] = verdict_record(learning)
+            result["verdict"] = learning
         record = folder.record()
         result |= {"steps": record.get("steps"), "schedule": record.get("schedule")}
         rounds: Any = record.get("falsification")

@@ -16,6 +16,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.traverse import NumberLeaf, leaves, map_children, map_leaves, nodes, numbers
 from stlc.diagnostics import Diagnostic, tell
+from stlc.jsontext import Num
 from stlc.source import Span
 from stlc.units import nearest, time_text
 
@@ -27,6 +28,14 @@ MAX_DELAY = 1_000_000
 
 _EMPTY = ir.Window(0, 0)
 """Placeholder window after a reported error."""
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """Length of a time window."""
+
+    seconds: Num
+    steps: int
 
 
 @dataclass(frozen=True, slots=True)

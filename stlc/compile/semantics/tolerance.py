@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 if TYPE_CHECKING:
     from stlc.compile.backends.array.namespace import Array, Ops
 
 A = TypeVar("A")
+End: TypeAlias = Literal["open", "strict", "truncate"]
+"""Verdict on a trace that is too short: bounds over all continuations, an error, or that of cut windows."""
 TOLERANCE = 1e-6
 """A requirement counts as satisfied if its robustness is >= -TOLERANCE, in float64.
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 
@@ -42,6 +42,7 @@ from stlc.controller.guard.kind import compared_guards
 from stlc.controller.training.config import DRIVES
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
+from stlc.jsontext import Num
 from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
@@ -113,7 +114,11 @@ class Share:
         causes: cause -> number of failed runs that have it, of those whose cause was determined.
     """
 
-    guard: str
+    JSON: ClassVar = (
+        "guard drives=runs satisfied share interval safe=safe_share compared gained lost broken causes"
+    )
+
+    guard: Annotated[str, compared_guards]
     runs: int
     satisfied: int
     safe: int | None
@@ -123,31 +128,24 @@ class Share:
     causes: Mapping[Cause, int] = field(default_factory=dict)
 
     @property
-    def share(self) -> float:
+    def share(self) -> Num:
         """Share of the runs that satisfy the mission."""
         return self.satisfied / self.runs
 
     @property
-    def interval(self) -> tuple[float, float]:
+    def interval(self) -> tuple[Num, Num]:
         """95 % Wilson interval of the share."""
         return wilson(self.share, self.runs)
 
-    def summary(self) -> dict[str, object]:
-        """The counts and shares under one guard as a JSON object."""
-        safe = None if self.safe is None else self.safe / self.runs
-        return {
-            "guard": self.guard,
-            "drives": self.runs,
-            "satisfied": self.satisfied,
-            "share": self.share,
-            "interval": list(self.interval),
-            "safe": safe,
-            "compared": self.runs if GUARDS.get(self.guard).intervenes else 0,
-            "gained": self.gained,
-            "lost": self.lost,
-            "broken": [asdict(each) for each in self.broken],
-            "causes": dict(self.causes),
-        }
+    @property
+    def safe_share(self) -> Num | None:
+        """Share of the runs that satisfy the requirements tagged `@safety`; None if there are none."""
+        return None if self.safe is None else self.safe / self.runs
+
+    @property
+    def compared(self) -> int:
+        """Number of runs that were compared with runs without a guard."""
+        return self.runs if GUARDS.get(self.guard).intervenes else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,15 +163,21 @@ class ClosedLoop:
         why: message of the error that prevented every run; empty if there was none.
         left_out: guards that might be better, and made fewer than `LEAST` runs from the initial states of the
             others in the time.
+        seed: first seed of the runs.
     """
+
+    JSON: ClassVar = (
+        "recommended=guard share interval guards=shares left_out seed steps seconds plan_seconds judge why"
+    )
 
     shares: tuple[Share, ...]
     steps: int
-    seconds: float = 0.0
-    plan_seconds: float = 0.0
+    seconds: Num = 0.0
+    plan_seconds: Num = 0.0
     judge: str | None = None
     why: str = ""
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[Annotated[str, compared_guards], ...] = ()
+    seed: int = SEED
 
     @property
     def recommended(self) -> Share | None:
@@ -189,22 +193,20 @@ class ClosedLoop:
         best = max(share.share for share in self.shares)
         return next(share for share in self.shares if share.share >= best - NEAR)
 
-    def summary(self) -> dict[str, object]:
-        """The recommended guard and the results of all guards as a JSON object."""
-        best = self.recommended
-        return {
-            "recommended": None if best is None else best.guard,
-            "share": None if best is None else best.share,
-            "interval": None if best is None else list(best.interval),
-            "guards": [share.summary() for share in self.shares],
-            "left_out": list(self.left_out),
-            "seed": SEED,
-            "steps": self.steps,
-            "seconds": self.seconds,
-            "plan_seconds": self.plan_seconds,
-            "judge": self.judge,
-            "why": self.why,
-        }
+    @property
+    def guard(self) -> Annotated[str | None, lambda: (*compared_guards(), None)]:
+        """Name of the recommended guard; None if there is none."""
+        return None if self.recommended is None else self.recommended.guard
+
+    @property
+    def share(self) -> Num | None:
+        """Share of the runs under the recommended guard that satisfy the mission."""
+        return None if self.recommended is None else self.recommended.share
+
+    @property
+    def interval(self) -> tuple[Num, Num] | None:
+        """95 % Wilson interval of this share."""
+        return None if self.recommended is None else self.recommended.interval
 
 
 class _LateError(Exception):
@@ -230,7 +232,7 @@ class _Known:
     given_up: bool = False
 
     @property
-    def share(self) -> float:
+    def share(self) -> Num:
         return sum(drive.obeyed for drive in self.found.values()) / max(1, len(self.found))
 
     @property

@@ -23,6 +23,7 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.planning.policy import PlannerPolicy, SearchUse
 from stlc.controller.search.feasibility import solvable
 from stlc.controller.world import world_type
+from stlc.jsontext import Num, plain
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
@@ -37,8 +38,8 @@ LATENCY_SECONDS = 5.0
 class DecisionLatency:
     """Seconds that the guard takes to decide for one agent: median and 99 % quantile over visited states."""
 
-    median: float
-    p99: float
+    median: Num
+    p99: Num
     samples: int
 
 
@@ -256,7 +257,7 @@ def as_json(
 def _record(found: Deployment, setting: Setting) -> dict[str, Any]:
     """The results of one guard or planner as a JSON object."""
     return {
-        "metrics": {key: metric.summary() for key, metric in found.metrics.items()},
+        "metrics": plain(found.metrics),
         "drives": runs_json(found.runs, setting.seeds, setting.agents),
         "units": dict(found.recording.units),
         "decisions": dict(found.decisions),

@@ -134,6 +134,14 @@ def obeying(rules: Mapping[str, NDArray[np.str_]], rows: int) -> NDArray[np.bool
 # ------------------------------------------------------------------------ files of rules
 
 
+@dataclass(frozen=True, slots=True)
+class CopiedRules:
+    """Copy of a file of rules in the folder of a run: its name, and the path of the file."""
+
+    file: str
+    path: str | None = None
+
+
 def read_rules(judge: JudgeRef) -> ast.Spec:
     """Read the rules (specification of closed-loop runs) that a system file names, with their imports.
 
@@ -201,7 +209,7 @@ def rules_for(folder: RunDir, decl: SystemDecl) -> Rules | None:
     judge, overrides = decl.test.judge, decl.overrides
     if judge is None:
         return None
-    index = folder.read_json(_INDEX, {"*": {"file": str, "path?": str}}) if folder.has(_INDEX) else {}
+    index = folder.read_json(_INDEX, dict[str, CopiedRules]) if folder.has(_INDEX) else {}
     entry = index.get(judge.written)
     if entry is None:
         spec = read_rules(judge)

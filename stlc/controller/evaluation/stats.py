@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist, fmean, stdev
 
+from stlc.jsontext import Num
+
 CONFIDENCE = 0.95
 _Z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 
@@ -15,10 +17,10 @@ _Z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 class MeanInterval:
     """Mean over seeds with its 95 % confidence interval; `low` and `high` are None without an interval."""
 
-    mean: float
-    low: float | None
-    high: float | None
-    values: tuple[float, ...]
+    mean: Num
+    low: Num | None
+    high: Num | None
+    values: tuple[Num, ...]
 
     @classmethod
     def of(cls, values: Sequence[float]) -> MeanInterval:
@@ -31,10 +33,6 @@ class MeanInterval:
             return cls(mean, None, None, tuple(values))
         half = student(len(values) - 1) * stdev(values) / math.sqrt(len(values))
         return cls(mean, mean - half, mean + half, tuple(values))
-
-    def summary(self) -> dict[str, object]:
-        """Mean, interval and values as a JSON object."""
-        return {"mean": self.mean, "low": self.low, "high": self.high, "values": list(self.values)}
 
     @property
     def half(self) -> float | None:

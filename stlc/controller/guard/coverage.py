@@ -140,3 +140,29 @@ def chances(task: Task, grid: PrefixGrid) -> list[Chance]:
     """
     axes = axes_of(task, grid)
     return [chance(axes, radius, length, grid.samples) for length in grid.lengths for radius in RADII]
+
+
+ASSUMED = (
+    "there is a prefix of T0 actions such that every prefix within the radius of it, in every control at "
+    "every step, leads to a plan that satisfies the specification when the policy finishes it",
+    "that prefix lies anywhere in the ranges of the controls with equal probability, independently of the "
+    "grid",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Guarantee:
+    """Lower bounds on the probability that the backup policy of a run finds a satisfying plan."""
+
+    run: str
+    assumptions: tuple[str, ...]
+    controls: tuple[Axis, ...]
+    chances: tuple[Chance, ...]
+
+
+def guarantee(run: str, task: Task) -> Guarantee:
+    """Compute the bounds for a run of a task: one for each length of the prefix and each radius."""
+    from stlc.controller.guard.candidates import grid_of
+
+    grid = grid_of(task)
+    return Guarantee(run, ASSUMED, tuple(axes_of(task, grid)), tuple(chances(task, grid)))

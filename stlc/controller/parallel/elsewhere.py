@@ -249,5 +249,9 @@ def translated(value: Any, change: Callable[[str | Path], str]) -> Any:
         return parts if isinstance(value, list) else tuple(parts)
     if is_dataclass(value) and not isinstance(value, type):
         names = [field.name for field in fields(value) if field.init]
-        return replace(value, **{name: translated(getattr(value, name), change) for name in names})
+        made = replace(value, **{name: translated(getattr(value, name), change) for name in names})
+        known = {name: each for name, each in getattr(value, "__dict__", {}).items() if name not in names}
+        if known:  # what a record has computed, and keeps
+            made.__dict__.update(translated(known, change))
+        return made
     return value

@@ -36,7 +36,16 @@ _HASH = 8
 """Number of digits of the hash in the name of a file."""
 _NAME = re.compile(rf"step-\d{{6,}}(-[0-9a-f]{{{_HASH}}})?\.safetensors")
 """Names of tensor files; older ones have no hash."""
-_FACTS = {"file": str, "sha256": str, "spec_hash?": str, "system_hash?": str}
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointHead:
+    """File of the tensors of a checkpoint, its hash, and those of what it was trained for."""
+
+    file: str
+    sha256: str
+    spec_hash: str | None = None
+    system_hash: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +141,7 @@ def _read(run: RunDir) -> tuple[dict[str, Any], bytes]:
                 note=("nothing has been saved yet, or the run ended before that",),
             )
         )
-    facts = run.read_json(f"{FOLDER}/{POINTER}", _FACTS)
+    facts = run.read_json(f"{FOLDER}/{POINTER}", CheckpointHead)
     name = facts["file"]
     if not _NAME.fullmatch(name):
         raise RunError(_damaged(run, f"`{name:.100}` is not the name of a checkpoint"))

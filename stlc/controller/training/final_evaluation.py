@@ -10,6 +10,7 @@ from stlc.controller.evaluation.held_out import Score, score, silent
 from stlc.controller.training.budget import simulation_reserve, verdict_reserve
 from stlc.controller.training.conflict import conflict, refuted
 from stlc.controller.training.run import Run
+from stlc.jsontext import plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,7 +109,7 @@ class FinalEvaluation:
         found: dict[str, object] = {"seconds": self.time.spent}
         if why is not None:
             found |= {"why": why.message, "proved": refuted(self.task)}
-        found |= {} if simulated is None else {"closed_loop": simulated.summary()}
+        found |= {} if simulated is None else {"closed_loop": plain(simulated)}
         if self.config.falsify and (rounds := self.writer.folder.record().get("falsification")):
             found["falsification"] = rounds
         self.writer.close("finished", {**result.summary(), **found})

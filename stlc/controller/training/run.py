@@ -267,7 +267,7 @@ def read_library(folder: RunDir, below: str = LIB) -> dict[str, str]:
     """
     if not folder.has(f"{below}/{INDEX}"):
         return {}
-    index: dict[str, str] = folder.read_json(f"{below}/{INDEX}", {"*": str})
+    index: dict[str, str] = folder.read_json(f"{below}/{INDEX}", dict[str, str])
     return {key: folder.source(f"{below}/{name}").text for key, name in index.items()}
 
 
@@ -287,6 +287,14 @@ def _unknown(folder: RunDir, registry: PackageRegistry[Any], name: str) -> Plugi
     return PluginError(Diagnostic("S206", message, note=note, help=(help_,)))
 
 
+@dataclass(frozen=True, slots=True)
+class StoredConfig:
+    """Resolved options of a run that every method has."""
+
+    method: str
+    hidden: list[int]
+
+
 def load_config(folder: RunDir) -> ResolvedConfig:
     """Read the resolved options of a run.
 
@@ -297,7 +305,7 @@ def load_config(folder: RunDir) -> ResolvedConfig:
         RunError: R101, their file is missing or damaged.
         PluginError: S206, the run needs a method or planner that is not there, or that cannot be loaded.
     """
-    values: dict[str, Any] = folder.read_json(CONFIG, {"method": str, "hidden": [int]})
+    values: dict[str, Any] = folder.read_json(CONFIG, StoredConfig)
     for registry, name in ((METHODS, values["method"]), (PLANNERS, values.get("planner"))):
         if isinstance(name, str) and name not in registry:
             raise _unknown(folder, registry, name)

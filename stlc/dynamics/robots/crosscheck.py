@@ -10,6 +10,7 @@ import io
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from importlib.util import find_spec
+from typing import ClassVar
 from warnings import catch_warnings
 
 import numpy as np
@@ -39,9 +40,16 @@ class Comparison:
         why: reason for not comparing.
     """
 
+    JSON: ClassVar = "name distance_m=distance why_not"
+
     name: str
     distance: float | None
     why: str = ""
+
+    @property
+    def why_not(self) -> str | None:
+        """Reason for not comparing; None if there is none."""
+        return self.why or None
 
 
 def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:

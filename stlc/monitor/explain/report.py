@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,9 +16,11 @@ from stlc.compile.ir.traverse import margin_unit
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.diagnostics import Label
 from stlc.grammar import ast
+from stlc.jsontext import Num
 from stlc.monitor.explain.causes import CauseFinder, CauseNode, Violations
 from stlc.monitor.instants import rule_bounds, window_of
-from stlc.monitor.judgement import Judgement, Part, Prepared, Verdict
+from stlc.monitor.judgement import RequirementVerdict, Verdict
+from stlc.monitor.prepared import Part, Prepared, Timeline
 from stlc.monitor.values import Record
 from stlc.signature import Column
 from stlc.source import Span
@@ -37,8 +40,10 @@ class SignalValue:
         frozen: whether it is a frozen value.
     """
 
+    JSON: ClassVar = "signal value text unit"
+
     signal: str
-    value: float
+    value: Num
     unit: str
     text: str
     frozen: bool = False
@@ -49,7 +54,7 @@ class Cause:
     """Cause of a violation of one requirement by one trace in one window.
 
     Attributes:
-        judgement: verdict and robustness of the requirement.
+        rule: the requirement.
         trace: index of the trace.
         start: sample at which the requirement was evaluated.
         sample: sample at which the deciding predicate was evaluated.
@@ -64,15 +69,21 @@ class Cause:
         tree: tree of the sub-formulas that explain the violation, down to predicates.
         alone: whether the robustness rises if only the value of `predicate` at `sample` rises, and a change
             of its signals there can make it rise.
-        subject: the trace from the first judged sample on, from which the tree counts samples.
+        timeline: times of the samples from the first judged one on, from which the tree counts.
         first: index of this sample in the trace.
+        unit: unit of the deciding predicate's values.
+        subject: the trace from the first judged sample on.
     """
 
-    judgement: Judgement
+    JSON: ClassVar = (
+        "predicate trace start sample time because signal value readings span requirement=place_span"
+    )
+
+    rule: CompiledRequirement
     trace: int
     start: int
     sample: int
-    time: float
+    time: Num
     violated: int
     predicate: str
     span: Span
@@ -80,15 +91,47 @@ class Cause:
     place: Label
     labels: tuple[Label, ...]
     because: str
-    tree: CauseNode
+    tree: CauseNode = field(repr=False)
     alone: bool
+    timeline: Timeline = field(compare=False, repr=False)
+    first: int
+    unit: str
     subject: Prepared = field(compare=False, repr=False)
-    first: int = 0
+
+    def told(self) -> Cause:
+        """Return the cause without the tree and the signals, which are large."""
+        gone: Any = None
+        return replace(self, tree=gone, subject=gone)
+
+    @property
+    def name(self) -> str:
+        """Name of the requirement."""
+        return self.rule.name
+
+    @property
+    def signal(self) -> str | None:
+        """The first signal that the predicate reads; None if it reads none."""
+        return self.readings[0].signal if self.readings else None
+
+    @property
+    def value(self) -> Num | None:
+        """Value of that signal."""
+        return self.readings[0].value if self.readings else None
+
+    @property
+    def place_span(self) -> Span:
+        """Place in the requirement that is underlined first."""
+        return self.place.span
 
     @property
     def started(self) -> str:
         """Instant at which the requirement was evaluated, as text."""
-        return self.subject.moment(self.start - self.first)
+        return self.timeline.moment(self.start - self.first)
+
+    @property
+    def started_at(self) -> float:
+        """The same in seconds."""
+        return self.timeline.time(self.start - self.first)
 
     @property
     def shown(self) -> int:
@@ -98,21 +141,12 @@ class Cause:
     @property
     def shown_time(self) -> float:
         """Time of `shown` in seconds."""
-        return self.subject.time(self.shown - self.first)
+        return self.timeline.time(self.shown - self.first)
 
     @property
     def moment(self) -> str:
         """Instant by which the violation shows, as text."""
-        return self.subject.moment(self.shown - self.first)
-
-    @property
-    def unit(self) -> str:
-        """Unit of the deciding predicate's values."""
-        return margin_unit(self.tree.leaf.formula)
-
-
-MOST = 500
-"""Greatest number of violated requirements explained at once; each takes half a millisecond."""
+        return self.timeline.moment(self.shown - self.first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,15 +174,7 @@ def explain(verdict: Verdict, name: str) -> Cause | None:
     judgement = verdict[name]
     if judgement.overall != "violated":
         return None
-    return _cause(judgement, verdict.subject, _definitions(verdict.subject.compiled.spec))
-
-
-def explain_all(verdict: Verdict) -> dict[str, Cause]:
-    """Return the causes of the first `MOST` violated requirements, by name of the requirement."""
-    definitions = _definitions(verdict.subject.compiled.spec)
-    violated = [judgement for judgement in verdict if judgement.overall == "violated"]
-    found = {x.name: _cause(x, verdict.subject, definitions) for x in violated[:MOST]}
-    return {name: cause for name, cause in found.items() if cause is not None}
+    return cause_of(judgement)
 
 
 def violations(verdict: Verdict, name: str, trace: int, most: int) -> list[Violation]:
@@ -181,8 +207,11 @@ def violations(verdict: Verdict, name: str, trace: int, most: int) -> list[Viola
     return result
 
 
-def _cause(judgement: Judgement, subject: Prepared, definitions: dict[str, ast.Expr]) -> Cause | None:
-    trace, start = judgement.worst
+def cause_of(judgement: RequirementVerdict) -> Cause | None:
+    """Return the cause of the worst violation of a violated requirement; None if no sample shows it."""
+    subject, (trace, start) = judgement.subject, judgement.worst
+    assert subject is not None
+    definitions = _definitions(subject.compiled.spec)
     judged = _JudgedTrace.of(judgement, subject, trace)
     start -= judged.first
     if not judged.shows(start):
@@ -196,14 +225,14 @@ def _cause(judgement: Judgement, subject: Prepared, definitions: dict[str, ast.E
 class _JudgedTrace:
     """The samples of one trace on which a requirement is judged; instants are counted from the first one."""
 
-    judgement: Judgement
+    judgement: RequirementVerdict
     subject: Prepared
     trace: int
     first: int
 
     @staticmethod
-    def of(judgement: Judgement, subject: Prepared, trace: int) -> _JudgedTrace:
-        part = judgement.part or Part(0, subject.record.samples)
+    def of(judgement: RequirementVerdict, subject: Prepared, trace: int) -> _JudgedTrace:
+        part = judgement.part
         return _JudgedTrace(judgement, _evidence(judgement.rule, subject, part, trace), trace, part.first)
 
     @property
@@ -237,7 +266,7 @@ class _JudgedTrace:
         leaf = tree.leaf
         place, *labels = words.labels(tree)
         return Cause(
-            judgement=self.judgement,
+            rule=self.judgement.rule,
             trace=self.trace,
             start=start + self.first,
             sample=leaf.sample + self.first,
@@ -251,8 +280,10 @@ class _JudgedTrace:
             because=words.because(tree),
             tree=tree,
             alone=alone,
-            subject=self.subject,
+            timeline=self.subject.timeline,
             first=self.first,
+            unit=margin_unit(leaf.formula),
+            subject=self.subject,
         )
 
 

@@ -20,7 +20,8 @@ from stlc.compile.ir.support import columns, columns_of
 from stlc.grammar import ast
 from stlc.monitor.facts.triggers import Trigger, triggers
 from stlc.monitor.holes import holes_in, without_holes
-from stlc.monitor.judgement import Judgement, Prepared, Verdict
+from stlc.monitor.judgement import RequirementVerdict, Verdict
+from stlc.monitor.prepared import Prepared
 from stlc.signature import Column
 from stlc.source import Span
 
@@ -51,12 +52,12 @@ class Evidence:
         return self.subject.signals.trace
 
     @cached_property
-    def satisfied(self) -> tuple[Judgement, ...]:
+    def satisfied(self) -> tuple[RequirementVerdict, ...]:
         """Requirements that are satisfied."""
         return tuple(judged for judged in self.verdict if judged.overall == "satisfied")
 
     @cached_property
-    def triggers(self) -> tuple[tuple[Judgement, Trigger], ...]:
+    def triggers(self) -> tuple[tuple[RequirementVerdict, Trigger], ...]:
         """Obligations of the satisfied requirements that depend on what the recording holds."""
         return tuple((judged, each) for judged in self.satisfied for each in triggers(judged, self.subject))
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from stlc.diagnostics import Diagnostic, Severity
+from stlc.jsontext import Num
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,10 +24,12 @@ class Fact:
         beside: whether it stands beside the verdict, as in "satisfied, never triggered".
     """
 
+    JSON: ClassVar = "code text signal time count of unjudged advice"
+
     finding: Diagnostic
     requirement: str = ""
     signal: str = ""
-    time: float | None = None
+    time: Num | None = None
     count: int | None = None
     of: int | None = None
     unjudged: bool = False

@@ -154,7 +154,7 @@ def few_samples(evidence: Evidence) -> Iterator[Fact]:
 def known_in_part(evidence: Evidence) -> Iterator[Fact]:
     """Yield W719 for signals that were seen in a part of the recording."""
     subject = evidence.subject
-    whole = subject.duration
+    whole = subject.timeline.duration
     for column, values in _signals(evidence, "real", "int", "bool", "enum"):
         span = subject.signals.spans.get(column.name)
         if span is None and np.isnan(values[[0, -1]]).any():

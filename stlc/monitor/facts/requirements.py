@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,15 +11,12 @@ import numpy as np
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import leaves, nodes
-from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic
 from stlc.monitor.facts.evidence import Evidence
-from stlc.monitor.facts.extent import samples_read
 from stlc.monitor.facts.fact import Fact
 from stlc.monitor.facts.triggers import Bools, Trigger
-from stlc.monitor.judgement import Judgement, Part, Prepared
-from stlc.trace.resample import TimeRange
+from stlc.monitor.judgement import RequirementVerdict
 
 AWAY = 3.0
 """Spans of the recorded values beyond which a predicate is out of their reach."""
@@ -27,29 +24,15 @@ _SHOWN = 3
 """Parts of a recording that a text lists."""
 
 
-def parts_read(judged: Judgement, subject: Prepared) -> tuple[TimeRange, ...]:
-    """Return the times in seconds at which a requirement could read the recording; empty for all of it."""
-    part = judged.part or Part(0, subject.record.samples)
-    begin = judged.start - part.first
-    starts = range(begin, begin + judged.instants)
-    found = samples_read(judged.rule.formula, starts, part.stop - part.first)
-    if not found:
-        return () if part.seen is None else (part.seen,)
-    return tuple(
-        TimeRange(subject.time(part.first + each.start), subject.time(part.first + each.stop - 1))
-        for each in found
-    )
-
-
 def part_read(evidence: Evidence) -> Iterator[Fact]:
     """Yield W711 for requirements that could not read the whole recording."""
-    subject = evidence.subject
     for judged in evidence.verdict:
-        yield from part_facts(judged.rule, parts_read(judged, subject), subject.duration)
+        yield from part_facts(judged)
 
 
-def part_facts(rule: CompiledRequirement, parts: Sequence[TimeRange], whole: TimeRange) -> Iterator[Fact]:
-    """Yield W711 if a requirement could read `parts` of a recording; there are none if it could read all."""
+def part_facts(judged: RequirementVerdict) -> Iterator[Fact]:
+    """Yield W711 if a requirement could not read the whole recording."""
+    rule, parts, whole = judged.rule, judged.parts_read, judged.timeline.duration
     if not parts:
         return
     ends = [(f"{p.first - whole.first:.6g} s", f"{p.last - whole.first:.6g} s") for p in parts]
@@ -89,7 +72,7 @@ def at_once(evidence: Evidence) -> Iterator[Fact]:
             yield _fact("W713", judged, f"`{_text(each)}` true at once, everywhere", at=each)
 
 
-def _idle(judged: Judgement, each: Trigger) -> Bools:
+def _idle(judged: RequirementVerdict, each: Trigger) -> Bools:
     """Traces in scope that never trigger a part of a requirement, (traces,)."""
     return np.asarray(~judged.counted(np.asarray(each.hits.any(axis=0))))
 
@@ -127,6 +110,12 @@ def on_boundary(evidence: Evidence) -> Iterator[Fact]:
 
 
 def _fact(
-    code: str, judged: Judgement, text: str, *, at: Trigger | ir.Predicate, label: str = "", **more: Any
+    code: str,
+    judged: RequirementVerdict,
+    text: str,
+    *,
+    at: Trigger | ir.Predicate,
+    label: str = "",
+    **more: Any,
 ) -> Fact:
     return Fact(Diagnostic(code, text, at.span or judged.rule.span, label=label), judged.name, **more)

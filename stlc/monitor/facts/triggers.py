@@ -19,7 +19,8 @@ from stlc.compile.ir.discretize import to_window
 from stlc.compile.ir.traverse import absolute, leaves, numbers
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
-from stlc.monitor.judgement import Judgement, Part, Prepared
+from stlc.monitor.judgement import RequirementVerdict
+from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.uncertain import outer
 from stlc.monitor.values import bounds, by_truth
 from stlc.source import Span
@@ -47,9 +48,9 @@ class Trigger:
     kind: str = "triggered"
 
 
-def triggers(judged: Judgement, subject: Prepared) -> Iterator[Trigger]:
+def triggers(judged: RequirementVerdict, subject: Prepared) -> Iterator[Trigger]:
     """Yield the obligations of a requirement that depend on what the recording holds."""
-    part = judged.part or Part(0, subject.record.samples)
+    part = judged.part
     at = np.zeros((subject.record.samples, 1), dtype=bool)
     at[judged.start : judged.start + judged.instants] = True
     yield from _Walk(subject, part).visit(judged.rule.typed.formula, at)

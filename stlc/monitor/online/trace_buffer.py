@@ -16,11 +16,12 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import history as lookback
 from stlc.compile.ir.support import reach
 from stlc.compile.pipeline import Compiled, CompiledRequirement
-from stlc.monitor.explain.report import Cause, explain
+from stlc.monitor.explain.report import Cause, cause_of
 from stlc.monitor.instants import rule_bounds, window_of
-from stlc.monitor.judgement import Judgement, Prepared, Verdict
+from stlc.monitor.judgement import RequirementVerdict
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.streams import endless, looks_on
+from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
 
@@ -86,8 +87,12 @@ class TraceBuffer:
         step = None if dt is None else float(dt)
         signals = Signals(env, (), record.samples, NUMPY, dt=step, t0=self.t0 + first * (step or 0.0))
         fails = np.ones((1, 1), dtype=np.bool_)
-        judgement = Judgement(rule, start, low, high, ~fails, fails, ())
-        cause = explain(Verdict((judgement,), Prepared(self.compiled, (rule,), signals, record)), rule.name)
+        subject, part = Prepared(self.compiled, (rule,), signals, record), Part(0, record.samples)
+        cause = cause_of(
+            RequirementVerdict(
+                *(rule, start, low, high, ~fails, fails, (), part, subject.timeline), subject=subject
+            )
+        )
         if cause is None:
             return None
         sample = first + cause.sample

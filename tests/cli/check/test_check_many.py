@@ -244,9 +244,9 @@ def test_pieces_that_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_file_that_is_too_large_is_read_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     (name,) = files(a_trace(peak=3))
     monkeypatch.setattr("stlc.trace.chunks.LARGE", 100)
-    monkeypatch.setattr("stlc.cli.check.many.SMALL", 100)
+    monkeypatch.setattr("stlc.monitor.check.SMALL", 100)
     monkeypatch.setattr("stlc.trace.formats.registry.MAX_BYTES", size_of(Path(name)) - 1)
-    monkeypatch.setattr("stlc.cli.check.online.CHUNK", N // 2)
+    monkeypatch.setattr("stlc.monitor.check.CHUNK", N // 2)
     assert check("s.stl", name, "-q") == 1
     assert check("s.stl", name, "-q", "--resample", "1s") == 2
 

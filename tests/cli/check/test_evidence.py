@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from stlc.cli.check.evidence import Repetition
-from stlc.cli.check.judge import Question, betweens, clock_setting, options_of, uncertainties
+from stlc.cli.check.options import Judging
 from stlc.cli.framework.app import main
 
 SPEC = """import "part.stl" as part
@@ -131,20 +131,21 @@ def test_damaged_results_are_refused(
     assert "error[U10" in capsys.readouterr().err
 
 
-def test_options_state_the_question() -> None:
-    question = Question(
+def test_options_come_back_from_their_words() -> None:
+    options = Judging(
         spec=Path("a.stl"),
-        names={"x": "col a"},
-        resample=0.1,
-        between=betweens({"x": "hold:0.5s", "y": "angle"}),
-        clock=clock_setting("frame:frames", 25.0),
-        uncertain=uncertainties({"x": "0.1m", "y": "2%"}),
+        map_=["x=col a"],
+        resample="100ms",
+        between=["x=hold:0.5s", "y=angle"],
+        clock="frame:frames",
+        fps=25.0,
+        uncertain=["x=0.1m", "y=2%"],
         strict=True,
     )
-    assert options_of(question) == {
+    assert options.words() == {
         "--spec": ("a.stl",),
         "--map": ("x=col a",),
-        "--resample": ("0.1s",),
+        "--resample": ("100ms",),
         "--between": ("x=hold:0.5s", "y=angle"),
         "--clock": ("frame:frames",),
         "--fps": ("25.0",),
@@ -154,3 +155,4 @@ def test_options_state_the_question() -> None:
         "--semantics": ("exact",),
         "--strict": ("",),
     }
+    assert Judging.from_words(options.words()) == options

@@ -16,11 +16,11 @@ import pytest
 from helpers.exported import exported
 from helpers.several import ENVIRONMENT, free_port
 
-from stlc.cli.commands.explain import FOLDER, Example, Page, read_page
 from stlc.cli.framework.app import main
 from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
 from stlc.grammar.parse.tables import load_parser
+from stlc.grammar.show.manual import FOLDER, Example, Page, read_page
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.cli.framework.render import MAX_COLUMNS, render_text, to_json
+from stlc.cli.framework.render import MAX_COLUMNS, render_text
 from stlc.diagnostics import Diagnostic, Fix, Label
+from stlc.jsontext import plain
 from stlc.source import Source, Span
 
 TEXT = "spec s\nconst T_total = 0 s\n\n\n\n\n\n\n\ndef red = tau % T_total <= T_red\n"
@@ -181,7 +182,7 @@ def test_json():
         ("because",),
         Fix(((at("0 s"), "1 s"),), "round"),
     )
-    value = to_json(finding)
+    value = plain(finding)
     here = {"start": {"line": 2, "column": 17}, "end": {"line": 2, "column": 20}}
     there = {"start": {"line": 10, "column": 11}, "end": {"line": 10, "column": 14}}
     assert value == {
@@ -203,7 +204,7 @@ def test_json():
 
 
 def test_json_without_a_place():
-    value = to_json(Diagnostic("U102", "no file"))
+    value = plain(Diagnostic("U102", "no file"))
     assert (value["file"], value["range"], value["fix"], value["severity"]) == (None, None, None, "error")
 
 
@@ -217,4 +218,4 @@ def test_every_text_and_place_can_be_shown(text, data):
     finding = Diagnostic("E001", "m", spans[0], "p", tuple(Label(span, "s") for span in spans[1:]))
     rows = shown(finding).splitlines()
     assert sum("^" in row and row.endswith(" p") for row in rows) >= 1
-    assert json.dumps(to_json(finding))
+    assert json.dumps(plain(finding))

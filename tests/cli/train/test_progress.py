@@ -17,6 +17,7 @@ from stlc.cli.train.progress import (
     native_text,
     sparkline,
 )
+from stlc.view.learning import Learning
 
 RECORD = {"spec": "traffic", "system_path": "examples/car.yaml", "seed": 0, "threads": 2}
 INFO = (RECORD, "0001-quiet-heron")
@@ -33,13 +34,7 @@ ROW = {
     "failing": 55,
     "s_per_step": 0.0112,
 }
-VERDICT = {
-    "level": "trained",
-    "share_of_feasible": 0.988,
-    "sentence": "it is good",
-    "advice": [],
-    "next": "stlc simulate --backup",
-}
+VERDICT = Learning("trained", 0.988, "it is good", (), "stlc simulate --backup")
 RESULT = {
     "run": "runs/traffic/0001-quiet-heron",
     "seconds": 61.2,
@@ -187,13 +182,7 @@ def test_the_closing_screen_says_all_that_matters():
         "",
         "Next:  stlc simulate --backup",
     ]
-    poor = {
-        "level": "undertrained",
-        "share_of_feasible": 0.03,
-        "sentence": "it is poor",
-        "advice": ["more time", "luck"],
-        "next": "stlc train --resume 7",
-    }
+    poor = Learning("undertrained", 0.03, "it is poor", ("more time", "luck"), "stlc train --resume 7")
     lines = final_screen({**RESULT, "verdict": poor})
     assert lines[2] == "verdict         undertrained: it is poor"
     assert lines[-5:-3] == ["what helps      more time", "                luck"]

@@ -32,6 +32,7 @@ from stlc.controller.training.run import Run
 from stlc.dynamics.model.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
+from stlc.jsontext import plain
 from stlc.registry import METHODS
 from stlc.view.learning import Commands, driven_lines, recommended
 
@@ -97,7 +98,7 @@ def test_a_training_reports_its_drives(tmp_path: Path) -> None:
     outcome = train(task, config, open_folder(task, config, Launch(root=tmp_path)))
     record = outcome.run.dir.record()
     assert outcome.simulated is not None
-    assert record["result"]["closed_loop"] == outcome.simulated.summary()
+    assert record["result"]["closed_loop"] == plain(outcome.simulated)
     assert driven_lines(record["result"])
 
 
@@ -162,7 +163,7 @@ def test_what_was_driven_from_few_common_starts_is_left_out(run: Run) -> None:
     trial = trial_of(run, {"none": none, "paper": paper})
     shares = trial.shares()
     assert [(share.guard, share.runs, share.satisfied) for share in shares] == [("none", 20, 15)]
-    result = {"closed_loop": ClosedLoop(shares, 10, left_out=trial.left_out(shares)).summary()}
+    result = {"closed_loop": plain(ClosedLoop(shares, 10, left_out=trial.left_out(shares)))}
     assert driven_lines(result)[1:] == [
         "too few drives in the time to compare the paper's guard and the full guard"
     ]
@@ -174,7 +175,7 @@ def test_what_is_said_of_drives() -> None:
         Share("none", 60, 40, 50, broken=violated),
         Share("paper", 60, 59, 60, gained=20, lost=1, broken=(Violated("a", 1, 2.0),)),
     )
-    result = {"closed_loop": ClosedLoop(shares, 10).summary()}
+    result = {"closed_loop": plain(ClosedLoop(shares, 10))}
     assert driven_lines(result) == [
         "59 of 60 drives obeyed with the paper's guard: `a` (2 s); "
         "95 % interval 91.1 to 99.7 %, 100.0 % safe",
@@ -185,11 +186,11 @@ def test_what_is_said_of_drives() -> None:
     ]
     assert recommended({"result": result}) == "paper"
     near = (Share("none", 100, 99, None), Share("full", 100, 100, None, gained=1))
-    assert driven_lines({"closed_loop": ClosedLoop(near, 10).summary()})[-1] == (
+    assert driven_lines({"closed_loop": plain(ClosedLoop(near, 10))})[-1] == (
         "recommended after these drives: no guard (`stlc simulate`), the cheapest within 2 % of the best"
     )
     assert driven_lines({}) == []
-    (nothing,) = driven_lines({"closed_loop": ClosedLoop((), 10).summary()})
+    (nothing,) = driven_lines({"closed_loop": plain(ClosedLoop((), 10))})
     assert nothing.startswith("not driven: ")
     assert driven_lines({"closed_loop": {"guards": [{"guard": "none"}]}}) == []
     assert recommended({"result": {"closed_loop": {"recommended": "rm -rf"}}}) == "paper"

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.monitor.verdict import Monitor, Verdict
+from stlc.monitor.judgement import Verdict
+from stlc.monitor.verdict import Monitor
 
 HEAD = "signal x\nsignal y\nrequire r: "
 

@@ -1,0 +1,59 @@
+"""Results of the commands, from which the JSON Schemas of their documents are derived."""
+
+from __future__ import annotations
+
+from functools import reduce
+from importlib import import_module
+from operator import or_
+from typing import Any
+
+_DOCUMENTS = "stlc.cli.framework.documents"
+_ASSURED = "stlc.cli.framework.assured"
+RESULTS: dict[str, tuple[str, ...]] = {
+    "certify": (
+        f"{_ASSURED}:BoundedDrives",
+        f"{_ASSURED}:BoundedDraws",
+        "stlc.assurance.campaign:CertificateCheck",
+    ),
+    "check": ("stlc.assurance.certificate:BoundedVerdict", "stlc.assurance.certificate:JudgedFiles"),
+    "compile": (
+        "stlc.compile.described:CompiledSpec",
+        f"{_DOCUMENTS}:ParsedFile",
+        f"{_DOCUMENTS}:ParsedFiles",
+    ),
+    "doctor": (f"{_DOCUMENTS}:InstallationReport",),
+    "explain": (
+        "stlc.grammar.show.manual:CodeList",
+        "stlc.grammar.show.manual:Page",
+        "stlc.grammar.show.manual:SpecInWords",
+        "stlc.monitor.explain.tree:Explanation",
+        "stlc.controller.guard.coverage:Guarantee",
+    ),
+    "export": ("stlc.export.write:Exported",),
+    "falsify": (
+        f"{_ASSURED}:FalsifiedSystem",
+        f"{_ASSURED}:ReplayedCounterexample",
+        f"{_ASSURED}:ReplayedFinding",
+    ),
+    "fmt": (f"{_DOCUMENTS}:FormattedFiles",),
+    "init": (f"{_DOCUMENTS}:CreatedFiles",),
+    "lint": (f"{_DOCUMENTS}:LintedFiles",),
+    "plan": ("stlc.cli.framework.plan_documents:Plans",),
+    "plot": (f"{_DOCUMENTS}:PlottedTrace",),
+    "report": (f"{_DOCUMENTS}:WrittenReport",),
+    "runs": tuple(
+        f"{_DOCUMENTS}:{name}" for name in ("RunList", "RunComparison", "RunContent", "RemovedRuns")
+    ),
+    "simulate": (f"{_DOCUMENTS}:Simulation", "stlc.plants.judge:PlantSimulation"),
+    "stlc": (),
+    "system": ("stlc.dynamics.declaration.facts:SystemList", "stlc.dynamics.declaration.facts:SystemFacts"),
+    "train": (f"{_DOCUMENTS}:TrainedRun", f"{_DOCUMENTS}:TrainedRuns"),
+    "verify": ("stlc.assurance.verification.verified:Verified",),
+}
+"""Name of a command, or `stlc` for those without a result -> `module:class` of its results."""
+
+
+def result_of(command: str) -> Any:
+    """Type of the result of a command, or None."""
+    places = (place.partition(":") for place in RESULTS[command])
+    return reduce(or_, [getattr(import_module(module), name) for module, _, name in places], None)
