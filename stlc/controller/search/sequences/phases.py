@@ -1,10 +1,10 @@
 """Phases: short plans that reach a target while all safety requirements hold.
 
 A phase is found by its switches: plans that keep one level of the controls after another. From the best of
-them, Gauss-Newton steps meet the target at each of several samples, and the earliest that does is kept; where
-they fail, the local search of the native kernel goes on. The kernel computes the robustness of
-`safe until[0, L] (target and safe for a while)`. It serves all targets of a task. Further states, constant
-along a phase, say which target is asked for and at which samples it counts.
+them, Gauss-Newton steps meet the target at each of several samples, and safety where it is missed most up to
+there; the earliest that does is kept. Where they fail, the local search of the native kernel goes on. The
+kernel computes the robustness of `safe until[0, L] (target and safe for a while)`. It serves all targets of a
+task. Further states, constant along a phase, say which target is asked for and at which samples it counts.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ GENERATIONS = 8
 """Generations of a local search in a round of the search for a phase."""
 CLIMBED = 5
 """Number of plans that it improves."""
-STEERED = 3
+STEERED = 5
 """Number of plans that Gauss-Newton steps improve."""
 NEWTON = 6
 """Largest number of these steps."""
@@ -135,10 +135,17 @@ class Phases:
         steps: number of steps of a phase, L.
         untils: number of `until`s of which a request names the open ones.
         targets: the targets.
+        clauses: disjunctions of predicates that hold at every sample of a phase.
     """
 
     def __init__(
-        self, kernel: Kernel, system: System, steps: int, untils: int, targets: Sequence[ir.Formula]
+        self,
+        kernel: Kernel,
+        system: System,
+        steps: int,
+        untils: int,
+        targets: Sequence[ir.Formula],
+        clauses: Sequence[Sequence[ir.Predicate]],
     ) -> None:
         self._kernel, self.steps, self._untils = kernel, steps, untils
         self._names = system.names
@@ -151,6 +158,7 @@ class Phases:
         self._switches = _begins(steps, SWITCHES)
         self._known = [deque["Numbers"](maxlen=KEPT) for _ in targets]
         names = frozenset(system.names)
+        self._clauses = clauses
         self._demands = [[each for each in _demands(target, names) if each] for target in targets]
         number = np.searchsorted(_begins(steps, BLOCKS), np.arange(steps), side="right")
         blocks = number == np.unique(number)[:, None]
@@ -166,6 +174,7 @@ class Phases:
         untils: Sequence[ir.Formula],
         steps: int,
         scale: Callable[[ir.Formula], float],
+        clauses: Sequence[Sequence[ir.Predicate]],
     ) -> Phases | None:
         """Build the search; None without a compiler or a C form of the formulas.
 
@@ -176,6 +185,7 @@ class Phases:
             untils: formulas that hold at every sample of a phase while they are open.
             steps: number of steps of a phase.
             scale: function that returns the typical size of the margin of a predicate.
+            clauses: what of `safe` is a disjunction of predicates on the states.
         """
         motion = motion_of(system)
         weights = (WEIGHT.format(i) for i in range(WEIGHTS))
@@ -211,15 +221,15 @@ class Phases:
         if library is None:
             return None
         sizes = Sizes(len(motion.states), len(motion.controls), steps, 1)
-        return cls(Kernel(library, sizes), system, steps, len(untils), targets)
+        return cls(Kernel(library, sizes), system, steps, len(untils), targets, clauses)
 
     def reach(self, state: Numbers, ask: Ask, random: Generator, effort: int = 1) -> Phase:
         """Search for a phase from `state`, (n,), and make it shorter if it is found.
 
         `effort` is a factor of the generations of local searches.
         """
-        row = self._row(state, ask)
-        plans = np.stack((np.broadcast_to(self._middle, self._bank[0].shape), *self._known[ask.target]))
+        row, middle = self._row(state, ask), np.broadcast_to(self._middle, self._bank[0].shape)
+        plans = np.stack((middle, *self._known[ask.target]))
         rho = self._judged(np.repeat(row, len(plans), 0), plans)
         for _ in range(min(ROUNDS[0] + effort - 1, ROUNDS[1])):
             if rho.max() < 0.0:
@@ -233,17 +243,15 @@ class Phases:
                 break
             plans = plans[(-rho).argsort(kind="stable")[:KEPT]]
         if found.margin < -UNSURE:
-            plans, rho = self._steered(
-                row, ask, np.broadcast_to(self._middle, (1, *self._bank[0].shape)), NEWTON
-            )
+            plans, rho = self._steered(row, ask, middle[None], NEWTON)
             found = max(found, self._phase(row, plans[0]), key=lambda phase: phase.margin)
         shares = deque(SHORTER)
         while shares and found.margin >= 0.0 and found.sample > ask.first + SHORT:
             shorter = replace(ask, last=max(ask.first, int(shares[0] * found.sample)))
             row = self._row(state, shorter)
-            plans, rho = self._switched(row, shorter, found.plan[None], random)
+            plans, rho = self._twice(row, shorter, np.stack((found.plan, middle)), random)
             if rho.max() < 0.0:
-                plans, rho = self._steered(row, shorter, plans[(-rho).argsort(kind="stable")[:2]], 2)
+                plans, rho = self._steered(row, shorter, plans[(-rho).argsort(kind="stable")[:STEERED]], 2)
             if rho.max() < 0.0:
                 shares.popleft()
             else:
@@ -266,7 +274,7 @@ class Phases:
         self, row: Numbers, ask: Ask, plans: Numbers, random: Generator, effort: int
     ) -> tuple[Numbers, Numbers]:
         """Improve plans, (k, L, m), and return those that result, with their robustness."""
-        best, rho = self._switched(row, ask, plans, random)
+        best, rho = self._twice(row, ask, plans, random)
         if rho.max() >= 0.0:
             return best, rho
         kept = (-rho).argsort(kind="stable")[:CLIMBED]
@@ -283,6 +291,16 @@ class Phases:
         self.tried += len(kept) * effort * GENERATIONS * LANES
         best, rho = self._kernel.climb(rows, best[kept], options)
         return best, np.nan_to_num(rho, nan=-np.inf)
+
+    def _twice(self, row: Numbers, ask: Ask, plans: Numbers, random: Generator) -> tuple[Numbers, Numbers]:
+        """Return plans with one or two more switches than `plans`, (k, L, m), or the first on target."""
+        best, rho = self._switched(row, ask, plans, random)
+        if rho.max() >= 0.0:
+            return best, rho
+        again, found = self._switched(row, ask, best[(-rho).argsort(kind="stable")[:KEPT]], random)
+        if found.max() >= 0.0:
+            return again, found
+        return np.concatenate((best, again)), np.concatenate((rho, found))
 
     def _switched(self, row: Numbers, ask: Ask, plans: Numbers, random: Generator) -> tuple[Numbers, Numbers]:
         """Return plans that follow one of `plans`, (k, L, m), up to some sample and keep a level from there.
@@ -360,8 +378,10 @@ class Phases:
             ir.ELAPSED: np.broadcast_to(np.arange(self.steps + 1.0)[:, None], columns.shape[1:])
         }
         options = self._demands[ask.target]
-        literals = tuple(dict.fromkeys(each.literal for option in options for each in option))
-        if not literals:
+        literals = tuple(
+            dict.fromkeys((*(each.literal for option in options for each in option), *chain(*self._clauses)))
+        )
+        if not any(options):
             return np.empty((count, 0, *plans.shape[1:]))
         flat = {name: column.reshape(1, -1) for name, column in env.items()}
         values = np.stack(
@@ -374,19 +394,41 @@ class Phases:
         index = {literal: i for i, literal in enumerate(literals)}
         whens = np.unique(np.linspace(ask.first, ask.last, SAMPLES).round().astype(np.int64))
         now = values[..., 0]
-        slopes = (values[..., 1:] - now[..., None]) / PROBE  # per share of the range, inward
+        with np.errstate(invalid="ignore"):  # of infinities; not a number is no slope
+            slopes = (values[..., 1:] - now[..., None]) / PROBE  # per share of the range, inward
         tried: list[Numbers] = []
+        lacks, falls = self._unsafe(now, slopes, index, whens)
         for option in options:
             numbers = [index[each.literal] for each in option]
             at = np.minimum(whens[:, None] + [each.later for each in option], self.steps)
             spare = np.array([each.spare for each in option])
-            missing = spare[:, None] - now[numbers, at]  # (whens, demands, k)
-            tried.append(
-                self._solved(
-                    plans, inward, missing.transpose(2, 0, 1), slopes[numbers, at].transpose(2, 0, 1, 3)
-                )
-            )
+            missing = np.concatenate((spare[:, None] - now[numbers, at], lacks), 1)
+            grow = np.concatenate((slopes[numbers, at], falls), 1)
+            tried.append(self._solved(plans, inward, missing.transpose(2, 0, 1), grow.transpose(2, 0, 1, 3)))
         return np.concatenate(tried, 1)
+
+    def _unsafe(
+        self, now: Numbers, slopes: Numbers, index: dict[ir.Predicate, int], whens: NDArray[np.int64]
+    ) -> tuple[Numbers, Numbers]:
+        """Return what safety lacks where it lacks most, (whens, clauses, k), and its derivatives.
+
+        Of each clause, that is its greatest literal at the sample up to each of `whens` where this is least.
+
+        Args:
+            now: values of the literals, (literals, L + 1, k).
+            slopes: their derivatives, (literals, L + 1, k, moves).
+            index: literal -> its row.
+            whens: samples up to which safety counts.
+        """
+        each = np.arange(now.shape[-1])
+        literals = np.empty((len(whens), len(self._clauses), len(each)), dtype=np.int64)
+        samples = np.empty_like(literals)
+        for i, clause in enumerate(self._clauses):
+            numbers = np.array([index[literal] for literal in clause])
+            margins = now[numbers].max(0)
+            worst = np.stack([margins[: when + 1].argmin(0) for when in whens])
+            samples[:, i], literals[:, i] = worst, numbers[now[numbers].argmax(0)[worst, each]]
+        return SPARE - now[literals, samples, each], slopes[literals, samples, each]
 
     def _solved(self, plans: Numbers, inward: Numbers, missing: Numbers, slopes: Numbers) -> Numbers:
         """Return plans after the least changes by which linearised values grow by what is missing.

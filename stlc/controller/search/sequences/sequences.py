@@ -195,7 +195,14 @@ class Sequences:
     @cached_property
     def _phases(self) -> Phases | None:
         safe, scale = joined("and", self._safe, YES), self._scales(self._targets, self._state)
-        return Phases.of(self.task.system, safe, self._targets, self._kept, self.steps, scale)
+        known = frozenset(self.task.system.names)
+        clauses = [
+            [part for part in clause if isinstance(part, ir.Predicate)]
+            for formula in self._safe
+            for clause in clauses_of(formula)
+            if all(isinstance(part, ir.Predicate) and columns(part) <= known for part in clause)
+        ]
+        return Phases.of(self.task.system, safe, self._targets, self._kept, self.steps, scale, clauses)
 
     def root(self, state: Tensor) -> Node | None:
         """Return the empty prefix at `state`, (n,), None if nothing leads from there to all goals."""

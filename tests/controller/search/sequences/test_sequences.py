@@ -63,6 +63,33 @@ def test_a_phase_reaches_its_target_and_stays_safe(handover: Task) -> None:
     assert np.array_equal(phase.plan, again.plan)
 
 
+def test_a_phase_is_short_where_safety_binds_the_way_to_its_target(tmp_path: Path) -> None:
+    """The arm goes out only in front of the station, where no sequence of whole turns leads."""
+    (tmp_path / "arm.yaml").write_text(
+        "stlc: 1\nname: arm\ntime: {dt: 0.5 s, horizon: 108 s}\n"
+        "state: {th: {range: [-1, 5]}, out: {range: [0, 1], clamp: true}, got: {bool: true}}\n"
+        "control: {turn: {range: [-1.2, 1.2]}, push: {range: [-0.8, 0.8]}}\n"
+        "flow: {th: turn, out: push}\n"
+        "jump: [{name: take, guard: out >= 0.9 and abs(th) <= 0.12, reset: {got: true}}]\n"
+        "init: {mixture: [{draw: {th: 3.74, out: 0, got: false}}]}\n"
+    )
+    (tmp_path / "take.stl").write_text(
+        'spec take\nsystem "arm.yaml"\nstate signal th, out\nstate signal got : bool\n'
+        "def facing(a) = abs(th - a) <= 0.12\n"
+        "@safety\nrequire aligned: always[0, T] (out > 0.15 -> facing(0) or facing(2.0944) or facing(4.1888))\n"
+        "require taken: eventually[0, T] got\n"
+    )
+    task = load_task(tmp_path / "take.stl")
+    x0 = task.sample(1, seed=0)[0].double()
+    sequences = Sequences(task, x0)
+    if sequences._phases is None:
+        pytest.skip("no C compiler")
+    ask = Ask(sequences._first_step, 0, sequences.steps - 1)
+    found = [sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(seed)) for seed in range(6)]
+    assert min(phase.margin for phase in found) >= 0.0
+    assert max(phase.sample for phase in found) <= 18
+
+
 def test_a_target_out_of_reach_is_approached(handover: Task) -> None:
     x0 = handover.sample(1, seed=0)[0].double()
     sequences = Sequences(handover, x0)
