@@ -26,7 +26,7 @@ from stlc.registry import PLANNERS, closest
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
-PLANNING_VERSION = 3
+PLANNING_VERSION = 4
 """Version of the planners, raised with every change of the plans that they find within a budget."""
 RATE = 50_000.0
 """Judged plans that count as a second where time is not limited."""

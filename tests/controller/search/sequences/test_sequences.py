@@ -76,7 +76,7 @@ def test_a_phase_is_short_where_safety_binds_the_way_to_its_target(tmp_path: Pat
     (tmp_path / "take.stl").write_text(
         'spec take\nsystem "arm.yaml"\nstate signal th, out\nstate signal got : bool\n'
         "def facing(a) = abs(th - a) <= 0.12\n"
-        "@safety\nrequire aligned: always[0, T] (out > 0.15 -> facing(0) or facing(2.0944) or facing(4.1888))\n"
+        "@safety\nrequire aligned: always[0, T] (out > 0.15 -> facing(0) or facing(2.1) or facing(4.2))\n"
         "require taken: eventually[0, T] got\n"
     )
     task = load_task(tmp_path / "take.stl")
