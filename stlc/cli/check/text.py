@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stlc.cli.framework.output import table
-from stlc.cli.framework.render import render_place
+from stlc.cli.framework.render import Paint, render_place
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.escape import operand, shell, visible
 
@@ -36,7 +36,13 @@ def verdict_text(verdict: Verdict, replay: Sequence[str], *, color: bool) -> str
     title = f"{visible(about.source.name)} on {visible(about.trace)}    {size}"
     least = "robustness (min over traces)" if several else "robustness"
     cells = [_cells(row, verdict) for row in verdict]
-    lines = [title, "", table(cells, header=("requirement", "verdict", least, "starts", "where"))]
+    rows = table(cells, header=("requirement", "verdict", least, "starts", "where")).split("\n")
+    red = Paint(color)("error", WORDS["violated"])
+    body = (
+        line.replace(WORDS["violated"], red, 1) if row.overall == "violated" else line
+        for row, line in zip(verdict, rows[1:], strict=True)
+    )
+    lines = [title, "", rows[0], *body]
     lines += [f"  clock {visible(str(clock))}" for clock in about.clocks if not clock.plain]
     lines += [f"  `{visible(name)}` may be off by {error}" for name, error in verdict.uncertain.items()]
     lines += [f"  {text}" for text in (*_gap_texts(verdict).values(), *map(fact_text, verdict.remarks))]

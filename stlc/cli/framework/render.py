@@ -33,7 +33,7 @@ _STYLES = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Paint:
+class Paint:
     """Function that adds the colour codes of a style to a text.
 
     If `color` is False, it returns the text unchanged.
@@ -59,12 +59,12 @@ class _Mark:
 
 def render_text(diagnostics: Iterable[Diagnostic], *, color: bool) -> str:
     """Findings as text, with an empty line between two findings and a line break at the end."""
-    paint = _Paint(color)
+    paint = Paint(color)
     blocks = ["\n".join(_block(diagnostic, paint)) for diagnostic in diagnostics]
     return "\n\n".join(blocks) + "\n" if blocks else ""
 
 
-def _block(diagnostic: Diagnostic, paint: _Paint) -> Iterator[str]:
+def _block(diagnostic: Diagnostic, paint: Paint) -> Iterator[str]:
     title = f"{diagnostic.severity}[{diagnostic.code}]"
     yield f"{paint(diagnostic.severity, title)}{paint('headline', f': {visible(diagnostic.message)}')}"
     yield from _body(_marks(diagnostic), _advice(diagnostic), paint, diagnostic.severity)
@@ -80,11 +80,11 @@ def render_place(
     """
     marks = [_Mark(place.span, place.text, primary=True)]
     marks += [_Mark(label.span, label.text, primary=False) for label in labels]
-    return "\n".join(_body(marks, advice, _Paint(color), "error")) + "\n"
+    return "\n".join(_body(marks, advice, Paint(color), "error")) + "\n"
 
 
 def _body(
-    marks: Sequence[_Mark], advice: Iterable[tuple[str, str]], paint: _Paint, severity: str
+    marks: Sequence[_Mark], advice: Iterable[tuple[str, str]], paint: Paint, severity: str
 ) -> Iterator[str]:
     width = max((len(str(mark.span.line)) for mark in marks), default=1)
     margin = " " * (width + 1)
@@ -113,7 +113,7 @@ def _marks(diagnostic: Diagnostic) -> list[_Mark]:
 # ---------------------------------------------------------------------- snippets
 
 
-def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
+def _snippets(marks: Sequence[_Mark], width: int, paint: Paint, severity: str) -> Iterator[str]:
     """Yield the lines of the source excerpts, one excerpt per file.
 
     The first excerpt is that of the file in which the finding itself lies. `width` is the number of digits of
@@ -131,7 +131,7 @@ def _snippets(marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) 
     yield f"{margin} {paint('frame', '|')}"
 
 
-def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: _Paint, severity: str) -> Iterator[str]:
+def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: Paint, severity: str) -> Iterator[str]:
     previous: int | None = None
     for number in sorted({mark.span.line for mark in marks}):
         if previous is not None and number > previous + 1:

@@ -404,3 +404,15 @@ def test_the_units_of_margins_that_are_compared_stand_in_the_row(tmp_path, capsy
     rows = capsys.readouterr().out
     assert re.search(r"a +satisfied +\+1\.000 W\|rad/s", rows)
     assert re.search(r"b +satisfied +\+1\.000 W\n", rows)
+
+
+def test_what_is_violated_is_red_on_a_terminal_alone(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT / "examples/recording")
+    assert main(["check", "tank.stl", "tank.csv", "--color", "always"]) == 1
+    colored = capsys.readouterr().out
+    assert "  filled       \x1b[1;31mVIOLATED\x1b[0m     -0.091 m" in colored
+    assert "no_overflow  satisfied" in colored
+    assert main(["check", "tank.stl", "tank.csv"]) == 1
+    plain = capsys.readouterr().out
+    assert "\x1b" not in plain
+    assert re.sub(r"\x1b\[[\d;]*m", "", colored) == plain
