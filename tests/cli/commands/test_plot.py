@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.walks import walk
 
-from stlc.cli.commands.plot import _with_units
+from stlc.cli.commands.plot import _as_declared
 from stlc.cli.framework.app import main
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
@@ -79,7 +79,7 @@ def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
 def test_a_file_without_units_is_labelled_with_those_of_the_specification(tmp_path):
     (tmp_path / "tank.csv").write_text("t,level\n0,1\n1,2\n2,3\n")
     trace = load_trace(tmp_path / "tank.csv")
-    told = _with_units(trace, parse(Source("tank.stl", TANK)))
+    told = _as_declared(trace, parse(Source("tank.stl", TANK)))
     assert (trace.signature["level"].unit.text, told.signature["level"].unit.text) == ("", "m")
 
 
