@@ -46,7 +46,7 @@ def git_state(folder: Path | None = None) -> dict[str, Any] | None:
 def _git(folder: Path | None, *arguments: str) -> str | None:
     try:
         done = subprocess.run(
-            ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=5, check=True
+            ["git", *arguments], cwd=folder, capture_output=True, encoding="utf-8", timeout=5, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return None

@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from stlc import cache
 from stlc.cache import Cache
@@ -251,7 +252,7 @@ def run(command: Sequence[str], *, given: str = "") -> ProgramResult:
                     command, stdin=into, stdout=out, stderr=errors, start_new_session=True
                 )
             started = process
-            with leaving(lambda _code: _kill(started)):
+            with leaving(lambda _code: kill_session(started)):
                 with suppress(ImportError, AttributeError, OSError, ValueError):
                     import resource
 
@@ -350,12 +351,12 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         pass
     finally:
-        _kill(process)
+        kill_session(process)
         process.wait()
 
 
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill all processes of the session that `process` leads."""
+def kill_session(process: subprocess.Popen[Any]) -> None:
+    """Kill all processes of the session that `process` leads; on Windows, the process alone."""
     with suppress(OSError):
         if hasattr(os, "killpg"):
             os.killpg(process.pid, signal.SIGKILL)

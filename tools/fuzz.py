@@ -207,7 +207,7 @@ def peak():
 
 def limit_address_space(megabytes):
     """Limit the address space of this process to its present size plus `megabytes`."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    used = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (megabytes << 20),) * 2)
 
 
@@ -220,12 +220,12 @@ def import_everything(kinds=()):
     missing = [*fuzz_foreign.prepare(), *fuzz_valid.prepare(tuple(set(FORMATS) & set(kinds or FORMATS)))]
     if not kinds or {"run", "hostile"} & {*kinds}:
         missing += fuzz_runs.prepare()
-    Path("a.stl").write_text(SMALL)
+    Path("a.stl").write_text(SMALL, encoding="utf-8")
     Path("t.npz").write_bytes(small_trace())
     for suffix in ("csv", "mat", "mcap", "parquet"):
         Path(f"t.{suffix}").write_bytes(b"t,x\n0,1\n1,2\n")
         _call(["check", "a.stl", f"t.{suffix}"], limits)
-    Path("b.yaml").write_text(SYSTEM)
+    Path("b.yaml").write_text(SYSTEM, encoding="utf-8")
     _call(["system", "check", "b.yaml"], limits)
     for arguments in (["compile", "a.stl"], ["check", "a.stl", "t.npz"], ["lint", "a.stl"], ["fmt", "a.stl"]):
         _call(arguments, limits)

@@ -215,7 +215,7 @@ class Place:
     def stlc(self, words: str, given: str | None = None) -> dict[str, Any]:
         """The outcome of `stlc …` with `given` on the standard input: exit code and document or text."""
         out, err, before = io.StringIO(), io.StringIO(), sys.stdin
-        sys.stdin = io.TextIOWrapper(io.BytesIO((given or "").encode()))
+        sys.stdin = io.TextIOWrapper(io.BytesIO((given or "").encode()), encoding="utf-8")
         try:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
                 code = stlc_main(words.split())

@@ -49,9 +49,9 @@ WORKER = (b"ray::answer", b"ray::IDLE")
 
 def write(files: int, samples: int) -> None:
     """Write recordings and specifications into the current folder."""
-    Path("s.stl").write_text(SPEC)
-    Path("oscillator.yaml").write_text(SYSTEM)
-    Path("oscillator.stl").write_text(CLAIM)
+    Path("s.stl").write_text(SPEC, encoding="utf-8")
+    Path("oscillator.yaml").write_text(SYSTEM, encoding="utf-8")
+    Path("oscillator.stl").write_text(CLAIM, encoding="utf-8")
     for index in range(files):
         generator, t = np.random.default_rng(index), np.arange(samples) * 0.1
         a = np.sin(t + index) + (1.5 if index % 7 == 0 else 0.9) * (t > 30)

@@ -172,7 +172,9 @@ def write_onnx(run: Run, folder: Path, real: Precision = "float64") -> None:
         data = model_of(Path(name).stem, outputs, {"stlc": dumps(facts)}, real)
         (folder / name).write_bytes(data)
         digests[name] = sha256(data)
-    (folder / FACTS).write_text(dumps({**facts, "files": digests}, indent=1) + "\n", encoding="utf-8")
+    (folder / FACTS).write_text(
+        dumps({**facts, "files": digests}, indent=1) + "\n", encoding="utf-8", newline="\n"
+    )
 
 
 def _facts(run: Run) -> dict[str, object]:

@@ -154,7 +154,7 @@ def _torch(run: Run, folder: Path, precision: Precision) -> Checked:  # noqa: AR
     path, backup = folder / "decide.pt2", folder / "backup.pt2"
     torch.export.save(recorded(run.task, run.network), path)
     torch.export.save(recorded_guard(run.task, run.network), backup)
-    (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8")
+    (folder / "controller.json").write_text(dumps(_facts(run)) + "\n", encoding="utf-8", newline="\n")
     fresh = agreement(run.policy, by_torch(path), states=STATES)
     guarded = backup_agreement(run.policy, backup_by_torch(backup, run.policy), states=GUARDED)
     return fresh.worst(guarded), None
@@ -200,7 +200,7 @@ def _c(run: Run, folder: Path, precision: Precision) -> Checked:  # noqa: ARG001
         "Makefile": c_header.makefile(),
     }
     for name, content in texts.items():
-        (folder / name).write_text(content, encoding="utf-8")
+        (folder / name).write_text(content, encoding="utf-8", newline="\n")
     program = by_c(folder, run.task, folder / BUILT)
     guarded = backup_agreement(run.policy, program("backup"), states=GUARDED)
     return agreement(run.policy, program("policy"), states=STATES).worst(guarded), None

@@ -49,12 +49,13 @@ def pytest_runtest_protocol() -> Iterator[Any]:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[Any]:
     report = yield
-    error = None if call.excinfo is None else call.excinfo.value
-    if isinstance(error, ModuleNotFoundError):  # also that of a fixture that failed before
-        ABSENT.asked |= {package_of(error.name or "")} & OPTIONAL
-    if report.failed and ABSENT.asked:
-        report.outcome = "skipped"
-        report.longrepr = (str(item.path), 0, f"needs {', '.join(sorted(ABSENT.asked))}")
+    if report.failed and call.excinfo is not None:
+        error: Any = call.excinfo.value
+        needs = ABSENT.asked or getattr(error, "needs", set())  # that of a fixture, which fails again
+        if needs:
+            error.needs = set(needs)
+            report.outcome = "skipped"
+            report.longrepr = (str(item.path), 0, f"needs {', '.join(sorted(needs))}")
     return report
 
 

@@ -4,6 +4,7 @@ It lacks the modules, functions, flags and signals of POSIX, and finds no C comp
 """
 
 import ctypes.util  # noqa: F401 - asks for the name of the system
+import multiprocessing.popen_fork
 import os
 import select
 import shutil
@@ -14,7 +15,7 @@ import sys
 MODULES = ("fcntl", "resource", "termios", "tty", "pty", "pwd", "grp", "syslog")
 SYSTEM = (
     *("fork", "forkpty", "register_at_fork", "killpg", "getpgid", "setsid", "set_blocking", "get_blocking"),
-    *("getuid", "geteuid", "getgid", "getegid", "fchmod", "mkfifo", "sysconf", "getloadavg", "nice"),
+    *("geteuid", "getegid", "fchmod", "mkfifo", "sysconf", "getloadavg", "nice"),
     *("sched_getaffinity", "sched_setaffinity", "O_NONBLOCK", "O_NOFOLLOW", "O_DIRECTORY", "O_CLOEXEC"),
 )
 SIGNALS = (
@@ -33,7 +34,9 @@ for _module, _names in ((os, SYSTEM), (signal, SIGNALS), (select, ("poll", "epol
     for _name in _names:
         if hasattr(_module, _name):
             delattr(_module, _name)
-subprocess.Popen.kill = subprocess.Popen.terminate  # as on Windows
+for _process in (subprocess.Popen, multiprocessing.popen_fork.Popen):
+    _process.kill = _process.terminate  # as on Windows
 shutil.which = _found_elsewhere(shutil.which)
 os.environ.pop("CC", None)
+multiprocessing.set_start_method("spawn")
 os.name = "neither"

@@ -17,6 +17,7 @@ from queue import SimpleQueue
 from typing import Any, Protocol
 
 from stlc.stopping import CHILD, PATIENCE, leaving
+from stlc.toolchain import kill_session
 
 TAIL = 12
 """Number of stored lines of a process's error output."""
@@ -170,8 +171,7 @@ class LocalExecutor:
     def kill(self, _code: int = 0) -> None:
         """Kill every process and its children."""
         for process in tuple(self.live):
-            with suppress(OSError):
-                os.killpg(process.pid, signal.SIGKILL)
+            kill_session(process)
 
 
 def start(arguments: Sequence[str], share: frozenset[int] | None = None) -> subprocess.Popen[str]:

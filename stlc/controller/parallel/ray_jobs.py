@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,8 +21,8 @@ from stlc.controller.parallel.workers import CallFiles, LostCall
 from stlc.files import RECORD, atomic_path
 from stlc.rundir import RUNS, RunDir
 
-LOST = -signal.SIGKILL
-"""Exit code of a job whose worker is lost."""
+LOST = -9
+"""Exit code of a job whose worker is lost, as after SIGKILL."""
 _OTHER_VERSION = 5
 _PATIENCE = 60.0
 """Seconds for interrupted trainings to save."""

@@ -259,7 +259,7 @@ def end_in_words(code: int) -> str:
     if code >= 0:
         return f"its process ended with exit code {code}"
     name = signal.Signals(-code).name if -code in {*signal.Signals} else f"signal {-code}"
-    memory = ", as the system does for lack of memory" if -code == signal.SIGKILL else ""
+    memory = ", as the system does for lack of memory" if name == "SIGKILL" else ""
     return f"its process was ended by {name}{memory}"
 
 
