@@ -33,9 +33,10 @@ from benchmarks.tables import (
     uncertain,
     verify,
 )
-from stlc.cli.framework.documents import DocumentRecord, Num
+from stlc.cli.framework.documents import Num
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
+from stlc.cli.framework.results import DocumentRecord
 from stlc.records import schema_of
 
 NAME = "benchmarks/1"

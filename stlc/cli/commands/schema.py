@@ -9,7 +9,7 @@ import typer
 
 from stlc.cli.framework.output import emit
 from stlc.cli.framework.program import command
-from stlc.cli.framework.results import RESULTS, result_of
+from stlc.cli.framework.results import RESULTS, DocumentRecord, result_of
 from stlc.diagnostics import usage
 from stlc.registry import did_you_mean
 
@@ -64,10 +64,11 @@ def load_schema(name: str) -> dict[str, Any]:
         from stlc.plants.declaration import plant_schema
 
         return {"$schema": _DIALECT, "title": wanted, **plant_schema()}
-    from stlc.cli.framework.documents import DocumentRecord, RobustnessLine
     from stlc.records import schema_of
 
     if command == LINE:
+        from stlc.cli.framework.documents import RobustnessLine
+
         return {"$schema": _DIALECT, "title": wanted, **schema_of(RobustnessLine)}
     frame = schema_of(DocumentRecord)
     frame["properties"] |= {"schema": {"const": wanted}, "result": schema_of(result_of(command))}

@@ -11,7 +11,6 @@ from stlc.cli.framework.assured import FalsificationRounds
 from stlc.controller.evaluation.closed_loop import ClosedLoop
 from stlc.controller.evaluation.deployment import DecisionLatency
 from stlc.controller.evaluation.stats import MeanInterval
-from stlc.diagnostics import Diagnostic
 from stlc.view.learning import Learning
 
 Num: TypeAlias = float | str
@@ -44,15 +43,6 @@ class FormattedFiles(TypedDict):
     changed: list[str]
     written: bool
     diff: NotRequired[str]
-
-
-class DocumentRecord(TypedDict):
-    stlc: str
-    schema: str
-    ok: bool
-    exit_code: int
-    diagnostics: list[Diagnostic]
-    result: Any
 
 
 class CreatedFiles(TypedDict):

@@ -5,7 +5,9 @@ from __future__ import annotations
 from functools import reduce
 from importlib import import_module
 from operator import or_
-from typing import Any
+from typing import Any, TypedDict
+
+from stlc.diagnostics import Diagnostic
 
 _DOCUMENTS = "stlc.cli.framework.documents"
 _ASSURED = "stlc.cli.framework.assured"
@@ -51,6 +53,17 @@ RESULTS: dict[str, tuple[str, ...]] = {
     "verify": ("stlc.assurance.verification.verified:Verified",),
 }
 """Name of a command, or `stlc` for those without a result -> `module:class` of its results."""
+
+
+class DocumentRecord(TypedDict):
+    """Keys that the documents of all commands share."""
+
+    stlc: str
+    schema: str
+    ok: bool
+    exit_code: int
+    diagnostics: list[Diagnostic]
+    result: Any
 
 
 def result_of(command: str) -> Any:
