@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from stlc.compile.frontend.modules import spec_sha256
 from stlc.controller.evaluation.executed import model_consistent
-from stlc.controller.training.run import read_library
+from stlc.controller.planning.traces import meta_of, trace_along
 from stlc.files import atomic_path
-from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
-from stlc.rundir import SPEC, SYSTEM, TRACE, UNGUARDED
-from stlc.source import Source
-from stlc.trace import Trace, TraceMeta, save_trace
-from stlc.version import __version__
+from stlc.rundir import TRACE, UNGUARDED
+from stlc.trace import save_trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +22,7 @@ if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording, Setting
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.training.run import Run
-    from stlc.dynamics.model.system import System
+    from stlc.trace import Trace
 
 
 def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:
@@ -48,33 +42,25 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
 
     The arrays `seed` and `agent` have the shape (traces,).
     """
-    system = run.task.system
-    states = np.moveaxis(recording.states, -1, 0)
-    actions = zip(system.control_names, np.moveaxis(_commanded(system, recording), -1, 0), strict=True)
     rows = np.arange(len(recording.states))
-    return Trace(
-        signature=system.signature,
-        dt=run.task.system.dt,
-        data=dict(zip(run.task.system.names, states, strict=True)),
-        extras={
-            **{f"action.{name}": action for name, action in actions},
-            "decision": recording.source,
-            "t0": recording.t0,
-            "plan_rho": recording.rho,
-            "policy_rho": recording.policy_rho,
-            "foreseen": model_consistent(run.task, recording).astype(np.int8),
-            "seed": np.array(setting.seeds)[rows // recording.agents],
-            "agent": rows % recording.agents,
-        },
-        meta=_meta(run, setting, rules),
-    )
-
-
-def _commanded(system: System, recording: DeploymentRecording) -> NDArray[np.float64]:
-    """Actuator commands of the recorded actions, with the feedback around plans, (rows, steps, m)."""
-    states = torch.from_numpy(recording.states[:, :-1]).flatten(0, 1)
-    planned = torch.from_numpy(recording.actions)
-    return system.commanded(states, planned.flatten(0, 1)).reshape(planned.shape).numpy()
+    extras = {
+        "decision": recording.source,
+        "t0": recording.t0,
+        "plan_rho": recording.rho,
+        "policy_rho": recording.policy_rho,
+        "foreseen": model_consistent(run.task, recording).astype(np.int8),
+        "seed": np.array(setting.seeds)[rows // recording.agents],
+        "agent": rows % recording.agents,
+    }
+    states, actions = torch.from_numpy(recording.states), torch.from_numpy(recording.actions)
+    record = run.dir.record()
+    paths = {key: str(record.get(key, "")) for key in ("spec_path", "system_path")}
+    meta = replace(meta_of(run.task, setting.seeds[0]), run=run.dir.name, **paths)
+    if rules is not None:
+        spec, changed = rules.spec, dict(rules.overrides)
+        meta = replace(meta, judge_path=rules.path, judge_text=spec.source.text, judge_set=changed)
+        meta = replace(meta, judge_library=dict(spec.library or {}))
+    return trace_along(run.task, states, actions, extras, meta)
 
 
 def save_trace_of(
@@ -123,40 +109,6 @@ def save_unguarded(
     extras = {name: rows[first] for name, rows in trace.extras.items()}
     save_trace(trace_path, replace(trace, data=data, extras=extras))
     save_scene(scene_path, recording.scene)
-
-
-def _meta(run: Run, setting: Setting, rules: Rules | None) -> TraceMeta:
-    record, spec = run.dir.record(), run.dir.source(SPEC).text
-    library = read_library(run.dir)
-    return TraceMeta(
-        spec_name=run.task.compiled.name,
-        spec_path=str(record.get("spec_path", "")),
-        spec_text=spec,
-        spec_library=library,
-        spec_set=_set_in(spec, run),
-        spec_hash=spec_sha256(spec, library),
-        judge_path="" if rules is None else rules.path,
-        judge_text="" if rules is None else rules.spec.source.text,
-        judge_library={} if rules is None else dict(rules.spec.library or {}),
-        judge_set={} if rules is None else dict(rules.overrides),
-        system_name=run.task.system.decl.name,
-        system_path=str(record.get("system_path", "")),
-        system_text=run.dir.source(SYSTEM).text,
-        system_hash=run.task.system.decl.hash,
-        run=run.dir.name,
-        seed=setting.seeds[0],
-        horizon=run.task.window,
-        dt=run.task.system.dt,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        stlc_version=__version__,
-    )
-
-
-def _set_in(spec: str, run: Run) -> dict[str, str]:
-    """Values that replaced those in the specification text, in training or deployment: constant -> text."""
-    own = {item.name for item in parse(Source(SPEC, spec)).items if isinstance(item, (ast.Const, ast.Param))}
-    changed = run.task.system.decl.overrides.items()
-    return {name: text for name, text in changed if name in own and name not in run.task.system.names}
 
 
 def save_scene(path: Path, scene: Mapping[str, NDArray[Any]]) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,6 +24,10 @@ from stlc.units import parse_quantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner import PlanResult
 
@@ -146,28 +150,41 @@ def trace_of(task: Task, result: PlanResult, seed: int | None = None) -> Trace:
     - `plan_rho`, (traces,): the robustness of each plan.
     - `infeasible`, (traces,): 1 if the planner proved that no plan satisfies the specification, else 0.
     """
-    states = task.rollout(result.states, result.plans).numpy()
-    commanded = task.system.commanded(
-        torch.as_tensor(states[:, :-1]).flatten(0, 1), result.plans.flatten(0, 1)
-    ).reshape(result.plans.shape)
-    actions = zip(task.system.control_names, np.moveaxis(commanded.numpy(), -1, 0), strict=True)
+    extras = {"plan_rho": result.rho.numpy(), "infeasible": result.infeasible.numpy().astype(np.int8)}
+    states = task.rollout(result.states, result.plans)
+    return trace_along(task, states, result.plans, extras, meta_of(task, seed))
+
+
+def trace_along(
+    task: Task, states: Tensor, plans: Tensor, extras: Mapping[str, NDArray[Any]], meta: TraceMeta
+) -> Trace:
+    """Content of a trace file with states and actuator commands.
+
+    Args:
+        task: specification and system.
+        states: (traces, steps + 1, n).
+        plans: controls as they were planned, (traces, steps, m).
+        extras: further arrays.
+        meta: origin of the trace.
+    """
+    system, controls = task.system, plans.flatten(0, 1)
+    commanded = system.commanded(states[:, :-1].flatten(0, 1), controls).reshape(plans.shape)
+    actions = zip(system.control_names, np.moveaxis(commanded.numpy(), -1, 0), strict=True)
     return Trace(
-        signature=task.system.signature,
-        dt=task.system.dt,
-        data=dict(zip(task.system.names, np.moveaxis(states, -1, 0), strict=True)),
-        extras={
-            **{f"action.{name}": action for name, action in actions},
-            "plan_rho": result.rho.numpy(),
-            "infeasible": result.infeasible.numpy().astype(np.int8),
-        },
-        meta=_meta(task, seed),
+        signature=system.signature,
+        dt=system.dt,
+        data=dict(zip(system.names, np.moveaxis(states.numpy(), -1, 0), strict=True)),
+        extras={**{f"action.{name}": action for name, action in actions}, **extras},
+        meta=meta,
     )
 
 
-def _meta(task: Task, seed: int | None) -> TraceMeta:
+def meta_of(task: Task, seed: int | None) -> TraceMeta:
+    """Origin of a trace of a task: texts and hashes of its files, and versions."""
     spec, decl = task.compiled.spec, task.system.decl
     library = library_of(spec)
-    own = {each.name for each in spec.items if isinstance(each, (ast.Const, ast.Param))}
+    names = {each.name for each in spec.items if isinstance(each, (ast.Const, ast.Param))}
+    own = names - {*task.system.names}
     return TraceMeta(
         spec_name=task.compiled.name,
         spec_path=spec.source.name,
