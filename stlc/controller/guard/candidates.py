@@ -6,7 +6,7 @@ A guard judges each plan of the policy at run time. If it rejects a plan, it cho
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import inf
 from time import perf_counter
 from typing import TYPE_CHECKING, TypeAlias
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.controller.problem.rows import Rows
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class Candidates(Rows):
     """Plans with their verdicts.
 
     The leading dimensions (…) are (agents,), or (agents, choices) if every agent has several plans to choose
@@ -96,22 +97,13 @@ class Candidates:
         """Mask of the plans that satisfy phi_safe (the requirements tagged `@safety`), (…) booleans."""
         return self.safe >= -TOLERANCE
 
-    def of(self, rows: Tensor) -> Candidates:
-        """Select agents by indices (k,) or by a mask (agents,)."""
-        return Candidates(*(getattr(self, name)[rows] for name in _FIELDS))
-
     def pick(self, choice: Tensor) -> Candidates:
         """Select one of the several plans of each agent: (agents, choices) -> (agents,).
 
         `choice`: for each agent the index of its plan, (agents,).
         """
         rows = torch.arange(len(choice), device=choice.device)
-        return Candidates(*(getattr(self, name)[rows, choice] for name in _FIELDS))
-
-    def put(self, rows: Tensor, other: Candidates) -> None:
-        """Replace the plans of the agents with indices `rows`, (k,), by those of `other`, (k, …)."""
-        for name in _FIELDS:
-            getattr(self, name)[rows] = getattr(other, name)
+        return self.each(lambda part: part[rows, choice])
 
     def improve(self, rows: Tensor, other: Candidates) -> None:
         """Replace the plans of the agents `rows`, (k,), by those of `other`, (k,), if the latter rank higher.
@@ -124,20 +116,15 @@ class Candidates:
     @classmethod
     def concatenated(cls, parts: Sequence[Candidates]) -> Candidates:
         """Concatenate sets of plans along the dimension of the agents."""
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
+        return cls(*map(torch.cat, zip(*(part.parts for part in parts), strict=True)))
 
     def view(self, agents: int) -> Candidates:
         """Reshape the leading dimension of all fields from (agents * choices,) to (agents, choices)."""
-        parts = (getattr(self, name) for name in _FIELDS)
-        return Candidates(*(part.view(agents, -1, *part.shape[1:]) for part in parts))
+        return self.each(lambda part: part.view(agents, -1, *part.shape[1:]))
 
     def beside(self, other: Candidates) -> Candidates:
         """Join two sets of plans of the same agents: (agents, j) and (agents, k) -> (agents, j + k)."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in _FIELDS)
-        return Candidates(*(torch.cat(pair, 1) for pair in pairs))
-
-
-_FIELDS = tuple(each.name for each in fields(Candidates))
+        return Candidates(*(torch.cat(pair, 1) for pair in zip(self.parts, other.parts, strict=True)))
 
 
 def rank(plans: Candidates) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,6 +14,7 @@ from stlc.controller.guard.kind import GuardInputs
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
+from stlc.controller.problem.rows import Rows
 from stlc.controller.problem.task import rank
 from stlc.registry import GUARDS
 from stlc.runtime.prefixes import PrefixGrid
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class GuardDecision:
+class GuardDecision(Rows):
     """Decisions of a guard: plans, their first actions, and their sources.
 
     Attributes:
@@ -60,20 +61,13 @@ class GuardDecision:
         plan = self.plan.gather(1, index.to(self.plan.device))
         return replace(self, plan=plan, action=plan[:, 0])
 
-    def of(self, rows: Tensor) -> GuardDecision:
-        """The decisions for the agents with the indices `rows`, (k,)."""
-        return GuardDecision(*(getattr(self, name)[rows] for name in _FIELDS))
-
     def with_new(self, rows: Tensor, new: GuardDecision) -> GuardDecision:
         """Return this decision with the entries of some agents replaced by those of `new`.
 
         `rows`: indices of these agents, (k,). `new`: decision for these agents only.
         """
-        pairs = ((getattr(self, name), getattr(new, name)) for name in _FIELDS)
+        pairs = zip(self.parts, new.parts, strict=True)
         return GuardDecision(*(old.index_copy(0, rows, fresh) for old, fresh in pairs))
-
-
-_FIELDS = tuple(each.name for each in fields(GuardDecision))
 
 
 class Guard:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from stlc.compile.backends.c.emit import LANES
 from stlc.controller.problem.native import Effort
+from stlc.controller.problem.rows import Rows
 from stlc.controller.problem.task import satisfied
 from stlc.native import cores, never
 
@@ -48,7 +49,7 @@ LOOK = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class SearchResult:
+class SearchResult(Rows):
     """Result of a search.
 
     Attributes:
@@ -70,10 +71,6 @@ class SearchResult:
         """
         return satisfied(self.rho)
 
-    def to(self, device: torch.device) -> SearchResult:
-        """The result with its tensors on `device`."""
-        return SearchResult(self.states.to(device), self.plans.to(device), self.rho.to(device))
-
 
 def remainders(task: Task, found: SearchResult, count: int) -> SearchResult:
     """Plans from `count` states that each plan visits at equal intervals: what remains of it there.
@@ -88,8 +85,7 @@ def remainders(task: Task, found: SearchResult, count: int) -> SearchResult:
     index = (begun[:, None] + torch.arange(steps, device=begun.device)).clamp(max=steps - 1)
     x0, u = path[:, begun].flatten(0, 1), found.plans[:, index].flatten(0, 1)
     judged = SearchResult(x0, u, task.judge(x0, u, states=False).rho)
-    good = judged.solved
-    return SearchResult(x0[good], u[good], judged.rho[good])
+    return judged.of(judged.solved)
 
 
 class Search:

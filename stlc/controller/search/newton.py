@@ -11,7 +11,7 @@ logarithmic barrier keeps the controls within their bounds (Pavlov et al. 2021).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,7 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir.support import columns as columns_read
 from stlc.controller.problem.native import NativeStep
+from stlc.controller.problem.rows import Rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,7 +58,7 @@ PROJECTIONS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectories:
+class Trajectories(Rows):
     """Trajectories of B plans, and the conditions along them.
 
     Attributes:
@@ -100,11 +101,6 @@ class Linearised(Trajectories):
 
     size: Numbers
     slopes: Numbers
-
-    def put(self, index: NDArray[np.int64], other: Linearised) -> None:
-        """Replace the plans `index`, (k,), by the k others."""
-        for field in fields(self):
-            getattr(self, field.name)[index] = getattr(other, field.name)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import Field, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from time import process_time
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.options import FINITE, bounds_of
+from stlc.controller.options import value_of
+from stlc.controller.problem.rows import Rows
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.native import Stop, never
 from stlc.registry import PLANNERS, closest
@@ -53,7 +54,7 @@ class PlanBudget:
 
 
 @dataclass(frozen=True, slots=True)
-class PlanResult:
+class PlanResult(Rows):
     """Plans from given initial states, judged exactly in float64.
 
     Attributes:
@@ -81,9 +82,7 @@ class PlanResult:
     @property
     def tried(self) -> PlanResult:
         """Results of the initial states for which a plan was judged or a proof was found."""
-        rows = (self.evaluations > 0) | self.infeasible
-        parts = (self.states, self.plans, self.rho, self.infeasible, self.seconds, self.evaluations)
-        return PlanResult(*(part[rows] for part in parts))
+        return self.of((self.evaluations > 0) | self.infeasible)
 
 
 class PlanSearch:
@@ -285,7 +284,7 @@ def planner_named(name: str, **options: Any) -> Planner:
             listed = f"options: {', '.join(known)}" if known else "it has none"
             advice = listed if near is None else f"did you mean `{near}`?  {listed}"
             raise UsageError(Diagnostic("U101", f"planner `{name}` has no option `{key}`", help=(advice,)))
-        values[key] = _value(name, known[key], value)
+        values[key] = value_of(f"planner `{name}`", known[key], value)
     planner: Planner = kind(**values)
     return planner
 
@@ -304,34 +303,6 @@ def _without_choice(search: PlanSearch) -> None:
     with search.charged(rows):
         search.offer(rows, search.start[rows])
     search.ended[rows] = True
-
-
-def _value(name: str, option: Field[Any], value: object) -> Any:
-    """Convert the value of a planner's option from text to the type of its default.
-
-    Raises:
-        UsageError: U101, the text is not of this type, or the number is out of its bounds.
-    """
-    kind: Any = type(option.default)
-    kinds = (int, float) if kind is float else (kind,)
-    message = f"option `{option.name}` of planner `{name}` is"
-    names = {bool: "`true` or `false`", int: "a whole number", str: "a text"}
-    wanted = names.get(kind, "a number")
-    if isinstance(value, str) and kind is not str:
-        try:
-            value = _WORDS[value] if kind is bool else kind(value)
-        except (ValueError, KeyError):
-            raise usage(f"{message} {wanted}, not `{value}`") from None
-    if not isinstance(value, kinds) or (kind is not bool and isinstance(value, bool)):
-        raise usage(f"{message} {wanted}, not `{value}`")
-    if kind in (int, float):
-        bounds = bounds_of(option, FINITE)
-        if value not in bounds:
-            raise usage(f"{message} {wanted} {bounds}, not `{value}`")
-    return value
-
-
-_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
 def plan(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import torch
 
-from stlc.controller.options import MOST, Bounds, bounds_of
+from stlc.controller.options import MOST, Bounds, bounds_of, value_of
 from stlc.controller.training.budget import Clock, StepSchedule
 from stlc.diagnostics import usage
 from stlc.native import cores
@@ -247,28 +247,19 @@ def _with_own(found: ResolvedConfig, config: TrainConfig) -> ResolvedConfig:
     Raises:
         UsageError: U101, the method has no such option, or a value is invalid.
     """
-    own = {each.name: each.type for each in fields(found)[len(fields(ResolvedConfig)) :]}
+    own = {each.name: each for each in fields(found)[len(fields(ResolvedConfig)) :]}
     changed: dict[str, Any] = {}
     for name, text in config.options.items():
         if name not in own:
             known = f"options: {', '.join(own)}" if own else "it has no options of its own"
             advice = did_you_mean(name, own, known)
             raise usage(f"method `{found.method}` has no option `{name}`", *advice)
-        changed[name] = _number(name, text, str(own[name])) if own[name] not in ("str", str) else text
+        changed[name] = value_of(f"method `{found.method}`", own[name], text)
     advice = ("stlc train SPEC --option NAME=VALUE",) if changed else ()
     try:
         return checked_config(replace(found, **changed))
     except ValueError as error:
         raise usage(f"method `{found.method}`: {error}", *advice) from None
-
-
-def _number(name: str, text: str, kind: str) -> int | float:
-    """Parse the value of option `name`, a whole number if `kind` is `int`. Raises UsageError (U101)."""
-    try:
-        return int(text) if kind == "int" else float(text)
-    except ValueError:
-        wanted = "whole number" if kind == "int" else "number"
-        raise usage(f"`{name}={text}` is no {wanted}", f"--option {name}=N") from None
 
 
 Options = TypeVar("Options", bound=ResolvedConfig)
@@ -300,6 +291,7 @@ def base_config(
     """
     declared = task.system.decl.train
     mission = bool(task.compiled.timers)
+    most, aside = int(torch.get_num_threads()), searches and config.device == "cpu"
     plans = config.plans or plans
     return kind(
         method="",
@@ -313,14 +305,8 @@ def base_config(
         most=MISSION_MOST if mission else 768,
         share=0.05 if plans > 1 else 0.0,
         held_out=config.held_out,
-        threads=config.threads or _threads(searching=searches and config.device == "cpu"),
+        threads=config.threads or (max(1, min(most, cores() - 1)) if aside else most),
         clock=config.clock,
         drives=config.drives,
         whole=task.compiled.grid.end is not None,
     )
-
-
-def _threads(*, searching: bool) -> int:
-    """Number of threads of torch; if `searching`, one core is left to the concurrent search."""
-    most = int(torch.get_num_threads())
-    return max(1, min(most, cores() - 1)) if searching else most

@@ -231,8 +231,7 @@ class Trainer(Learner):
         if stop():
             self.generator.set_state(before)
             return False
-        good = searched.satisfied
-        plans = SearchResult(starts[good], searched.plans[good].to(starts.dtype), searched.rho[good])
+        plans = SearchResult(starts, searched.plans.to(starts.dtype), searched.rho).of(searched.satisfied)
         count = TAILS if self.task.compiled.timers else 1
         found = remainders(self.task, plans, count).to(self.device)
         self.buffer.add(found.states, found.plans)
@@ -346,7 +345,7 @@ class Trainer(Learner):
         assert repaired_by_then is not None
         found = repaired_by_then.to(self.device)
         solved = found.solved
-        good = SearchResult(found.states[solved], found.plans[solved], found.rho[solved])
+        good = found.of(solved)
         self.supply.follow(good.states, good.plans)
         if self.task.compiled.grid.end is not None and len(good.rho):
             good = remainders(self.task, good, TAILS)

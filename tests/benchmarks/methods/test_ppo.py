@@ -155,12 +155,12 @@ def test_options_of_the_method(car_task: Task) -> None:
     assert (config.reward, config.epochs, config.plans, config.environments) == ("accuracy", 3, 1, 512)
     for options, message in (
         ({"epoch": "3"}, "method `ppo` has no option `epoch`"),
-        ({"epochs": "3.5"}, "`epochs=3.5` is no whole number"),
-        ({"trace": "much"}, "`trace=much` is no number"),
-        ({"environments": "0"}, "method `ppo`: `environments` is 0, not from 1 to 65,536"),
-        ({"epochs": "0"}, "method `ppo`: `epochs` is 0, not from 1 to 1,000,000"),
-        ({"minibatches": "0"}, "method `ppo`: `minibatches` is 0, not from 1 to 1,000,000"),
-        ({"correlation": "2"}, "method `ppo`: `correlation` is 2.0, not from 0 to 1"),
+        ({"epochs": "3.5"}, "option `epochs` of method `ppo` is a whole number, not `3.5`"),
+        ({"trace": "much"}, "option `trace` of method `ppo` is a number, not `much`"),
+        ({"environments": "0"}, "option `environments` of method `ppo` is a whole number from 1 to 65,536, not `0`"),
+        ({"epochs": "0"}, "option `epochs` of method `ppo` is a whole number from 1 to 1,000,000, not `0`"),
+        ({"minibatches": "0"}, "option `minibatches` of method `ppo` is a whole number from 1 to 1,000,000, not `0`"),
+        ({"correlation": "2"}, "option `correlation` of method `ppo` is a number from 0 to 1, not `2.0`"),
         ({"entropy": "-1"}, "method `ppo`: `entropy` is -1.0, not at least 0"),
         ({"reward": "money"}, "method `ppo`: `reward` is 'money', none of task, robustness, accuracy"),
     ):
