@@ -156,7 +156,7 @@ def tolerant(formula: ir.Formula) -> ir.Formula:
 
 def both(*items: ir.Formula) -> ir.Formula:
     """Return the conjunction of formulas, simplified where a formula is a constant."""
-    return joined("and", items, ir.Truth(True))
+    return joined("and", items)
 
 
 def cited(formula: typed.Formula) -> str:

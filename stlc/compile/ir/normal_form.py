@@ -6,15 +6,18 @@ De Morgan's laws push a negation down to the leaves: it swaps `and` with `or`, `
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, Literal, TypeAlias, assert_never
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, assert_never
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.nodes import DUAL
 from stlc.compile.ir.traverse import map_children
+
+if TYPE_CHECKING:
+    from stlc.source import Span
 
 Sign: TypeAlias = Literal[1, -1]
 
@@ -126,7 +129,7 @@ def _folded(formula: typed.Formula, flat: bool) -> ir.Formula:
             return literal(formula)
         case typed.Logic(span, "and" | "or" as op, items):
             parts = [_folded(item, flat) for item in items]
-            return joined(op, flattened(op, parts) if flat else parts, ir.Truth(op == "and", span))
+            return joined(op, flattened(op, parts) if flat else parts, span)
         case _:
             raise AssertionError("not a state formula")
 
@@ -146,21 +149,36 @@ def literal(formula: typed.Predicate | typed.Not) -> ir.Predicate:
     return negated
 
 
-def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], neutral: ir.Truth) -> ir.Formula:
+def joined(op: Literal["and", "or"], items: Iterable[ir.Formula], span: Span | None = None) -> ir.Formula:
     """Return the `and` or `or` of formulas, simplified where a formula is a constant.
 
     A constant that does not change the result is removed; a constant that decides the result is returned.
-    `neutral` is the value of the operator without operands: true for `and`, false for `or`.
     """
     kept: list[ir.Formula] = []
     for item in items:
         if not isinstance(item, ir.Truth):
             kept.append(item)
-        elif item.value is not neutral.value:
-            return replace(neutral, value=item.value)
+        elif item.value is not (op == "and"):
+            return ir.Truth(item.value, span)
     if len(kept) < 2:
-        return kept[0] if kept else neutral
-    return ir.BoolOp(op, tuple(kept), neutral.span)
+        return kept[0] if kept else ir.Truth(op == "and", span)
+    return ir.BoolOp(op, tuple(kept), span)
+
+
+def rejoined(formula: ir.Formula, change: Callable[[ir.Formula], ir.Formula]) -> ir.Formula:
+    """Return a formula in which `change` replaces each formula that `and` and `or` join, simplified."""
+    if isinstance(formula, ir.BoolOp):
+        return joined(formula.op, (rejoined(item, change) for item in formula.items), formula.span)
+    return change(formula)
+
+
+def terms(formula: ir.Formula, op: Literal["and", "or"]) -> Iterator[ir.Formula]:
+    """Yield the formulas that nested operators `op` join; the formula itself if it is no such operator."""
+    if isinstance(formula, ir.BoolOp) and formula.op == op:
+        for item in formula.items:
+            yield from terms(item, op)
+    else:
+        yield formula
 
 
 def negate(formula: Any) -> Any:

@@ -45,7 +45,7 @@ def _join(whole: ir.BoolOp, semantics: Semantics) -> ir.Formula:
         flat += operands(item) if same else (item,)
     if semantics.idempotent:
         flat = list(dict.fromkeys(flat))
-    return joined(whole.op, flat, ir.Truth(whole.op == "and", whole.span))
+    return joined(whole.op, flat, whole.span)
 
 
 def _window(node: ir.Temporal | ir.PastTemporal, semantics: Semantics) -> ir.Formula:

@@ -43,7 +43,7 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
     The arrays `seed` and `agent` have the shape (traces,).
     """
     rows = np.arange(len(recording.states))
-    extras = {
+    extras: dict[str, NDArray[Any]] = {
         "decision": recording.source,
         "t0": recording.t0,
         "plan_rho": recording.rho,
@@ -54,8 +54,9 @@ def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: 
     }
     states, actions = torch.from_numpy(recording.states), torch.from_numpy(recording.actions)
     record = run.dir.record()
-    paths = {key: str(record.get(key, "")) for key in ("spec_path", "system_path")}
-    meta = replace(meta_of(run.task, setting.seeds[0]), run=run.dir.name, **paths)
+    spec_path, system_path = (str(record.get(key, "")) for key in ("spec_path", "system_path"))
+    meta = meta_of(run.task, setting.seeds[0])
+    meta = replace(meta, run=run.dir.name, spec_path=spec_path, system_path=system_path)
     if rules is not None:
         spec, changed = rules.spec, dict(rules.overrides)
         meta = replace(meta, judge_path=rules.path, judge_text=spec.source.text, judge_set=changed)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.normal_form import terms
 from stlc.compile.ir.traverse import leaves, map_children, nodes, numbers, operands
 
 Instants = NDArray[np.int64]
@@ -158,14 +159,6 @@ class GoalScheduler:
             return map_children(formula, formulas=self._named)
         return ir.Truth(True)
 
-    def parts(self, formula: ir.Formula) -> Iterator[ir.Formula]:
-        """Yield the parts of a condition: the operands of its conjunctions, or the condition itself."""
-        if isinstance(formula, ir.BoolOp) and formula.op == "and":
-            for item in formula.items:
-                yield from self.parts(item)
-        else:
-            yield formula
-
     def present(self, formula: ir.Formula) -> Iterator[ir.Formula]:
         """Yield the conditions that must hold at a sample if `formula` is to hold at this sample.
 
@@ -182,7 +175,7 @@ class GoalScheduler:
 
     def _collect(self, formula: ir.Formula) -> None:
         if self.decidable(formula):
-            for part in self.parts(formula):
+            for part in terms(formula, "and"):
                 if not isinstance(part, ir.Truth):
                     self._numbers.setdefault(part, len(self._numbers))
             return
@@ -351,7 +344,7 @@ class _Drawing:
 
     def _demand(self, formula: ir.Formula, within: Flags) -> None:
         """Demand that a condition holds at samples, (schedules, T + 1)."""
-        for part in self._scheduler.parts(formula):
+        for part in terms(formula, "and"):
             if isinstance(part, ir.Truth):
                 self.possible &= part.value | ~within.any(1)
             else:

@@ -17,7 +17,7 @@ import numpy as np
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined
+from stlc.compile.ir.normal_form import joined, rejoined, terms
 from stlc.compile.ir.support import columns
 from stlc.compile.semantics.tolerance import satisfied
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 VALUES = 1001
 """Number of values of a state at which it is looked up whether two conditions on it exclude each other."""
-YES, NO = ir.Truth(True), ir.Truth(False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,27 +48,22 @@ class Landmarks:
         for clause in self.clauses:
             barred = [each for each in clause if any(self._excludes(one, each) for one in asked)]
             open_ = [each for each in clause if each not in barred]
-            gate = [one for one in barred if any(self._together(one, each) for each in open_)]
+            gate = [
+                one
+                for one in barred
+                if any(all(not self._excludes(part, each) for part in _literals(one)) for each in open_)
+            ]
             if gate:
-                before.append(joined("or", gate, NO))
-                rest.append(joined("or", open_, NO))
+                before.append(joined("or", gate))
+                rest.append(joined("or", open_))
                 left = [one for one in left if not any(self._excludes(one, each) for each in gate)]
         if not before:
             return ()
-        near = joined("and", (*left, *(self._with(left, each) for each in rest)), YES)
-        return joined("and", before, YES), near
 
-    def _together(self, one: ir.Formula, other: ir.Formula) -> bool:
-        return not any(self._excludes(literal, other) for literal in _literals(one))
+        def open_to(formula: ir.Formula) -> ir.Formula:
+            return ir.Truth(False) if any(self._excludes(one, formula) for one in left) else formula
 
-    def _with(self, asked: Sequence[ir.Formula], formula: ir.Formula) -> ir.Formula:
-        """Return a formula without alternatives that conditions exclude."""
-        match formula:
-            case ir.BoolOp(op, items):
-                kept = [self._with(asked, item) for item in items]
-                return joined(op, kept, ir.Truth(op == "and"))
-            case _:
-                return NO if any(self._excludes(one, formula) for one in asked) else formula
+        return joined("and", before), joined("and", (*left, *(rejoined(each, open_to) for each in rest)))
 
     def _excludes(self, literal: ir.Formula, formula: ir.Formula) -> bool:
         """True if a literal and a conjunction never hold together."""
@@ -90,11 +84,8 @@ class Landmarks:
 
 def _literals(formula: ir.Formula) -> Iterator[ir.Formula]:
     """Yield the predicates that hold wherever a formula holds."""
-    match formula:
-        case ir.Predicate():
-            yield formula
-        case ir.BoolOp("and", items):
-            for item in items:
-                yield from _literals(item)
-        case ir.Temporal("always", _, body):
-            yield from _literals(body)
+    for part in terms(formula, "and"):
+        if isinstance(part, ir.Temporal) and part.op == "always":
+            yield from _literals(part.body)
+        elif isinstance(part, ir.Predicate):
+            yield part

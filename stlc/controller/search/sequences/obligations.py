@@ -124,7 +124,7 @@ class Obligations:
             if columns(item) != {self._clock}
             or bool((evaluate([item], env, ops=NUMPY, count=len(time))[0] >= 0.0).any())
         ]
-        return joined("or", kept, ir.Truth(False))
+        return joined("or", kept)
 
     def _formulas(self, clock: int, met: tuple[bool, ...]) -> tuple[ir.Formula, ...]:
         """Return the obligations at step `clock`; `met`: the parts of `_progressed` that every plan meets."""

@@ -195,7 +195,7 @@ class Phases:
             ir.BoolOp("or", (_equal(ir.Signal(OPEN.format(i)), 0.0), each)) for i, each in enumerate(untils)
         )
         shortfall = _Shortfall(scale)
-        held = _decisive(joined("and", (safe, *kept), ir.Truth(True)))
+        held = _decisive(joined("and", (safe, *kept)))
         chosen = (
             ir.BoolOp("and", (_equal(ir.Signal(TARGET), float(i)), shortfall.of(target)))
             for i, target in enumerate(targets)
@@ -212,7 +212,7 @@ class Phases:
                 ),
             ),
         )
-        reached = ir.BoolOp("and", (*times, joined("or", chosen, ir.Truth(False)), *tail))
+        reached = ir.BoolOp("and", (*times, joined("or", chosen), *tail))
         formula = simplify(ir.Until("until", ir.Window(0, steps), held, reached))
         try:
             library = load(emit(motion, [formula], "truncate"))

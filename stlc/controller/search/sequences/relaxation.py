@@ -25,12 +25,12 @@ import numpy as np
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined, negate
+from stlc.compile.ir.normal_form import joined, negate, rejoined, terms
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.search.sequences.phases import levels
-from stlc.controller.search.sequences.residuals import looks_ahead
+from stlc.controller.search.sequences.residuals import YES, looks_ahead
 from stlc.dynamics.model.algebra import names_in, substitute
 
 if TYPE_CHECKING:
@@ -49,7 +49,6 @@ MOST_LEVELS = 64
 """Largest number of combinations of extreme controls under which the direction of a state is looked up."""
 PROBE = 1e-4
 """Difference of a state for the direction in which a condition wants it to move."""
-YES, NO = ir.Truth(True), ir.Truth(False)
 Sort: TypeAlias = Literal["mode", "timed", "driven", "unknown"]
 
 
@@ -257,7 +256,7 @@ class Relaxation:
         if len(modes) < len(parts):
             last = math.ceil(samples - PROBE)
             target = ir.Temporal("always", ir.Window(0, last), formula) if last <= LONGEST else formula
-            yield Step(joined("and", modes, YES), target, last if last <= LONGEST else 0)
+            yield Step(joined("and", modes), target, last if last <= LONGEST else 0)
 
     def _step(
         self, jump: JumpDecl, clauses: Sequence[Sequence[ir.Formula]], orders: Sequence[ir.Until]
@@ -267,14 +266,14 @@ class Relaxation:
         extra = [self._left(clause, fixed) for clause in clauses]
         for order in orders:
             asked = (self._left(clause, fixed) for clause in clauses_of(order.left))
-            extra.append(joined("or", (joined("and", asked, YES), present(order.right)), NO))
-        condition = joined("and", (jump.guard, *extra), YES)
+            extra.append(joined("or", (joined("and", asked), present(order.right))))
+        condition = joined("and", (jump.guard, *extra))
         controls = frozenset(self._controls)
         if not columns(jump.guard) & controls:
             return Step(condition, condition, 1, jump)
-        free = _without(jump.guard, controls)
+        free = rejoined(jump.guard, lambda part: YES if columns(part) & controls else part)
         effects = (_equal(name, value) for name, value in fixed.items())
-        return Step(joined("and", (free, *extra), YES), joined("and", effects, YES), 0, jump)
+        return Step(joined("and", (free, *extra)), joined("and", effects), 0, jump)
 
     def _left(self, clause: Sequence[ir.Formula], fixed: Mapping[str, ir.Num]) -> ir.Formula:
         """Return what a clause, a disjunction, asks before a jump that sets the states `fixed`."""
@@ -283,7 +282,7 @@ class Relaxation:
         if any(isinstance(node, (ir.PastTemporal, ir.Since)) for item in clause for node in nodes(item)):
             return YES
         here = [item for item in clause if not any(isinstance(node, ir.Shift) for node in nodes(item))]
-        return joined("or", (_folded(substitute(item, fixed)) for item in here), NO)
+        return joined("or", (rejoined(substitute(item, fixed), _folded) for item in here))
 
     def _literals_of(self, formula: ir.Formula) -> Iterator[ir.Formula]:
         """Yield the predicates of a formula that one state decides."""
@@ -344,10 +343,10 @@ class Relaxation:
         if (least := min(min(yes, no) for _, yes, no in gains)) < 0.0:
             stops = [negate(mode) for mode, yes, no in gains if yes < 0.0 <= no]
             stops += [mode for mode, yes, no in gains if no < 0.0 <= yes]
-            self._stops[literal], self._falls[literal] = joined("or", stops, NO), -least
+            self._stops[literal], self._falls[literal] = joined("or", stops), -least
         ways = [mode for mode, yes, _ in gains if yes > 0.0]
         ways += [negate(mode) for mode, _, no in gains if no > 0.0]
-        return joined("or", ways, NO)
+        return joined("or", ways)
 
 
 class RelaxedState:
@@ -478,31 +477,13 @@ def _values(formulas: Sequence[ir.Formula], env: Mapping[str, Numbers]) -> Numbe
 
 def clauses_of(formula: ir.Formula) -> Iterator[tuple[ir.Formula, ...]]:
     """Yield the disjunctions of a conjunction, each as the tuple of its items."""
-    match formula:
-        case ir.BoolOp("and", items):
-            for item in items:
-                yield from clauses_of(item)
-        case ir.BoolOp("or", items):
-            yield tuple(part for item in items for part in _disjuncts(item))
-        case _:
-            yield (formula,)
+    for clause in terms(formula, "and"):
+        yield tuple(terms(clause, "or"))
 
 
 def present(formula: ir.Formula) -> ir.Formula:
     """Return a formula without its operators of the future, which become true."""
-    match formula:
-        case ir.BoolOp(op, items):
-            return joined(op, map(present, items), ir.Truth(op == "and"))
-        case _:
-            return YES if looks_ahead(formula) else formula
-
-
-def _disjuncts(formula: ir.Formula) -> Iterator[ir.Formula]:
-    if isinstance(formula, ir.BoolOp) and formula.op == "or":
-        for item in formula.items:
-            yield from _disjuncts(item)
-    else:
-        yield formula
+    return rejoined(formula, lambda part: YES if looks_ahead(part) else part)
 
 
 def _conjunctions(formula: ir.Formula) -> Iterator[ir.Formula]:
@@ -513,31 +494,16 @@ def _conjunctions(formula: ir.Formula) -> Iterator[ir.Formula]:
                 yield from _conjunctions(item)
         case ir.BoolOp("and", items):
             for parts in islice(product(*map(_conjunctions, items)), MOST_LEVELS):
-                yield joined("and", parts, YES)
+                yield joined("and", parts)
         case _:
             yield formula
 
 
 def _folded(formula: ir.Formula) -> ir.Formula:
-    """Replace the literals that read no signal by their truth."""
+    """Replace a literal that reads no signal by its truth."""
     if isinstance(formula, ir.Predicate) and not columns(formula):
-        blank = {"": np.zeros((1, 1))}
-        return ir.Truth(bool(satisfied(_values([formula], blank))[0, 0]))
-    if isinstance(formula, ir.BoolOp):
-        return joined(formula.op, map(_folded, formula.items), ir.Truth(formula.op == "and"))
+        return ir.Truth(bool(satisfied(_values([formula], {"": np.zeros((1, 1))}))[0, 0]))
     return formula
-
-
-def _without(formula: ir.Formula, names: frozenset[str]) -> ir.Formula:
-    """Replace the literals that read one of the signals `names` by true."""
-    if isinstance(formula, ir.Predicate):
-        return YES if columns(formula) & names else formula
-    items = (_without(item, names) for item in formula.items) if isinstance(formula, ir.BoolOp) else ()
-    return (
-        joined(formula.op, items, ir.Truth(formula.op == "and"))
-        if isinstance(formula, ir.BoolOp)
-        else formula
-    )
 
 
 def _settled(num: ir.Num, mode: ir.Formula | None, *, holds: bool = True) -> ir.Num:

@@ -113,20 +113,20 @@ class _Residual:
         match formula:
             case ir.BoolOp(op, items):
                 left = [self.at(item, sample) for item in items]
-                return joined(op, left, ir.Truth(op == "and"))
+                return joined(op, left)
             case ir.Temporal(op, window, body):
                 ahead, seen = self._split(window, sample)
                 both: Literal["and", "or"] = "or" if op == "eventually" else "and"
                 left = [self.at(body, k) for k in self._open(body, seen)]
                 left += [] if ahead is None else [ir.Temporal(op, ahead, body)]
-                return joined(both, left, ir.Truth(both == "and"))
+                return joined(both, left)
             case ir.Until("until", window, one, other):
                 ahead, seen = self._split(window, sample)
                 held = self.known[id(one)][:, 1]
                 left = [self.at(other, k) for k in self._open(other, seen) if held[sample : k + 1].all()]
                 if ahead is not None and held[sample : self.now + 1].all():
                     left.append(ir.Until("until", ahead, one, other))
-                return joined("or", left, NO)
+                return joined("or", left)
             case _:
                 return YES
 

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.normal_form import joined, pieces
+from stlc.compile.ir.normal_form import joined, pieces, terms
 from stlc.compile.ir.support import columns, history, reach
 from stlc.compile.ir.traverse import nodes
 from stlc.controller.search.newton import values_of
@@ -190,11 +190,11 @@ class Sequences:
                 speed = DRIFT * (high - low) / (self.steps * system.dt)
                 margin = ir.Op("sub", (ir.Const(speed), ir.Op("abs", (assign.value,))))
                 slow.append(ir.Predicate(margin))
-        return joined("and", slow, YES)
+        return joined("and", slow)
 
     @cached_property
     def _phases(self) -> Phases | None:
-        safe, scale = joined("and", self._safe, YES), self._scales(self._targets, self._state)
+        safe, scale = joined("and", self._safe), self._scales(self._targets, self._state)
         known = frozenset(self.task.system.names)
         clauses = [
             [part for part in clause if isinstance(part, ir.Predicate)]
@@ -270,7 +270,7 @@ class Sequences:
                 return [each for item in items for each in self._alternatives(item)]
             case ir.BoolOp("and", items):
                 parts = [found for item in items if (found := self._alternatives(item))]
-                whole = [joined("and", combined, YES) for combined in product(*parts)] if parts else []
+                whole = [joined("and", combined) for combined in product(*parts)] if parts else []
                 return whole[:ALTERNATIVES]
             case _:
                 return []
@@ -502,7 +502,7 @@ def _is_kept(formula: ir.Formula) -> bool:
 
 def _needed(formulas: Sequence[ir.Formula]) -> tuple[ir.Formula, ...]:
     """Return the parts of a conjunction without goals that are met whenever another one is."""
-    parts = list(dict.fromkeys(part for formula in formulas for part in _conjuncts(formula)))
+    parts = list(dict.fromkeys(part for formula in formulas for part in terms(formula, "and")))
 
     def later(one: ir.Formula, other: ir.Formula) -> bool:
         match one, other:
@@ -513,14 +513,6 @@ def _needed(formulas: Sequence[ir.Formula]) -> tuple[ir.Formula, ...]:
                 return False
 
     return tuple(one for one in parts if not any(later(one, other) for other in parts))
-
-
-def _conjuncts(formula: ir.Formula) -> Iterator[ir.Formula]:
-    if isinstance(formula, ir.BoolOp) and formula.op == "and":
-        for item in formula.items:
-            yield from _conjuncts(item)
-    else:
-        yield formula
 
 
 def _moves(formula: ir.Formula, relaxed: RelaxedState) -> float:
