@@ -96,7 +96,7 @@ def methods_of(task: Task, backup: StagedSearch) -> dict[str, Method]:
     searcher = Searcher(task, torch.Generator().manual_seed(SEED), enough=enough)
 
     def local_search(x: Tensor, places: Tensor, tries: int) -> Tensor:
-        return searcher.at_once(x.expand(len(places), -1), places, tries=tries).plans
+        return searcher.repair(x.expand(len(places), -1), places, tries=tries, threads=1).plans
 
     def steps_and_search(x: Tensor, plan: Tensor, rest: Tensor) -> Tensor:
         raised = ascent.rise(x, torch.stack((plan, rest), 1))[0]

@@ -159,7 +159,7 @@ class Mpc:
         missed = search.budget.target - float(search.rho[rows])
         if self.repair and TOLERANCE < missed <= NEARLY:
             tries = search.allowed(rows, self.repair)
-            found = searcher.at_once(search.states[rows], search.plans[rows], tries=tries)
+            found = searcher.repair(search.states[rows], search.plans[rows], tries=tries, threads=1)
             search.offer(rows, found.plans, evaluations=tries)
 
     def _guess(self, search: PlanSearch, row: int, number: int) -> Tensor:

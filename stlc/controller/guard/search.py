@@ -207,7 +207,8 @@ class RelaxedSearch(GuardSearch):
         """
         if not len(rows):
             return rows
-        climbed = self._searcher.at_once(x[rows], start, tries=self.limits.tries).plans.to(x.dtype)
+        tries, threads = self.limits.tries, torch.get_num_threads()
+        climbed = self._searcher.repair(x[rows], start, tries=tries, threads=threads).plans.to(x.dtype)
         plain = Candidates.judged(self._plain.task, x[rows], climbed, REPAIRED)
         strict = Candidates.judged(self.task, x[rows], climbed, REPAIRED)
         safe = plain.is_safe

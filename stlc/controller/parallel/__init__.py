@@ -8,11 +8,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from stlc.controller.parallel.jobs import Executor
+    from stlc.controller.parallel.jobs import LocalExecutor
+    from stlc.controller.parallel.ray_jobs import RayExecutor
     from stlc.controller.parallel.workers import CallWorkers
 
 
-def executor(workers: int = 1, cluster: str | None = None, *, cores: int = 1, gpus: int = 0) -> Executor:
+def executor(
+    workers: int = 1, cluster: str | None = None, *, cores: int = 1, gpus: int = 0
+) -> LocalExecutor | RayExecutor:
     """Return an executor of training jobs in local processes, or on a Ray cluster if an address is given.
 
     Args:

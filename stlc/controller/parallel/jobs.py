@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 
 from stlc.stopping import CHILD, PATIENCE, leaving
 from stlc.toolchain import kill_session
@@ -81,21 +81,6 @@ class JobResult:
         return "\n".join(lines) or self.said
 
 
-class Executor(Protocol):
-    """Interface of executors, which run training jobs on this machine or on others."""
-
-    def run(self, jobs: Sequence[Job], started: Callable[[Job], None] = ...) -> Iterator[JobResult]:
-        """Run jobs and yield the result of each when it ends.
-
-        When the caller is interrupted or closes the iterator, every job that is still running is asked to
-        save and stop, and its end is awaited.
-
-        Args:
-            jobs: jobs in the order in which they start.
-            started: function that receives each job when it starts.
-        """
-
-
 @dataclass(slots=True)
 class LocalExecutor:
     """Executor of up to `workers` local processes at a time; each is pinned to its share of the cores.
@@ -114,7 +99,12 @@ class LocalExecutor:
     ) -> Iterator[JobResult]:
         """Run jobs and yield the result of each when it ends.
 
-        The function `started` receives each job when it starts; it runs in another thread.
+        When the caller is interrupted or closes the iterator, every job that is still running is asked to
+        save and stop, and its end is awaited.
+
+        Args:
+            jobs: jobs in the order in which they start.
+            started: function that receives each job when it starts; it runs in another thread.
         """
         for share in core_shares(self.workers):
             self.shares.put(share)

@@ -181,7 +181,14 @@ class Searcher:
 
     @torch.no_grad()
     def repair(
-        self, x0: Tensor, plans: Tensor, bank: Tensor, *, tries: int = THOROUGH, stop: Stop = never
+        self,
+        x0: Tensor,
+        plans: Tensor,
+        bank: Tensor | None = None,
+        *,
+        tries: int = THOROUGH,
+        stop: Stop = never,
+        threads: int = 0,
     ) -> SearchResult:
         """Improve plans until they reach the target robustness, or until `tries` plans per state were judged.
 
@@ -193,9 +200,12 @@ class Searcher:
             bank: library of plans that satisfy the specification from other states, (k, T, m); may be empty.
             tries: maximum number of plans judged per state.
             stop: condition that ends the search early, with the best plans until then.
+            threads: number of threads of compiled code; 0 for all cores.
         """
+        bank = plans[:0] if bank is None else bank
         if self.task.native is not None:
-            return self._climbing(x0, plans, bank, tries, cores(), self._seed())(stop).to(x0.device)
+            climb = self._climbing(x0, plans, bank, tries, threads or cores(), self._seed())
+            return climb(stop).to(x0.device)
         return self._climb(x0, plans, bank, tries, self._seed()).finish(stop)
 
     @torch.no_grad()
@@ -219,14 +229,6 @@ class Searcher:
         if self.task.native is not None:
             return search.on_thread(self._aside, self._climbing(x0, plans, bank, tries, idle_cores(), seed))
         return search.by_steps(self._climb(x0, plans, bank, tries, seed), steps)
-
-    @torch.no_grad()
-    def at_once(self, x0: Tensor, plans: Tensor, *, tries: int) -> SearchResult:
-        """Search like `repair`, without plan library, and with as many threads as torch has."""
-        bank = plans.new_zeros(0, *plans.shape[1:])
-        if self.task.native is None:
-            return self._climb(x0, plans, bank, tries, self._seed()).finish()
-        return self._climbing(x0, plans, bank, tries, torch.get_num_threads(), self._seed())(never)
 
     def _seed(self) -> int:
         return int(torch.randint(2**62, (), generator=self.generator))

@@ -9,7 +9,7 @@ the policy is thus trained on the states that it brings about itself, and on the
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from stlc.native import never
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -60,28 +60,15 @@ class SearchRound:
     failing: int
 
 
-class FailureSearch(Protocol):
-    """Search for failing drives of a policy; `stlc.assurance` supplies it, which is above the training."""
+FailureSearch: TypeAlias = "Callable[[Run, int, int, NDArray[np.float64], Stop, Stop], SearchRound | None]"
+"""Search for failing drives of a policy; `stlc.assurance` supplies it, which is above the training.
 
-    def __call__(
-        self, run: Run, simulations: int, seed: int, starts: NDArray[np.float64], over: Stop, stop: Stop
-    ) -> SearchRound | None:
-        """Search with at most `simulations` simulations of the policy.
-
-        The size of a batch does not depend on `simulations`, so that a search that ended early is repeated
-        by one of as many simulations.
-
-        Args:
-            run: run with the present policy.
-            simulations: number of simulations at most.
-            seed: seed of the search.
-            starts: points of earlier rounds, which are simulated first, (p, dim).
-            over: function that is called after each batch; no other batch follows once it returns True.
-            stop: function that is called at every step; once it returns True, the search ends at once.
-
-        Returns:
-            The states and points that were found; None if `stop` ended the search.
-        """
+It receives the run with the present policy; the greatest number of simulations; the seed of the search;
+points of earlier rounds, which are simulated first, (p, dim); a function that is called after each batch, and
+another at every step: no other batch follows once the former returns True, and the search ends at once, with
+None, once the latter does. The size of a batch does not depend on the number of simulations, so that a search
+that ended early is repeated by one of as many simulations.
+"""
 
 
 @dataclass(slots=True)

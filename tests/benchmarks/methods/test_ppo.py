@@ -153,13 +153,14 @@ def test_options_of_the_method(car_task: Task) -> None:
     )
     assert isinstance(config, PpoConfig)
     assert (config.reward, config.epochs, config.plans, config.environments) == ("accuracy", 3, 1, 512)
+    wanted = "of method `ppo` is a whole number"
     for options, message in (
         ({"epoch": "3"}, "method `ppo` has no option `epoch`"),
-        ({"epochs": "3.5"}, "option `epochs` of method `ppo` is a whole number, not `3.5`"),
+        ({"epochs": "3.5"}, f"option `epochs` {wanted}, not `3.5`"),
         ({"trace": "much"}, "option `trace` of method `ppo` is a number, not `much`"),
-        ({"environments": "0"}, "option `environments` of method `ppo` is a whole number from 1 to 65,536, not `0`"),
-        ({"epochs": "0"}, "option `epochs` of method `ppo` is a whole number from 1 to 1,000,000, not `0`"),
-        ({"minibatches": "0"}, "option `minibatches` of method `ppo` is a whole number from 1 to 1,000,000, not `0`"),
+        ({"environments": "0"}, f"option `environments` {wanted} from 1 to 65,536, not `0`"),
+        ({"epochs": "0"}, f"option `epochs` {wanted} from 1 to 1,000,000, not `0`"),
+        ({"minibatches": "0"}, f"option `minibatches` {wanted} from 1 to 1,000,000, not `0`"),
         ({"correlation": "2"}, "option `correlation` of method `ppo` is a number from 0 to 1, not `2.0`"),
         ({"entropy": "-1"}, "method `ppo`: `entropy` is -1.0, not at least 0"),
         ({"reward": "money"}, "method `ppo`: `reward` is 'money', none of task, robustness, accuracy"),

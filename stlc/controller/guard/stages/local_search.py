@@ -71,7 +71,8 @@ def climbed_from(
     search.
     """
     rows = x.repeat_interleave(starts.shape[1], 0)
-    plans = searcher.at_once(rows, starts.flatten(0, 1), tries=tries).plans.to(x.device)
+    threads = torch.get_num_threads()
+    plans = searcher.repair(rows, starts.flatten(0, 1), tries=tries, threads=threads).plans
     return Candidates.judged(task or searcher.task, x, plans.view(starts.shape), REPAIRED)
 
 

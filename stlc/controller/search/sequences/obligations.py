@@ -50,19 +50,15 @@ class Obligations:
         absolute = [rule for rule in task.rules if rule.absolute]
         grid = task.compiled.grid
         self._written = [lower(hoist_absolute(normal(rule.typed.formula), []), grid, []) for rule in absolute]
-        self._progressed = [
+        parts = [
             part
             for written, rule in zip(self._written, absolute, strict=True)
-            for part in _progressed(written, rule.lowered)
+            for part in _parts(written, rule.lowered)
         ]
+        self._progressed = [progressed for _, progressed in parts]
         self._known = lru_cache(maxsize=64)(self._formulas)
         own = frozenset(self._names) - {timer.name for timer in task.compiled.timers}
-        self._responses = [
-            response
-            for written, rule in zip(self._written, absolute, strict=True)
-            for part, form in zip(_absolute(written), _progressed(written, rule.lowered), strict=True)
-            for response in _responses(part, form, own)
-        ]
+        self._responses = [each for part in parts for each in _responses(*part, own)]
 
     @property
     def first(self) -> tuple[ir.Formula, ...]:
@@ -208,21 +204,13 @@ def _responses(written: ir.Formula, form: ir.Formula, own: frozenset[str]) -> It
             yield _Response(goal.body, goal.window.hi, named(form), parts)
 
 
-def _absolute(written: ir.Formula) -> Iterator[ir.Formula]:
-    """Yield the absolute formulas that a requirement joins by `and` and `or`."""
-    for item in written.items if _is_branch(written) else ():
-        yield from _absolute(item)
-    if not _is_branch(written):
-        yield written
-
-
-def _progressed(written: ir.Formula, progressed: ir.Formula) -> Iterator[ir.Formula]:
-    """Yield the progressed forms of the absolute formulas that a requirement joins by `and` and `or`."""
+def _parts(written: ir.Formula, progressed: ir.Formula) -> Iterator[tuple[ir.Formula, ir.Formula]]:
+    """Yield the absolute formulas that a requirement joins by `and` and `or`, with their progressed forms."""
     if _is_branch(written) and isinstance(progressed, ir.BoolOp):
         for one, other in zip(written.items, progressed.items, strict=True):
-            yield from _progressed(one, other)
+            yield from _parts(one, other)
     else:
-        yield progressed
+        yield written, progressed
 
 
 def _is_branch(formula: ir.Formula) -> TypeGuard[ir.BoolOp]:
