@@ -471,10 +471,10 @@ def statuses(monitor: Monitor, signals: Mapping[str, Any]) -> Any:
 
 def online(monitor: Monitor, signals: Mapping[str, Any]) -> list[list[Any]]:
     """Decisions of the online monitor, with the deciding sample of each."""
-    stream, found = monitor.online(), []
+    run, found = monitor.online(), []
     for k in range(len(signals["x"])):
-        decisions = stream.push({name: values[k] for name, values in signals.items()})
-        found += [[k, d.requirement, d.start, str(d.status), d.low, d.high, d.sample] for d in decisions]
+        run.push({name: values[k] for name, values in signals.items()})
+        found += [[k, d.requirement, d.start, str(d.status), d.low, d.high, d.sample] for d in run.verdicts()]
     return found
 
 

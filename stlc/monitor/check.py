@@ -280,7 +280,10 @@ def write_robustness(path: Path, verdict: Verdict, question: Question) -> None:
 
 
 def judge_lines(
-    lines: Iterator[bytes], question: Question, name: str, tell: Callable[[Decision, Online], object]
+    lines: Iterator[bytes],
+    question: Question,
+    name: str,
+    tell: Callable[[Decision, Online], object] | None,
 ) -> Verdict:
     """Judge lines of samples, a table with a header or JSON, as they come.
 

@@ -66,7 +66,7 @@ def watched(
     uniform: Uniform,
     units: Mapping[str, str],
     name: str,
-    tell: Callable[[Decision, Online], object] = lambda *_: None,
+    tell: Callable[[Decision, Online], object] | None = None,
 ) -> Verdict:
     """Judge samples as they come, and return the verdict when they end.
 
@@ -83,12 +83,13 @@ def watched(
     changes = _conversions(online, units, name)
     for sample in uniform.samples:
         try:
-            decisions = online.push(_in_units(sample, changes, online))
+            decided = online.push(_in_units(sample, changes, online))
         except TraceError as error:
             where = f"sample {online.samples} of the {name}"
             raise TraceError(*(finding.with_note(where) for finding in error.diagnostics)) from None
-        for decision in decisions:
-            tell(decision, online)
+        if decided and tell is not None:
+            for decision in online.verdicts():
+                tell(decision, online)
     found = verdict_of(online, name)
     if not (aside := uniform.aside()):
         return found

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias, cast
 
 import numpy as np
 
+from stlc.compile.analysis.holes import holes_in, partial, unsure, without_holes
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.namespace import Array, Ops
@@ -21,7 +22,6 @@ from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.cells import Cells
-from stlc.monitor.holes import holes_in, partial, unsure, without_holes
 from stlc.signature import Signature
 
 Ends: TypeAlias = Literal["open", "truncate"]
@@ -39,7 +39,7 @@ class Record:
         env: signal name -> values, none of them NaN.
         ops: the array library.
         semantics: definition of minimum and maximum.
-        holes: names of the signals with unknown values (`stlc.monitor.holes`).
+        holes: names of the signals with unknown values (`stlc.compile.analysis.holes`).
         computed: whether NaN that a function gives outside of its domain is unknown too.
         cells: recorded values between the samples, if the signals were resampled.
         loose: whether a step of the grid counts as a whole: windows end at an instant of their own.

@@ -132,7 +132,10 @@ def test_a_stream_is_judged_as_a_file(
 
 def test_a_monitor_that_is_fed_takes_degrees() -> None:
     online = Monitor(SPEC.format(unit="degC"), dt=0.1).online(How())
-    decisions = [decision for value in DEGREES for decision in online.push({"temp": value})]
+    decisions = []
+    for value in DEGREES:
+        online.push({"temp": value})
+        decisions += online.verdicts()
     (calm,) = (decision for decision in decisions if decision.requirement == "calm")
     assert (calm.status, calm.low) == ("satisfied", 5.0)
 

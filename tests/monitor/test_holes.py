@@ -10,15 +10,13 @@ from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stlc.compile.analysis.holes import partial
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.monitor.explain.report import explain
-from stlc.monitor.holes import partial
-from stlc.monitor.online.bounds import TrackingOptions
 from stlc.monitor.online.online import How
-from stlc.monitor.online.trackers import Trackers
-from stlc.monitor.values import Record, bounds, by_truth, window_bounds
+from stlc.monitor.values import Record, bounds, window_bounds
 from stlc.monitor.verdict import Monitor
 
 NAN = float("nan")
@@ -64,33 +62,6 @@ def test_bounds_hold_for_every_filling(written, trace, ends, window, seed, share
     least, most = judged(Record(trace, NUMPY))
     assert (low <= least).all()
     assert (high >= most).all()
-
-
-@settings(max_examples=20, deadline=None)
-@given(
-    written=random_formulas.formulas(held=()),
-    trace=random_formulas.traces(1, 14, 1),
-    ending=st.sampled_from(["open", "truncate"]),
-    truth=st.booleans(),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_a_stream_with_holes_says_what_the_whole_trace_says(written, trace, ending, truth, seed) -> None:
-    formula = simplify(lower(written, random_formulas.GRID, []))
-    judged = by_truth(formula) if truth else formula
-    rule = random_formulas.a_rule(judged)
-    everywhere, samples = not rule.uses_end, len(trace["x"])
-    unknown = holed(trace, seed, 0.2)
-    tracker = Trackers(None).of(rule, TrackingOptions(ending), everywhere=everywhere)
-    seen = [(-np.inf, np.inf)]
-    for now in range(1, samples + 1):
-        tracker.grow({name: x[:now] for name, x in unknown.items()}, 0, now)
-        low, high = tracker.live(0, 1)
-        seen.append((max(low[0], seen[-1][0]), min(high[0], seen[-1][1])))
-    starts = range(samples if everywhere else 1)
-    wanted = [end[:, 0] for end in bounds(judged, Record.of(unknown, NUMPY), starts, ending)]
-    found = tracker.ended(starts)
-    np.testing.assert_array_equal(found, wanted)
-    assert seen[-1][0] <= found.low[0] <= found.high[0] <= seen[-1][1]
 
 
 REQUIREMENTS = {
@@ -197,7 +168,10 @@ def test_a_function_outside_of_its_domain_is_a_hole(
     np.testing.assert_array_equal(judged.high, wanted.high)
     assert judged.overall == wanted.overall
     online = computed.online(How(end=end, tolerance=tolerance))
-    decided = [each for k in range(samples) for each in online.push({"a": float(a[k]), "b": float(b[k])})]
+    decided = []
+    for k in range(samples):
+        online.push({"a": float(a[k]), "b": float(b[k])})
+        decided += online.verdicts()
     tally = online.finish()["r"]
     assert tally.status == judged.overall
     assert (tally.low, tally.high) == (judged.low.min(), judged.high.min())

@@ -11,7 +11,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.online.margins import Margins
-from stlc.monitor.online.trackers import RecomputeTracker
+from stlc.monitor.online.recompute import RecomputeTracker
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 
@@ -71,8 +71,8 @@ def anew(judge: Monitor, rule, data):  # type: ignore[no-untyped-def]
     for trace in range(TRACES):
         whole = RecomputeTracker(rule, horizon, "open")
         whole.grow({"x": data[:, 0, trace, None], "y": data[:, 1, trace, None]}, 0, len(data))
-        ends.append(whole.live(starts.start, starts.stop))
-    return [end.low.min() for end in ends], [end.high.min() for end in ends]
+        ends.append(whole.live(starts))
+    return [low.min() for low, _ in ends], [high.min() for _, high in ends]
 
 
 @pytest.mark.parametrize("often", [1, 3, 7, 100])

@@ -102,7 +102,8 @@ def check_promises(case: Case, monitor: Monitor, how: How) -> None:
     most: dict[int, float] = {}
     said: dict[int, str] = {}
     for k in range(case.samples):
-        for decision in online.push({name: values[k] for name, values in case.signals.items()}):
+        online.push({name: values[k] for name, values in case.signals.items()})
+        for decision in online.verdicts():
             said[decision.start] = decision.status
         for start, low, high in online.open_starts("r"):
             least[start] = max(least.get(start, low), low)

@@ -197,7 +197,7 @@ def _of_stream(question: Question, *, talk: bool) -> Outcome:
 
     begun = time.perf_counter()
     raw = iter(lambda: sys.stdin.buffer.readline(MAX_LINE + 1), b"")
-    verdict = judge_lines(raw, question, NAME, _tell if talk else lambda *_: None)
+    verdict = judge_lines(raw, question, NAME, _tell if talk else None)
     return Outcome(NAME, verdict, time.perf_counter() - begun)
 
 

@@ -249,6 +249,12 @@ def depends_on_ends(num: ir.Num) -> bool:
     return any(leaf.clamped for leaf in _shifts(num))
 
 
+def endless(formula: ir.Formula) -> bool:
+    """True if a formula has a window to the end of the trace."""
+    windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
+    return any(node.window.hi is None and not node.back for node in windowed)
+
+
 def uses_end(formula: ir.Formula) -> bool:
     """True if a formula depends on where the trace ends.
 
@@ -256,9 +262,7 @@ def uses_end(formula: ir.Formula) -> bool:
     may read a signal after the last sample, where the last sample is repeated; `sweep`, which reads the next
     sample, is rewritten to such expressions.
     """
-    windowed = (node for node in nodes(formula) if isinstance(node, ir.Windowed))
-    endless = any(node.window.hi is None and not node.back for node in windowed)
-    return endless or any(
+    return endless(formula) or any(
         leaf.clamped and leaf.steps > 0 for num in numbers(formula) for leaf in _shifts(num)
     )
 

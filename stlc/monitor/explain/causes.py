@@ -23,6 +23,7 @@ from typing import Any, TypeAlias, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.analysis.holes import KNOWN
 from stlc.compile.backends.array.graph import evaluate_parts
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -44,7 +45,6 @@ from stlc.compile.ir.traverse import (
 from stlc.compile.lowering.lower import lower
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.cells import over_columns
-from stlc.monitor.holes import KNOWN
 from stlc.monitor.values import Record, assume_missing_true, bounds
 from stlc.source import Span
 from stlc.units import DIMENSIONLESS, Unit

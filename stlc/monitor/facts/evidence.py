@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.analysis.holes import holes_in, without_holes
 from stlc.compile.analysis.ranges import bounds
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
@@ -19,7 +20,6 @@ from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.support import columns, columns_of
 from stlc.grammar import ast
 from stlc.monitor.facts.triggers import Trigger, triggers
-from stlc.monitor.holes import holes_in, without_holes
 from stlc.monitor.judgement import RequirementVerdict, Verdict
 from stlc.monitor.prepared import Prepared
 from stlc.signature import Column

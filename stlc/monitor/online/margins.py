@@ -14,7 +14,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
 from stlc.monitor.online.history import ColumnHistory, Floats
-from stlc.monitor.online.trackers import RecomputeTracker
+from stlc.monitor.online.recompute import RecomputeTracker
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
@@ -96,7 +96,7 @@ class _Watched:
         self.tracker.grow({name: column[begin - first :] for name, column in env.items()}, 0, samples - begin)
         shape = (stop - self.next, next(iter(env.values())).shape[1])
         low, high = (
-            np.broadcast_to(end, shape) for end in self.tracker.of_all(range(self.next - begin, stop - begin))
+            np.broadcast_to(end, shape) for end in self.tracker.live(range(self.next - begin, stop - begin))
         )
         fails, holds = high < -TOLERANCE, low >= -TOLERANCE
         whole = 0 if self.ahead is None else max(samples - self.ahead, 0)  # instants with complete windows

@@ -3,32 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, final
+from typing import Any, Literal, Protocol, TypeAlias, final
 
 import numpy as np
 
+from stlc.compile.backends.c.streams import Rule, streams_of
+from stlc.compile.backends.numbers import Untranslatable
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.support import endless, farthest
+from stlc.compile.ir.traverse import map_children, numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.instants import At, beyond, check_length, starts_of, widened
+from stlc.monitor.instants import At, beyond, check_length, starts_of, window_of
 from stlc.monitor.judgement import Status, unknown_requirement
-from stlc.monitor.online.bounds import RobustnessBounds, Tracker, TrackingOptions
 from stlc.monitor.online.history import ColumnHistory, Floats
-from stlc.monitor.online.paced import PacedTracker
+from stlc.monitor.online.kernel import After, Starts, StreamKernel, Watching
+from stlc.monitor.online.recompute import RecomputeTracker, require_bounded, without_end
 from stlc.monitor.online.tally import Flags, JudgedInstants, RequirementSummary
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
-from stlc.monitor.online.trackers import Trackers
+from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.signals import Gap, Need, arrange, needs_of
-from stlc.monitor.values import decisive
+from stlc.monitor.values import Ends, decisive
 from stlc.trace import Trace
 
 Sample: TypeAlias = Mapping[str, Any]
 """Signal -> number; a vector is a list of them."""
 
 _BEYOND_FLOATS = 1 << 1023
+_LATE = 4096
+"""Samples that are moved to the buffer of reasons at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,97 +83,223 @@ class How:
     reasons: bool = False
 
 
+class Watched(Protocol):
+    """A requirement and its running verdict.
+
+    A start is an instant at which the requirement is evaluated. It is counted when its value is final and its
+    windows are complete.
+    """
+
+    @property
+    def asked(self) -> Asked:
+        """The requirement, and where it is evaluated."""
+
+    @property
+    def tally(self) -> RequirementSummary:
+        """Summary of the counted starts."""
+
+    @property
+    def news(self) -> dict[int, Status]:
+        """Starts that the latest sample decided, in order, and their verdicts."""
+
+    def live(self, starts: range) -> JudgedInstants:
+        """Bounds and verdicts at starts while the trace continues; at most the first of them is counted."""
+
+    def ended(self, starts: range) -> JudgedInstants:
+        """Bounds and verdicts at starts that are not counted, once the trace has ended."""
+
+
 @final
-@dataclass(slots=True)
-class Watched:
-    """A requirement with its incremental evaluators (trackers) and its running verdict.
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Requirement to watch.
 
     Attributes:
         rule: the requirement.
-        everywhere: whether the requirement is evaluated at every sample or only at one.
-        values: evaluator of the robustness.
-        truths: evaluator of the robustness that decides, if it is another one (`stlc.monitor.values`).
-        tolerance: the tolerance, as in `How`.
-        tally: summary of the instants whose verdict is final; these instants are called counted.
-        cut: whether windows are clipped at the end of the trace.
+        deciding: the requirement whose robustness decides the verdict; mostly `rule`.
+        begin: the first start.
+        everywhere: whether every later sample is a start, too.
         horizon: length of a planning window in steps; None if unknown.
-        decided: whether an instant already has a verdict, (instants,). The first entry belongs to the first
-            instant that is not counted.
+        ending: whether the end of the trace cuts windows.
+        tolerance: as in `How`.
     """
 
     rule: CompiledRequirement
+    deciding: CompiledRequirement
+    begin: int
     everywhere: bool
-    values: Tracker
-    truths: Tracker | None
+    horizon: int | None
+    ending: Ends
     tolerance: float
-    tally: RequirementSummary = field(default_factory=RequirementSummary)
-    cut: bool = False
-    horizon: int | None = None
-    decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     @property
-    def trackers(self) -> tuple[Tracker, ...]:
-        """The evaluator of robustness and, if it is another, that of the robustness that decides."""
-        return (self.values,) if self.truths is None else (self.values, self.truths)
+    def lag(self) -> int:
+        """Samples after a start until its windows are complete."""
+        if not self.everywhere:
+            return 0
+        return (self.horizon or 0) if self.rule.windowed else self.rule.reach
+
+    @property
+    def ahead(self) -> int:
+        """Samples after a start until its value is final."""
+        window, formula = window_of(self.rule, self.horizon), self.rule.formula
+        if window is None and endless(formula):
+            return FAR
+        later = max((farthest(num).future for num in numbers(formula)), default=0)
+        return later + (self.rule.reach if window is None else window)
+
+    def streamed(self, signals: Sequence[str]) -> Rule | None:
+        """The requirement of a kernel; None if it has no transducers."""
+        values, deciding = (
+            _in_windows(each, self.horizon, self.begin) for each in (self.rule, self.deciding)
+        )
+        if values is None or deciding is None or (self.everywhere and endless(values)):
+            return None
+        rule = Rule(values, deciding, self.lag)
+        try:
+            streams_of([rule], signals, cut=False)
+        except Untranslatable:
+            return None
+        return rule
+
+
+def _in_windows(rule: CompiledRequirement, horizon: int | None, begin: int) -> ir.Formula | None:
+    """Formula that has the value of a requirement at its starts, without windows to a moving end."""
+    formula, window = rule.formula, window_of(rule, horizon)
+    if window is not None:
+        return without_end(formula, window)
+
+    def first(part: ir.Formula) -> ir.Formula:
+        if isinstance(part, ir.AtStart):
+            return part.body
+        return map_children(part, formulas=first) if isinstance(part, ir.BoolOp) else part
+
+    return formula if begin else first(formula)
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Streamed:
+    """A requirement in a kernel, with its number there."""
+
+    asked: Asked
+    kernel: StreamKernel
+    number: int
+
+    @property
+    def tally(self) -> RequirementSummary:
+        return self.kernel.tally(self.number)
+
+    @property
+    def news(self) -> dict[int, Status]:
+        return self.kernel.news(self.number)
+
+    def live(self, starts: range) -> JudgedInstants:
+        counted = starts.start < self.tally.next
+        rest = starts[1:] if counted else starts
+        found = self._look(rest, "growing" if self.asked.ending == "truncate" else "open")
+        known = range(rest.start, min(self.kernel.samples - self.asked.ahead, rest.stop))
+        if self.asked.ending == "truncate" and known:
+            found = self._look(known, "clipped").followed_by(found, len(known))
+        return self.kernel.last(self.number).followed_by(found) if counted else found
+
+    def ended(self, starts: range) -> JudgedInstants:
+        if self.asked.ending != "truncate":
+            return self._look(starts, "ended")
+        found = self._look(starts, "clipped")
+        outside = beyond(self.asked.rule, starts, self.kernel.samples, self.asked.horizon)
+        return found.widened(outside, self._look(starts, "growing")) if outside.any() else found
+
+    def _look(self, starts: range, after: After) -> JudgedInstants:
+        return self.kernel.look(self.number, starts, after)
+
+
+@final
+@dataclass(slots=True)
+class Recomputed:
+    """A requirement that is evaluated anew after each sample.
+
+    Attributes:
+        asked: the requirement.
+        tally: as in `Watched`.
+        news: as in `Watched`.
+    """
+
+    asked: Asked
+    tally: RequirementSummary
+    news: dict[int, Status] = field(default_factory=dict)
+    _values: RecomputeTracker = field(init=False)
+    _truths: RecomputeTracker | None = None
+    _decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+
+    def __post_init__(self) -> None:
+        asked = self.asked
+        require_bounded(asked.rule, window_of(asked.rule, asked.horizon), everywhere=asked.everywhere)
+        self._values = RecomputeTracker(asked.rule, asked.horizon, asked.ending)
+        if asked.deciding is not asked.rule:
+            self._truths = RecomputeTracker(asked.deciding, asked.horizon, asked.ending)
 
     @property
     def over(self) -> bool:
         """True if the requirement is evaluated only once, and its verdict is final."""
-        return not self.everywhere and self.tally.instants > 0
+        return not self.asked.everywhere and self.tally.instants > 0
+
+    def take(self, history: ColumnHistory) -> None:
+        """Take new samples: decide starts, and count those whose windows are complete."""
+        self.news = {}
+        if not self.over and self._values.due(history.samples):
+            self.grow(history)
+            starts = self.pending
+            judged = self.live(starts)
+            known = judged.holds | judged.fails
+            new = known.copy()
+            new[: len(self._decided)] &= ~self._decided
+            for i in np.flatnonzero(new).tolist():
+                self.news[starts[i]] = "violated" if judged.fails[i] else "satisfied"
+            settled = min(self._values.settled, self._values.samples - self.asked.lag)
+            count = min(max(settled - starts.start, 0), len(starts))
+            self.tally.add(judged, count)
+            self._decided = known[count:]
+
+    def grow(self, history: ColumnHistory) -> None:
+        """Take new samples without a look at the starts."""
+        for tracker in filter(None, (self._values, self._truths)):
+            tracker.grow(history.columns(), history.first, history.samples)
 
     @property
     def pending(self) -> range:
-        """The received instants that are not yet part of the summary `tally`."""
-        samples = self.values.samples
-        return range(self.tally.next, samples if self.everywhere else min(self.tally.first + 1, samples))
+        """Starts that are not counted."""
+        samples = self._values.samples
+        return range(
+            self.tally.next, samples if self.asked.everywhere else min(self.tally.first + 1, samples)
+        )
 
-    def grow(self, history: ColumnHistory) -> None:
-        """Pass new samples to the evaluators."""
-        if self.over or self.values.samples == history.samples:
-            return
-        signals = history.columns()
-        for tracker in self.trackers:
-            tracker.grow(signals, history.first, history.samples)
+    @property
+    def needs(self) -> int:
+        """The first sample that is still read."""
+        return self._values.samples if self.over else self._values.needs(self.tally.next)
 
-    def due(self, samples: int) -> bool:
-        """True if the requirement is to be evaluated now that `samples` samples have been received."""
-        return not self.over and (not isinstance(self.values, PacedTracker) or self.values.due(samples))
-
-    def judged(self, starts: range) -> JudgedInstants:
-        """Return bounds and verdicts at the instants `starts` while the trace continues."""
-        if not starts:
-            return self._judged(RobustnessBounds(np.zeros(0), np.zeros(0)))
-        return self._judged(*(tracker.live(starts.start, starts.stop) for tracker in self.trackers))
+    def live(self, starts: range) -> JudgedInstants:
+        return self._judged(starts, RecomputeTracker.live)
 
     def ended(self, starts: range) -> JudgedInstants:
-        """Return bounds and verdicts at the instants `starts` once the trace has ended."""
-        return self._judged(*(self._ended(tracker, starts) for tracker in self.trackers))
+        return self._judged(starts, RecomputeTracker.ended)
 
-    def _ended(self, tracker: Tracker, starts: range) -> RobustnessBounds:
-        """Bounds once the trace has ended; where a window begins beyond its end, it may also go on."""
-        found = tracker.ended(starts)
-        if not self.cut:
-            return found
-        outside = beyond(self.rule, starts, self.values.samples, self.horizon)
-        if not outside.any():
-            return found
-        return RobustnessBounds(*widened(outside, found, tracker.live(starts.start, starts.stop)))
-
-    def _judged(self, bounds: RobustnessBounds, truths: RobustnessBounds | None = None) -> JudgedInstants:
-        least, most = truths or bounds
-        return JudgedInstants(*bounds, least >= -self.tolerance, most < -self.tolerance)
-
-    def drop(self) -> int:
-        """Free the memory of final instants; return the index of the first sample that is still needed."""
-        return min(tracker.drop(min(self.tally.next, tracker.settled)) for tracker in self.trackers)
+    def _judged(
+        self, starts: range, bounds: Callable[[RecomputeTracker, range], tuple[Floats, Floats]]
+    ) -> JudgedInstants:
+        if not starts:
+            return JudgedInstants.of(np.zeros((0, 4)), 0.0)
+        parts = [*bounds(self._values, starts), *bounds(self._truths or self._values, starts)]
+        return JudgedInstants.of(np.concatenate(parts, axis=1), self.asked.tolerance)
 
 
 class Online:
     """Monitor of a stream of samples; made by `Monitor.online`.
 
-    Memory is bounded by the windows of the requirements, not by the length of the stream. An unbounded future
-    window takes constant memory, unless it is inside a bounded window. In that case all samples are stored,
-    and the requirement is evaluated on all of them.
+    Memory and the time per sample are bounded by the windows of the requirements, not by the length of the
+    stream. Without a C compiler, for `freeze`, and for a window to the end of the trace inside of another
+    window, the requirement is evaluated anew after each sample; in the last case all samples are stored.
     """
 
     def __init__(
@@ -175,16 +308,20 @@ class Online:
         self.how = how or How()
         self.compiled = compiled
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
-        self._names = [need.column.name for need in self._needs]
-        self.gaps: dict[str, Gap] = {}
-        """Samples at which signals are unknown."""
+        self.signals = tuple(need.column.name for need in self._needs)
+        """Names of the signals, in the order of a row."""
+        asked = [self._ask(rule) for rule in rules]
+        asked += [self._ask(rule, once=True) for rule in compiled.assumptions]
+        self._kernel, watched = self._watch(asked)
+        self._watched, self._scope = watched[: len(rules)], watched[len(rules) :]
+        self._recomputed = [each for each in watched if isinstance(each, Recomputed)]
         self._history = ColumnHistory()
-        self._trackers = Trackers(compiled.grid.horizon)
-        self._watched = [self._watch(rule) for rule in rules]
-        self._scope = [self._watch(rule, once=True) for rule in compiled.assumptions]
+        self._gaps: dict[str, Gap] = {}
         self._buffer = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
+        self._late: list[Sequence[float]] = []
+        self._plain = self._kernel is not None and not self._recomputed and self._buffer is None
 
-    def _watch(self, rule: CompiledRequirement, *, once: bool = False) -> Watched:
+    def _ask(self, rule: CompiledRequirement, *, once: bool = False) -> Asked:
         horizon = self.compiled.grid.horizon
         begin = self.how.at if isinstance(self.how.at, int) and not once else 0
         once = once or rule.absolute or isinstance(self.how.at, int)
@@ -192,99 +329,157 @@ class Online:
         if everywhere and not rule.windowed and rule.uses_end:
             message = f"`{rule.name}` runs to the end: at every start it would stay open until then"
             raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
-        ending: Literal["open", "truncate"] = "truncate" if self.how.end == "truncate" else "open"
-        options = TrackingOptions(ending, begin=begin)
-        values, truths = self._trackers.of(rule, options, everywhere=everywhere), None
-        if (deciding := decisive(rule, self.how.tolerance, self.compiled.signature)) is not rule:
-            truths = self._trackers.of(deciding, options, everywhere=everywhere)
-        tally = RequirementSummary(low_at=begin, high_at=begin, first=begin)
-        cut = ending == "truncate"
-        return Watched(rule, everywhere, values, truths, self.how.tolerance, tally, cut, horizon)
+        ending: Ends = "truncate" if self.how.end == "truncate" else "open"
+        deciding = decisive(rule, self.how.tolerance, self.compiled.signature)
+        return Asked(rule, deciding, begin, everywhere, horizon, ending, self.how.tolerance)
 
-    def push(self, sample: Sample) -> tuple[Decision, ...]:
-        """Add one sample; return the verdicts that this sample decides, in the order of the requirements.
+    def _watch(self, asked: Sequence[Asked]) -> tuple[StreamKernel | None, list[Streamed | Recomputed]]:
+        """Kernel of all requirements that have transducers, and what watches each requirement."""
+        streamed = {
+            i: rule for i, each in enumerate(asked) if (rule := each.streamed(self.signals)) is not None
+        }
+        starts = [Starts(asked[i].begin, asked[i].everywhere) for i in streamed]
+        watching = Watching(starts, self.how.tolerance, self.how.end == "truncate")
+        kernel = StreamKernel.of(list(streamed.values()), self.signals, watching) if streamed else None
+        numbers = {i: number for number, i in enumerate(streamed)} if kernel is not None else {}
+        return kernel, [
+            Streamed(each, kernel, numbers[i])
+            if kernel is not None and i in numbers
+            else Recomputed(each, RequirementSummary(low_at=each.begin, high_at=each.begin, first=each.begin))
+            for i, each in enumerate(asked)
+        ]
 
-        NaN is an unknown value.
+    def push(self, sample: Sequence[float] | Sample) -> int:
+        """Add one sample; return the number of starts that it decides (`verdicts`).
+
+        A sample is one number per signal, in the order of `signals`, or a mapping from names to numbers. NaN
+        is an unknown value.
 
         Raises:
-            TraceError: E601, a signal is missing; E605, a value is not a single number.
+            TraceError: E601, a signal is missing; E605, the sample is not one number per signal.
         """
-        values = [_number(sample, need) for need in self._needs]
-        rows = np.array(values).reshape(-1, 1, 1)
-        holes = [name for name, value in zip(self._names, values, strict=True) if math.isnan(value)]
-        self._take(dict(zip(self._names, rows, strict=True)), 1, holes)
-        found: list[Decision] = []
-        for watched in self._watched:
-            if watched.due(self.samples):
-                watched.grow(self._history)
-                found += self._decide(watched)
-        self._settle(self._scope)
-        return tuple(found)
+        row = self._row(sample) if isinstance(sample, Mapping) else sample
+        try:
+            if self._plain:
+                return self._kernel.push(row)  # type: ignore[union-attr]
+            return self._pushed(row)
+        except (TypeError, ValueError, OverflowError):
+            pass
+        if isinstance(sample, Mapping):
+            return self._pushed([_number(sample, need) for need in self._needs])
+        message = f"a sample is one number for each of {', '.join(self.signals)}"
+        raise TraceError(Diagnostic("E605", message)) from None
 
-    def feed(self, signals: Mapping[str, Any] | Trace) -> None:
+    def _row(self, sample: Sample) -> list[Any]:
+        try:
+            return [sample[name] for name in self.signals]
+        except KeyError:
+            return [_number(sample, need) for need in self._needs]
+
+    def _pushed(self, row: Sequence[float]) -> int:
+        decided = 0
+        if self._kernel is not None:
+            decided = self._kernel.push(row)
+        if self._recomputed:
+            numbers = np.array(row, dtype=np.float64).reshape(1, -1)
+            self._store(numbers)
+            for each in self._recomputed:
+                each.take(self._history)
+                decided += len(each.news)
+            self._forget()
+        if self._buffer is not None:
+            self._late.append(tuple(row))
+            if len(self._late) > _LATE:
+                self._fill()
+        return decided
+
+    def push_block(self, rows: Floats, *, pause: bool = False) -> tuple[int, int]:
+        """Add samples, (count, signals); with `pause`, up to the first that decides a start.
+
+        Returns:
+            The number of starts that are decided, and the number of samples taken.
+        """
+        if pause and (self._recomputed or self._kernel is None):
+            rows = rows[:1]
+        decided, taken = 0, len(rows)
+        if self._kernel is not None:
+            decided, taken = self._kernel.push_block(rows, pause=pause)
+        if self._recomputed:
+            self._store(rows)
+            for each in self._recomputed:
+                each.take(self._history)
+                decided += len(each.news)
+            self._forget()
+        if self._buffer is not None:
+            self._fill()
+            self._keep(np.asarray(rows[:taken], dtype=np.float64))
+        return decided, taken
+
+    def feed(self, signals: Mapping[str, Any] | Trace) -> int:
         """Add many samples at once: arrays (time,) by signal name, or a trace or a part of it.
 
-        Verdicts are counted, but not returned one by one.
+        Returns the number of starts that they decide.
 
         Raises:
             TraceError: the errors of `push`.
         """
         laid = arrange(signals, self._needs, plain=True)
-        columns = {name: np.asarray(values).reshape(laid.samples, 1) for name, values in laid.env.items()}
-        self._take(columns, laid.samples, [name for name in self._names if np.isnan(columns[name]).any()])
-        self._settle((*self._watched, *self._scope))
+        columns = [np.asarray(laid.env[name]).reshape(-1) for name in self.signals]
+        rows = np.stack(columns, axis=1) if columns else np.zeros((laid.samples, 0))
+        return self.push_block(rows)[0]
 
-    def _take(self, columns: dict[str, Floats], count: int, holes: Sequence[str]) -> None:
-        """Store `count` samples: arrays (count, 1) by signal name; `holes` have unknown samples."""
-        for name in holes:
-            self.gaps[name] = self.gaps.get(name, Gap()).with_more(np.isnan(columns[name]), self.samples)
-        columns = columns or {"": np.zeros((count, 1))}
-        self._history.take(columns, count)
-        if self._buffer is None:
-            return
-        self._buffer.take(columns, count)
+    def _store(self, rows: Floats) -> None:
+        """Store samples, (count, signals), for requirements that are evaluated anew."""
+        columns = self._columns(rows)
+        if self._kernel is None:
+            for name in self.signals:
+                unknown = np.isnan(columns[name])
+                self._gaps[name] = self._gaps.get(name, Gap()).with_more(unknown, self._history.samples)
+        self._history.take(columns, len(rows))
+
+    def _columns(self, rows: Floats) -> dict[str, Floats]:
+        found = {name: rows[:, i : i + 1] for i, name in enumerate(self.signals)}
+        return found or {"": np.zeros((len(rows), 1))}
+
+    def _forget(self) -> None:
+        self._history.forget(min(each.needs for each in self._recomputed))
+
+    def _fill(self) -> None:
+        """Move the latest samples to the buffer of reasons."""
+        if self._late:
+            self._keep(np.array(self._late, dtype=np.float64).reshape(len(self._late), -1))
+            self._late.clear()
+
+    def _keep(self, rows: Floats) -> None:
+        assert self._buffer is not None
+        self._buffer.take(self._columns(rows), len(rows))
         if self._buffer.full:
-            found = [(watched.rule, self._worst(watched)) for watched in self._watched]
+            found = [(watched.asked.rule, self._worst(watched)) for watched in self._watched]
             self._buffer.forget([(rule, worst) for rule, worst in found if worst is not None])
 
-    def _decide(self, watched: Watched) -> list[Decision]:
-        """Return the verdicts that the latest sample decides, and count the final instants."""
+    def verdicts(self) -> tuple[Decision, ...]:
+        """Verdicts that the latest sample decided, in the order of the requirements."""
         found: list[Decision] = []
-        starts = watched.pending
-        judged = watched.judged(starts)
-        known = judged.holds | judged.fails
-        if np.count_nonzero(known) > np.count_nonzero(watched.decided):
-            new = known.copy()
-            new[: len(watched.decided)] &= ~watched.decided
-            for i in np.flatnonzero(new).tolist():
-                status: Status = "violated" if judged.fails[i] else "satisfied"
-                low, high, start = float(judged.low[i]), float(judged.high[i]), starts[i]
-                decision = Decision(
-                    watched.rule.name, start, self.time(start), status, low, high, self.samples - 1
-                )
-                found.append(decision)
-        count = min(max(self._countable(watched) - starts.start, 0), len(known))
-        watched.tally.add(judged, count)
-        watched.decided = known[count:]
-        return found
+        for watched in self._watched:
+            news = watched.news
+            if not news:
+                continue
+            starts = range(min(news), max(news) + 1)
+            judged = watched.live(starts)
+            for start, status in news.items():
+                low, high = float(judged.low[start - starts.start]), float(judged.high[start - starts.start])
+                name, sample = watched.asked.rule.name, self.samples - 1
+                found.append(Decision(name, start, self.time(start), status, low, high, sample))
+        return tuple(found)
 
-    def _countable(self, watched: Watched) -> int:
-        """The first instant whose value may still change, or whose window is incomplete."""
-        if not watched.everywhere:
-            return watched.values.settled
-        window = self.compiled.grid.horizon if watched.rule.windowed else watched.rule.reach
-        return min(watched.values.settled, max(watched.values.samples - (window or 0), 0))
-
-    def _settle(self, requirements: Sequence[Watched]) -> None:
-        """Count the final instants of `requirements`, and drop the samples that no requirement needs."""
-        for watched in requirements:
-            if watched.due(self.samples):
-                watched.grow(self._history)
-                starts = watched.pending
-                judged = watched.judged(range(starts.start, min(starts.stop, self._countable(watched))))
-                watched.tally.add(judged, len(judged.low))
-        alive = [watched for watched in (*self._watched, *self._scope) if not watched.over]
-        self._history.forget(min((watched.drop() for watched in alive), default=self.samples))
+    @property
+    def gaps(self) -> dict[str, Gap]:
+        """Samples at which signals are unknown."""
+        if self._kernel is None:
+            found = self._gaps
+        else:
+            found = {name: self._kernel.gap(i) for i, name in enumerate(self.signals)}
+        return {name: gap for name, gap in found.items() if gap.samples}
 
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; the sample number if the time step is unknown."""
@@ -294,25 +489,20 @@ class Online:
     @property
     def requirements(self) -> tuple[str, ...]:
         """Names of the requirements, in order."""
-        return tuple(watched.rule.name for watched in self._watched)
+        return tuple(watched.asked.rule.name for watched in self._watched)
 
     def rule(self, name: str) -> CompiledRequirement:
         """Return the requirement `name`. Raises UsageError (U101) for an unknown name."""
-        return self._find(name).rule
+        return self._find(name).asked.rule
 
     def repeats(self, name: str) -> bool:
         """True if the requirement `name` is evaluated at every sample, False if it is evaluated once."""
-        return self._find(name).everywhere
-
-    @property
-    def kept(self) -> int:
-        """Number of samples that are stored in memory."""
-        return self.samples - self._history.first
+        return self._find(name).asked.everywhere
 
     @property
     def samples(self) -> int:
         """Number of samples received."""
-        return self._history.samples
+        return self._history.samples if self._kernel is None else self._kernel.samples
 
     def open_starts(self, name: str) -> list[tuple[int, float, float]]:
         """Return the bounds on the robustness of the requirement `name` that are not final yet.
@@ -320,10 +510,26 @@ class Online:
         There is one triple (sample, least robustness, greatest robustness) for each such sample.
         """
         watched = self._find(name)
-        watched.grow(self._history)
-        starts = watched.pending
-        bounds = watched.values.live(starts.start, starts.stop) if starts else ((), ())
-        return [(start, float(a), float(b)) for start, a, b in zip(starts, *bounds, strict=True)]
+        starts = self._pending(watched)
+        judged = watched.live(starts)
+        return list(zip(starts, judged.low.tolist(), judged.high.tolist(), strict=True))
+
+    def bounds(self, name: str, start: int) -> tuple[float, float]:
+        """Least and greatest robustness of the requirement `name` at a start whose value is not final yet.
+
+        Raises UsageError (U101) for another start.
+        """
+        watched = self._find(name)
+        if start not in self._pending(watched):
+            raise UsageError(Diagnostic("U101", f"`{name}` is not open at sample {start}"))
+        judged = watched.live(range(start, start + 1))
+        return float(judged.low[0]), float(judged.high[0])
+
+    def _pending(self, watched: Watched) -> range:
+        if isinstance(watched, Recomputed):
+            watched.grow(self._history)
+        first, begin = watched.tally.next, watched.asked.begin
+        return range(first, self.samples if watched.asked.everywhere else min(begin + 1, self.samples))
 
     def standing(self, name: str) -> RequirementSummary:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.
@@ -333,8 +539,8 @@ class Online:
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> RequirementSummary:
-        watched.grow(self._history)
-        return watched.tally.with_more(watched.judged(watched.pending))
+        starts = self._pending(watched)
+        return watched.tally.with_more(watched.live(starts)) if starts else watched.tally
 
     @property
     def in_scope(self) -> bool | None:
@@ -356,22 +562,23 @@ class Online:
             raise TraceError(Diagnostic("E605", "there are no samples"))
         if self.how.end == "strict":
             findings = [
-                check_length(each.rule, self.samples, self._starts(each), self.compiled.grid)
+                check_length(each.asked.rule, self.samples, self._starts(each), self.compiled.grid)
                 for each in self._watched
             ]
             if refused := [finding for finding in findings if finding is not None]:
                 raise TraceError(*refused)
-        return {watched.rule.name: self._ended(watched) for watched in self._watched}
+        return {watched.asked.rule.name: self._ended(watched) for watched in self._watched}
 
     def _starts(self, watched: Watched) -> range:
-        return starts_of(watched.rule, self.samples, self.compiled.grid.horizon, self.how.at)
+        return starts_of(watched.asked.rule, self.samples, self.compiled.grid.horizon, self.how.at)
 
     def _ended(self, watched: Watched) -> RequirementSummary:
         """Summary of a requirement if the trace ends now."""
-        watched.grow(self._history)
-        starts = self._starts(watched)
-        rest = range(min(watched.tally.next, starts.stop), starts.stop)
-        return watched.tally.with_more(watched.ended(rest)) if rest else watched.tally
+        if isinstance(watched, Recomputed):
+            watched.grow(self._history)
+        starts, tally = self._starts(watched), watched.tally
+        rest = range(min(tally.next, starts.stop), starts.stop)
+        return tally.with_more(watched.ended(rest)) if rest else tally
 
     def _worst(self, watched: Watched) -> Worst | None:
         """Worst violation of a requirement if the trace ended now; None if it would not be violated."""
@@ -391,11 +598,12 @@ class Online:
         watched = self._find(name)
         if self._buffer is None or (worst := self._worst(watched)) is None:
             return None
-        return self._buffer.cause(watched.rule, worst)
+        self._fill()
+        return self._buffer.cause(watched.asked.rule, worst)
 
     def _find(self, name: str) -> Watched:
         for watched in self._watched:
-            if watched.rule.name == name:
+            if watched.asked.rule.name == name:
                 return watched
         raise unknown_requirement(name, list(self.requirements))
 

@@ -26,6 +26,22 @@ class JudgedInstants(NamedTuple):
     holds: Flags
     fails: Flags
 
+    @staticmethod
+    def of(bounds: Floats, tolerance: float) -> JudgedInstants:
+        """From bounds on the robustness and on that which decides, (instants, 4)."""
+        low, high, least, most = bounds.T
+        return JudgedInstants(low, high, least >= -tolerance, most < -tolerance)
+
+    def followed_by(self, other: JudgedInstants, first: int = 0) -> JudgedInstants:
+        """These instants, then those of `other` from number `first` on."""
+        return JudgedInstants(*(np.concatenate([a, b[first:]]) for a, b in zip(self, other, strict=True)))
+
+    def widened(self, where: Flags, other: JudgedInstants) -> JudgedInstants:
+        """Bounds and verdicts that hold for both at the instants `where`."""
+        low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
+        both = JudgedInstants(low, high, self.holds & other.holds, self.fails & other.fails)
+        return JudgedInstants(*(np.where(where, a, b) for a, b in zip(both, self, strict=True)))
+
 
 @dataclass(slots=True)
 class RequirementSummary:

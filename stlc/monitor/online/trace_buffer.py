@@ -13,14 +13,14 @@ import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.support import endless, farthest, reach
 from stlc.compile.ir.support import history as lookback
-from stlc.compile.ir.support import reach
+from stlc.compile.ir.traverse import numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.monitor.explain.report import Cause, cause_of
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import RequirementVerdict
 from stlc.monitor.online.history import ColumnHistory, Floats
-from stlc.monitor.online.streams import endless, looks_on
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
@@ -141,4 +141,5 @@ def _around(rule: CompiledRequirement, formula: ir.Formula, horizon: int | None)
     window = window_of(rule, horizon)
     if rule.absolute or (window is None and endless(formula) and not _endless_always(rule, formula)):
         return None
-    return lookback(formula), max(reach(formula).future, window or 0) + looks_on(formula)
+    later = max((farthest(num).future for num in numbers(formula)), default=0)
+    return lookback(formula), max(reach(formula).future, window or 0) + later

@@ -264,7 +264,8 @@ def test_the_first_violation_is_the_one_that_an_online_monitor_reports(seed: int
     online = monitor.online(How(at=at), dt=0.1, require=require)
     first: dict[str, int] = {}
     for k in range(40):
-        for decision in online.push({"a": a[k], "b": b[k]}):
+        online.push({"a": a[k], "b": b[k]})
+        for decision in online.verdicts():
             counted = decision.start < verdict[decision.requirement].instants
             if decision.status == "violated" and counted:
                 first.setdefault(decision.requirement, decision.sample)

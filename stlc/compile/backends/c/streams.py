@@ -1,0 +1,666 @@
+"""Monitors of streams in C: every sub-formula is a transducer, from its operands' values to its own.
+
+`streams.c` has the transducers; this module writes what differs between monitors: tables of nodes, and code
+for the predicates. A requirement gives two programs over the same nodes.
+
+- *Values*: bounds at each instant, in order, as soon as all samples that they depend on were received. A
+  window is two lists of partial maxima, `until` the same over functions `x -> min(c, max(f, x))`, operators
+  of the past are recursions. After the last sample, the same transducers give bounds over all continuations
+  if unknown samples follow, and the value of the ended trace if instants that do not exist follow.
+- *Truths*: what is already certain. The truth of a predicate decides a range of instants of the operator
+  above it, and so on up to the requirement. Each instant of each operator is decided once.
+
+Minima are maxima of negated operands, so that there is one transducer per pair of dual operators. Windows to
+the end of the trace are judged at one instant; the function from their values to that of the requirement is
+kept as its values where each of them is +inf or -inf (`coefficients`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from stlc.compile.analysis.holes import unsure
+from stlc.compile.backends.c.numbers import NumberWriter
+from stlc.compile.backends.numbers import Leaf, Untranslatable
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.support import farthest, reach_of
+from stlc.compile.ir.traverse import leaves, map_children, operands
+from stlc.compile.schedule.schedule import PICKS
+
+RUNTIME = Path(__file__).with_name("streams.c")
+
+_MOST = 5
+"""Greatest number of operators with windows to the end of the trace; there are 2^n coefficients."""
+
+_ENTRIES = 256
+"""Greatest number of operators around these, as in `streams.c`."""
+
+_LARGEST = 1 << 31
+"""Rows of a ring of values from which a monitor is refused."""
+
+Lines: TypeAlias = list[str]
+
+
+class Lasting(ir.Temporal):
+    """Left side of an `until` before its window; the end of the trace does not cut it."""
+
+
+class Begun(ir.Shift):
+    """An unbounded `until` with its part before the window: unknown until a sample of its window exists."""
+
+    @property
+    def offsets(self) -> tuple[ir.Offsets, ...]:
+        return (ir.NOW,)
+
+
+def normal(formula: ir.Formula) -> ir.Formula:
+    """Return an equal formula of fewer kinds of nodes.
+
+    `until` and `since` have windows from 0, those of `since` are unbounded, and so `always p` without bounds
+    is a `release`.
+    """
+    match formula:
+        case ir.Predicate() | ir.Truth():
+            return formula
+        case ir.Freeze() | ir.AtStart():
+            raise Untranslatable(type(formula).__name__)
+    whole: Any = map_children(formula, formulas=normal)
+    if not isinstance(whole, ir.Windowed):
+        return whole  # type: ignore[no-any-return]
+    return _windowed(whole, whole.names[0])
+
+
+def _windowed(whole: Any, least: str) -> ir.Formula:
+    """`normal` of an operator with a window; `least` is the name of those of its kind that take a minimum."""
+    lo, hi, every = whole.window.lo, whole.window.hi, whole.op == least
+    bounded = isinstance(whole, (ir.Temporal, ir.PastTemporal))
+    if bounded and hi is not None:
+        return whole  # type: ignore[no-any-return]
+    left, right = (ir.Truth(not every), whole.body) if bounded else (whole.left, whole.right)
+    kind = ir.Since if whole.back else ir.Until
+    op = whole.op if not bounded else kind.names[0 if every else 1]
+    window = ir.Window(0, None if hi is None or whole.back else hi - lo)
+    node: ir.Formula = kind(op, window, left, right)  # type: ignore[arg-type]
+    if lo:
+        node = ir.Shift(-lo, node, outside=every) if whole.back else ir.Shift(lo, node, weak=every)
+    parts, extremum = [node], ir.PastTemporal if whole.back else ir.Temporal
+    if hi is not None:
+        parts.append(extremum(extremum.names[0 if every else 1], whole.window, right))  # type: ignore[arg-type]
+    if lo and not bounded:
+        held: Any = extremum if whole.back else Lasting
+        parts.append(held(extremum.names[1 if every else 0], ir.Window(0, lo - 1), left))
+    if len(parts) == 1:
+        return node
+    together = ir.BoolOp("or" if every else "and", tuple(parts))
+    return together if hi is not None or whole.back else Begun(lo, together)
+
+
+@dataclass(slots=True)
+class Node:
+    """A sub-formula and its transducers.
+
+    Attributes:
+        index: number of the node; operands come before the nodes that read them.
+        form: the sub-formula, in normal form.
+        args: numbers of the operands.
+        delay: samples after an instant until its value is known.
+        readers: numbers of the nodes that read it.
+        ahead: instants after the latest sample at which its truth may be known.
+        age: instants before the latest sample at which its truth still matters.
+        kept: greatest number of samples after which its values are still read.
+        endless: whether it has a window to the end of the trace.
+        lasts: whether its truth may be known at all instants from one on.
+    """
+
+    index: int
+    form: ir.Formula
+    args: tuple[int, ...]
+    delay: int = 0
+    readers: list[int] = field(default_factory=list)
+    ahead: int = 0
+    age: int = 0
+    kept: int = 0
+    endless: bool = False
+    lasts: bool = False
+
+    @property
+    def dual(self) -> bool:
+        """True if the node takes a minimum."""
+        return PICKS.get(getattr(self.form, "op", "")) == "min"
+
+    @property
+    def rows(self) -> int:
+        """Length of the ring of its truths, a power of 2."""
+        return _ring(self.age + self.ahead + 3)
+
+
+def _ring(rows: int) -> int:
+    if rows >= _LARGEST:
+        raise Untranslatable("a window of more samples than memory holds")
+    return 1 << (rows - 1).bit_length()
+
+
+class Graph:
+    """Sub-formulas of one formula, with all that is known of them before the first sample.
+
+    Args:
+        formula: formula in negation normal form.
+        lag: samples after an instant until its value is counted, at least.
+        signals: name of a signal -> its index in a sample.
+
+    Raises:
+        Untranslatable: there is no transducer for an operator where it stands.
+    """
+
+    def __init__(self, formula: ir.Formula, lag: int, signals: Mapping[str, int]) -> None:
+        self.signals, self.spans, self.ints = signals, 0, 0
+        self.rings: dict[int, int] = {}
+        self.nodes: list[Node] = []
+        self._known: dict[ir.Formula, int] = {}
+        self.root = self._place(normal(formula))
+        top = self.nodes[self.root]
+        self.coefficients: list[tuple[int, int]] = []
+        """Windows to the end: number of the node, and instants after that of the requirement."""
+        self.parts: dict[tuple[int, int], None] = {}
+        if top.endless:
+            self._skeleton(self.root, 0)
+            if len(self.coefficients) > _MOST:
+                raise Untranslatable("too many windows to the end")
+            lag = max([lag, *(self.nodes[part].delay + later for part, later in self.parts)])
+        self.lag = max(lag, top.delay)
+        self._sizes()
+
+    # ------------------------------------------------------------------- construction
+
+    def _place(self, form: ir.Formula) -> int:
+        if form in self._known:
+            return self._known[form]
+        parts = operands(form)
+        if isinstance(form, (ir.Until, ir.Since)) and parts[0] == ir.Truth(PICKS[form.op] == "max"):
+            parts = parts[1:]
+        args = tuple(map(self._place, parts))
+        args = tuple(dict.fromkeys(args)) if isinstance(form, ir.BoolOp) else args
+        node = Node(len(self.nodes), form, args)
+        delays = [self.nodes[arg].delay for arg in args]
+        most = max(delays, default=0)
+        match form:
+            case ir.Predicate(num):
+                node.delay = farthest(num).future
+            case ir.Temporal(window=window):
+                node.delay = most + (window.hi or 0)
+            case ir.PastTemporal(window=window):
+                node.delay = max(most - window.lo, 0)
+            case Begun():
+                node.delay = most
+            case ir.Shift(steps):
+                node.delay = max(most + steps, 0)
+            case ir.Until(window=window):
+                node.endless = window.hi is None
+                node.delay = most + (window.hi or 0)
+            case _:
+                node.delay = most
+        node.endless = node.endless or any(self.nodes[arg].endless for arg in args)
+        self.nodes.append(node)
+        for arg in args:
+            self.nodes[arg].readers.append(node.index)
+        self._known[form] = node.index
+        return node.index
+
+    def _skeleton(self, index: int, later: int) -> None:
+        """Find the operators with windows to the end, and the nodes without that these read."""
+        node = self.nodes[index]
+        if not node.endless:
+            self.parts[index, later] = None
+            return
+        match node.form:
+            case ir.BoolOp():
+                pass
+            case Begun():
+                pass
+            case ir.Shift(steps, _, None) if steps >= 0:
+                later += steps
+            case ir.Until(window=ir.Window(hi=None)):
+                if (index, later) not in self.coefficients:
+                    for arg in node.args:
+                        self._skeleton(arg, later)
+                    self.coefficients.append((index, later))
+                return
+            case _:
+                raise Untranslatable("a window to the end inside of another operator")
+        for arg in node.args:
+            self._skeleton(arg, later)
+
+    def _offsets(self, node: Node) -> list[tuple[int, int]]:
+        """Least and greatest instant, relative to now, at which a node reads each operand."""
+        match node.form:
+            case ir.Temporal(window=ir.Window(lo, hi)):
+                return [(lo, hi or 0)]
+            case ir.PastTemporal(window=ir.Window(lo, hi)):
+                return [(-(hi or 0), -lo)]
+            case ir.Shift(steps) if not isinstance(node.form, Begun):
+                return [(steps, steps)]
+            case _:
+                return [(0, 0)] * len(node.args)
+
+    def _sizes(self) -> None:
+        for node in self.nodes:
+            below = [self.nodes[arg].ahead for arg in node.args]
+            match node.form:
+                case ir.Predicate():
+                    node.ahead = -node.delay
+                case ir.Temporal(window=window):
+                    node.ahead = below[0] - window.lo
+                case ir.PastTemporal(window=window):
+                    node.ahead = max(below[0] + (window.hi or 0), window.lo - 1)
+                case ir.Shift(steps, _, outside) if not isinstance(node.form, Begun):
+                    node.ahead = below[0] - steps if outside is None else max(below[0], -1) - steps
+                case _:
+                    node.ahead = max(below, default=0)
+            node.lasts = isinstance(node.form, (ir.Truth, ir.Since)) or any(
+                self.nodes[arg].lasts for arg in node.args
+            )
+        self.nodes[self.root].age = self.lag
+        for node in reversed(self.nodes):
+            node.ahead = max(node.ahead, 0)
+            for arg, (first, _) in zip(node.args, self._offsets(node), strict=True):
+                part = self.nodes[arg]
+                part.ahead = max(part.ahead, node.ahead if isinstance(node.form, ir.BoolOp) else 0)
+                part.age = max(part.age, node.age - first)
+        for node in self.nodes:
+            for arg in () if node.endless else node.args:
+                self._keep(arg, self._late(node, arg))
+        for index, later in self.parts:
+            self._keep(index, self.lag - later - self.nodes[index].delay)
+        if not self.nodes[self.root].endless:
+            self._keep(self.root, self.lag - self.nodes[self.root].delay)
+
+    def _keep(self, index: int, late: int) -> None:
+        self.nodes[index].kept = max(self.nodes[index].kept, late)
+
+    def _late(self, node: Node, arg: int) -> int:
+        """Samples between the value of an operand and the one that reads it."""
+        part = self.nodes[arg]
+        match node.form:
+            case ir.Temporal():
+                return 0
+            case ir.PastTemporal(window=window):
+                return node.delay - part.delay + window.lo
+            case ir.Shift(steps):
+                return node.delay - part.delay - steps
+            case ir.Until() | ir.Since():
+                return max(self.nodes[each].delay for each in node.args) - part.delay
+            case _:
+                return node.delay - part.delay
+
+    @property
+    def samples(self) -> int:
+        """Number of samples that predicates read, the latest included."""
+        found = [1]
+        for node in self.nodes:
+            if isinstance(node.form, ir.Predicate):
+                far = farthest(node.form.num)
+                found.append(far.future + (far.past if far.past < 1 << 29 else 0) + 1)
+        return max(found)
+
+    @property
+    def far(self) -> int:
+        """Number of unknown samples after which more of them change no bounds."""
+        spans = [self.lag + 2]
+        for node in self.nodes:
+            match node.form:
+                case ir.Predicate(num):
+                    far = farthest(num)
+                    spans.append(far.future + (far.past if far.past < 1 << 29 else 0))
+                case ir.Temporal(window=window) | ir.PastTemporal(window=window) | ir.Until(window=window):
+                    spans.append(window.hi or 0)
+                case ir.Shift(steps):
+                    spans.append(abs(steps))
+        return sum(spans)
+
+    # ------------------------------------------------------------------------- tables
+
+    def tables(self, out: _Tables) -> int:
+        """Add the tables of the graph; return its number."""
+        first, spans, ints = len(out.nodes), 0, 0
+
+        def room(count: int) -> int:
+            nonlocal spans
+            spans += count
+            return spans - count
+
+        for node in self.nodes:
+            form, kind = node.form, _KINDS[type(node.form)]
+            lo, hi, flags = 0, 0, 0
+            match form:
+                case ir.Truth(value):
+                    lo = 2 if value else 1
+                case Begun(steps):
+                    lo = steps
+                case ir.Shift(steps, _, outside, _, weak):
+                    lo, hi = steps, 0 if outside is None else 2 if outside else 1
+                    flags |= _WEAK * weak
+                case ir.Windowed(window=around):
+                    lo, hi = around.lo, around.hi or 0
+            flags |= _DUAL * node.dual
+            flags |= _UNCUT * isinstance(form, Lasting) | _ENDLESS * node.endless
+            flags |= _LASTS * node.lasts | _ROOT * (node.index == self.root)
+            operands = out.add(out.operands, [(first + arg, self._late(node, arg)) for arg in node.args])
+            readers = out.add(out.readers, [(first + reader,) for reader in dict.fromkeys(node.readers)])
+            rows, kept = node.rows, _ring(node.kept + 1)
+            window = ends = place = skip = 0
+            ring = self.rings[node.index] = 0 if node.endless else room(kept)
+            if not node.endless:
+                match form:
+                    case ir.Temporal() | ir.PastTemporal():
+                        window, place, ints = room(hi - lo + 2), ints, ints + 1
+                    case ir.Until():
+                        window, place, ints = room(2 * (hi + 2)), ints, ints + 1
+                    case ir.Since():
+                        window = room(1)
+            truth = 0 if isinstance(form, ir.Truth) else out.room("truths", rows)
+            if isinstance(form, (ir.Temporal, ir.PastTemporal)):
+                skip, ends = out.room("ints", rows), out.room("ints", self.nodes[node.args[0]].rows)
+            elif isinstance(form, ir.BoolOp):
+                skip = out.room("ints", rows)
+            since = out.room("times", 2) if node.lasts else 0
+            sizes = (
+                node.delay,
+                node.age,
+                node.ahead,
+                operands,
+                len(node.args),
+                readers,
+                len(dict.fromkeys(node.readers)),
+            )
+            places = (ring, kept - 1, window, place, truth, rows - 1, skip, ends, since)
+            out.nodes.append((kind, flags, lo, hi, *sizes, *places))
+        entries = self._entries(first, out)
+        bits, coefficients = len(self.coefficients), 0
+        if bits:
+            coefficients = room(1 << bits)
+        neutral = sum(1 << i for i, (index, _) in enumerate(self.coefficients) if self.nodes[index].dual)
+        late = self.lag - self.nodes[self.root].delay
+        shape = (first, len(self.nodes), first + self.root, late, self.lag, self.far)
+        out.graphs.append((*shape, coefficients, bits, neutral, len(out.entries), len(entries)))
+        out.entries += entries
+        if len(entries) > _ENTRIES:
+            raise Untranslatable("too many operators around windows to the end")
+        self.spans, self.ints = spans, ints
+        return len(out.graphs) - 1
+
+    def _entries(self, first: int, out: _Tables) -> list[tuple[int, ...]]:
+        """Parts of a formula with windows to the end, operands first."""
+        entries: list[tuple[int, ...]] = []
+        done: dict[tuple[int, int], int] = {}
+        bits = {key: bit for bit, key in enumerate(self.coefficients)}
+
+        def place(index: int, later: int) -> int:
+            if (index, later) in done:
+                return done[index, later]
+            node, form = self.nodes[index], self.nodes[index].form
+            flags, kind, there, bit = 0, _KINDS[type(form)], later, 0
+            if not node.endless:
+                kind, operands = _KINDS[ir.Predicate], [(first + index, self.lag - later - node.delay)]
+            else:
+                if isinstance(form, ir.Shift):
+                    flags, there = _WEAK * form.weak, later + form.steps
+                flags |= _DUAL * node.dual
+                below = there if not isinstance(form, Begun) else later
+                operands = [(place(arg, below), 0) for arg in node.args]
+                if isinstance(form, ir.Until):
+                    bit = bits[index, later]
+                    operands.append((first + index, 0))
+            count = len(operands) - isinstance(form, ir.Until) * node.endless
+            entries.append((kind, flags, out.add(out.operands, operands), count, there, bit))
+            done[index, later] = len(entries) - 1
+            return done[index, later]
+
+        if self.nodes[self.root].endless:
+            place(self.root, 0)
+        return entries
+
+    def predicates(self, number: int) -> Lines:
+        """Function that writes the values of the predicates."""
+        found = [
+            line
+            for node in self.nodes
+            if isinstance(node.form, ir.Predicate)
+            for line in self._predicate(node)
+        ]
+        head = f"static void predicates_{number}(const samples *x, at n, int mode, int clip, span *v) {{"
+        return [
+            head,
+            "  (void)x; (void)n; (void)mode; (void)clip; (void)v;",
+            *(f"  {line}" for line in found),
+            "}",
+        ]
+
+    def _predicate(self, node: Node) -> Lines:
+        atom = node.form
+        assert isinstance(atom, ir.Predicate)
+        near, far = reach_of(atom.num), farthest(atom.num)
+
+        def place(leaf: Leaf) -> str | None:
+            if isinstance(leaf, ir.Extern):
+                return None
+            steps = getattr(leaf, "steps", 0)
+            if leaf.name == ir.ELAPSED:
+                return "(double)t"
+            column = self.signals[leaf.name]
+            if steps < -(1 << 29):
+                return f"x->first[{column}]"
+            instant = f"t + {steps}" if steps >= 0 else f"t - {-steps}"
+            if getattr(leaf, "clamped", False):
+                instant = f"sooner({instant}, x->known - 1)" if steps > 0 else f"later({instant}, 0)"
+            return f"X({column}, {instant})"
+
+        reads = {place(leaf) for leaf in leaves(atom.num) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
+        known = (
+            " && ".join(f"{text} == {text}" for text in sorted(filter(None, reads)) if text != "(double)t")
+            or "1"
+        )
+        sides = []
+        for least in (True, False):
+            writer = NumberWriter(place)
+            bounded = unsure(atom, frozenset(), least=least)
+            assert isinstance(bounded, ir.Predicate)
+            value = writer.number(bounded.num) if atom.sign > 0 else f"-{writer.number(bounded.num)}"
+            if atom.guard:
+                value = f"{value} {'>' if atom.strict else '>='} 0 ? INF : -INF"
+            sides.append([*writer.lines, f"out.{'lo' if least else 'hi'} = {value};"])
+        if sides[0][:-1] == sides[1][:-1]:
+            body = [*sides[0], sides[1][-1]]
+        else:
+            body = ["{", *sides[0], "}", "{", *sides[1], "}"]
+        outside = 1 if atom.sign < 0 else 0
+        rows = _ring(node.kept + 1)
+        return [
+            f"if (n >= {node.delay}) {{",
+            f"  const at t = n - {node.delay};",
+            "  span out = spanned(-INF, INF);",
+            f"  if (t >= {near.past} && t + (mode >= ENDED ? {near.future} : {far.future}) < x->known) {{",
+            f"    if ({known}) {{",
+            *(f"      {line}" for line in body),
+            "    }",
+            "  } else if (clip) {",
+            f"    out = certain({outside});",
+            "  }",
+            f"  v[{self.rings[node.index]} + (t & {rows - 1})] = out;",
+            "}",
+        ]
+
+
+_DUAL, _WEAK, _UNCUT, _ENDLESS, _LASTS, _ROOT = 1, 2, 4, 8, 16, 32
+_KINDS: dict[type, int] = {
+    ir.Truth: 0,
+    ir.Predicate: 1,
+    ir.BoolOp: 2,
+    ir.Temporal: 3,
+    Lasting: 3,
+    ir.PastTemporal: 4,
+    ir.Shift: 5,
+    Begun: 6,
+    ir.Until: 7,
+    ir.Since: 8,
+}
+"""Class of a node -> its number in `streams.c`, which explains the flags too."""
+
+Row: TypeAlias = tuple[Any, ...]
+
+
+@dataclass(slots=True)
+class _Tables:
+    """Tables of a monitor, and the sizes of its state."""
+
+    nodes: list[Row] = field(default_factory=list)
+    operands: list[Row] = field(default_factory=list)
+    readers: list[Row] = field(default_factory=list)
+    entries: list[Row] = field(default_factory=list)
+    graphs: list[Row] = field(default_factory=list)
+    rules: list[Row] = field(default_factory=list)
+    sizes: Counter[str] = field(default_factory=Counter)
+
+    def add(self, table: list[Row], rows: Sequence[Row]) -> int:
+        """Add rows to a table; return the number of the first."""
+        table += rows
+        return len(table) - len(rows)
+
+    def room(self, part: str, count: int) -> int:
+        """Reserve `count` places of a part of the state; return the first."""
+        self.sizes[part] += count
+        return self.sizes[part] - count
+
+    def text(self) -> Lines:
+        """C declarations of the tables."""
+        lines = []
+        for kind, name in TABLES.items():
+            rows: list[Row] = getattr(self, name) or [(0,)]
+            text = ",\n".join("  " + (_row(row) if kind != "int32_t" else str(row[0])) for row in rows)
+            lines.append(f"static const {kind} {name}[] = {{\n{text}\n}};")
+        return lines
+
+
+TABLES = {
+    "node": "nodes",
+    "operand": "operands",
+    "int32_t": "readers",
+    "entry": "entries",
+    "graph": "graphs",
+    "rule": "rules",
+}
+"""C type of a row -> name of the table."""
+
+
+def _row(row: Row | Any) -> str:
+    return "{" + ", ".join(_row(each) if isinstance(each, tuple) else str(each) for each in row) + "}"
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Requirement of a monitor of streams.
+
+    Attributes:
+        formula: its formula.
+        deciding: formula whose sign is the verdict; mostly `formula`.
+        lag: samples after a start until it is counted, at least.
+    """
+
+    formula: ir.Formula
+    deciding: ir.Formula
+    lag: int
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """Program of a monitor of streams.
+
+    Attributes:
+        tables: C name of a table -> its rows, all numbers int32.
+        sizes: `signals`, `rows`, `judged`, `spans`, `times`, `ints` and `truths` of the structure `tables`.
+        predicates: C text of the function `predicates`, after the types.
+    """
+
+    tables: Mapping[str, Sequence[Row]]
+    sizes: Mapping[str, int]
+    predicates: str
+
+
+def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> Streams:
+    """Return the program of a monitor of `rules` over samples of `signals`.
+
+    `cut`: whether the monitor can cut windows at the end of the trace.
+
+    Raises:
+        Untranslatable: a formula has no transducers.
+    """
+    index = {name: i for i, name in enumerate(signals)}
+    out, bodies, rows = _Tables(), [], 1
+
+    def added(graph: Graph) -> int:
+        nonlocal rows
+        number = graph.tables(out)
+        bodies.append(graph.predicates(number))
+        rows = max(rows, graph.samples)
+        return number
+
+    for rule in rules:
+        values = Graph(rule.formula, rule.lag, index)
+        deciding = values if rule.deciding == rule.formula else Graph(rule.deciding, values.lag, index)
+        if deciding.lag != values.lag:
+            values = Graph(rule.formula, deciding.lag, index)
+        truths = added(deciding)
+        numbers = (truths if values is deciding else added(values), truths)
+        places = []
+        for graph in (deciding, values):
+            for part, count in (("spans", graph.spans), ("ints", graph.ints)):
+                one = out.room(part, count)
+                places.append((one, out.room(part, count) if cut else one))
+        root = deciding.nodes[deciding.root].rows
+        out.rules.append((*numbers, *places, out.room("ints", root), root - 1))
+    if any(size >= _LARGEST for size in out.sizes.values()):
+        raise Untranslatable("windows of more samples than memory holds")
+    sizes = {"signals": len(signals), "rows": _ring(rows), "judged": len(rules)}
+    sizes |= {part: out.sizes[part] for part in ("spans", "times", "ints", "truths")}
+    calls = [f"  case {i}: predicates_{i}(x, n, mode, clip, v); return;" for i in range(len(bodies))]
+    text = [
+        f"#define X(i, q) x->x[(i) * {_ring(rows)} + ((q) & {_ring(rows) - 1})]",
+        *(line for body in bodies for line in body),
+        "PREDICATES void predicates(int32_t g, const samples *x, at n, int mode, int clip, span *v) {",
+        "  switch (g) {",
+        *calls,
+        "  default: return;",
+        "  }",
+        "}",
+        "",
+    ]
+    return Streams({name: getattr(out, name) for name in TABLES.values()}, sizes, "\n".join(text))
+
+
+def runtime() -> tuple[str, str]:
+    """C text of the types and small functions that predicates use, and of the transducers."""
+    types, functions = RUNTIME.read_text(encoding="utf-8").split("/* PREDICATES */\n")
+    return HEAD + types, functions
+
+
+HEAD = """
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+
+typedef double real;
+typedef int64_t at;
+#define INF ((real)INFINITY)
+#define MIN(a, b) ((b) < (a) ? (b) : (a)) /* a where it is NaN */
+#define MAX(a, b) ((b) > (a) ? (b) : (a))
+#define LEAST(a, b) ((b) < (a) || (b) != (b) ? (b) : (a)) /* NaN where either is */
+#define MOST(a, b) ((b) > (a) || (b) != (b) ? (b) : (a))
+
+static inline double floored_mod(double a, double b) {
+  const double r = fmod(a, b); /* exact, unlike a - b * floor(a / b) where a / b rounds up */
+  return r != 0.0 && (r < 0.0) != (b < 0.0) ? r + b : r;
+}
+"""
