@@ -3,7 +3,7 @@
 The names of the library are imported when they are first used:
 
     spec = stlc.load("specs/traffic.stl")
-    verdict = stlc.Monitor(spec).check("trace.npz")
+    verdict = stlc.check(spec, "trace.npz")
 
     task = stlc.compile(spec, stlc.System.load("examples/car.yaml"))
     run = stlc.train(task, budget=60)
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from stlc.diagnostics import SpecError, StlcError
     from stlc.dynamics.model.system import System
     from stlc.grammar import ast
+    from stlc.monitor.check import check
+    from stlc.monitor.judgement import RequirementVerdict, Verdict
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
 
@@ -44,13 +46,16 @@ else:
 __all__ = [
     "Monitor",
     "PlanResult",
+    "RequirementVerdict",
     "Run",
     "SpecError",
     "StlcError",
     "System",
     "Task",
     "Trace",
+    "Verdict",
     "__version__",
+    "check",
     "compile",
     "load",
     "parse",
@@ -62,12 +67,15 @@ __all__ = [
 _HOMES = {
     "Monitor": "stlc.monitor.verdict:Monitor",
     "PlanResult": "stlc.controller.search.planner:PlanResult",
+    "RequirementVerdict": "stlc.monitor.judgement:RequirementVerdict",
     "Run": "stlc.controller.training.run:Run",
     "SpecError": "stlc.diagnostics:SpecError",
     "StlcError": "stlc.diagnostics:StlcError",
     "System": "stlc.dynamics.model.system:System",
     "Task": "stlc.controller.problem.task:Task",
     "Trace": "stlc.trace:Trace",
+    "Verdict": "stlc.monitor.judgement:Verdict",
+    "check": "stlc.monitor.check:check",
     "plan": "stlc.controller.search.planner:plan",
     "train": "stlc.controller.training.launch:train_here",
     "tube": "stlc.assurance.verification.tubes:tube",

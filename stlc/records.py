@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache, reduce
 from importlib import import_module
@@ -36,7 +36,7 @@ _NOUNS = {int: "a whole number", float: "a number", str: "a text", bool: "true o
 _NOUNS |= {types.NoneType: "null"}
 _INFINITE = {"inf": float("inf"), "-inf": float("-inf"), "nan": float("nan")}
 _UNIONS = (Union, types.UnionType)
-_LISTS = (list, tuple, frozenset, Sequence)
+_LISTS = (list, tuple, Sequence)
 
 
 @cache
@@ -198,11 +198,9 @@ def _has_default(field: Field[Any]) -> bool:
 def _read_annotated(kind: Any, what: Any, value: Json, key: str) -> Any:
     if what == "unbounded" and isinstance(value, str) and value in _INFINITE:
         return _INFINITE[value]
-    found, known = read(kind, value, key), what() if callable(what) else what
-    if isinstance(known, int) and found < known:
-        raise _unlike(value, f"a number from {known} on", key)
-    if isinstance(known, Sequence) and not isinstance(known, str) and found not in known:
-        raise _unlike(value, f"one of {', '.join(map(str, known))}", key)
+    found = read(kind, value, key)
+    if isinstance(what, int) and found < what:
+        raise _unlike(value, f"a number from {what} on", key)
     return found
 
 
@@ -226,8 +224,7 @@ def _read_list(origin: Any, args: Sequence[Any], value: Json, key: str) -> Any:
     if not isinstance(value, list) or (fixed and len(value) != len(args)):
         raise _unlike(value, f"a list of {len(args)}" if fixed else "a list", key)
     items = [read(args[n if fixed else 0], each, _below(key, n)) for n, each in enumerate(value)]
-    made: Callable[[list[Any]], Any] = list if origin is list else frozenset if origin is frozenset else tuple
-    return made(items)
+    return items if origin is list else tuple(items)
 
 
 def _below(key: str, name: object) -> str:

@@ -71,16 +71,10 @@ class Hardware:
 
 @dataclass(frozen=True, slots=True)
 class StoredDrives:
-    """What a training has stored of its drives; see `stlc.controller.evaluation.closed_loop.ClosedLoop`."""
+    """What a training has stored of its drives, and of its rounds of falsification."""
 
     share: float | None = None
     recommended: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class StoredRounds:
-    """What a training has stored of its rounds of falsification."""
-
     last_share: float | None = None
 
 
@@ -97,7 +91,7 @@ class StoredResult:
     interval: tuple[float, float] | None = None
     requirements: dict[str, float] | None = None
     closed_loop: StoredDrives | None = None
-    falsification: StoredRounds | None = None
+    falsification: StoredDrives | None = None
 
 
 @dataclass(frozen=True, slots=True)

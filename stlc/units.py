@@ -88,6 +88,11 @@ class Unit:
         whole = tuple(int(exponent) for exponent in dims)
         return Unit(whole, Fraction(self.scale ** float(power)), text=_si_text(whole))
 
+    @property
+    def shown(self) -> str:
+        """The unit as a text; `1` for numbers without a unit."""
+        return str(self)
+
     def __str__(self) -> str:
         return self.text or _si_text(self.dims)
 

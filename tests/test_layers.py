@@ -19,7 +19,7 @@ ROOMS = (
     {"source", "version", "stopping"},
     {"diagnostics"},
     {"escape"},
-    {"plugins", "registry", "units", "jsontext", "records", "extras"},
+    {"plugins", "registry", "units", "jsontext", "records", "extras", "tabular"},
     {"signature"},
     {"rundir", "files", "foreign", "provenance", "cache", "toolchain", "native", "trace"},
     {"grammar"},

@@ -20,7 +20,7 @@ from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parse.parser import parse
-from stlc.monitor.judgement import unknown_requirement
+from stlc.monitor.judgement import chosen
 from stlc.plants.declaration import load_plant_decl
 from stlc.provenance import sha256
 
@@ -81,7 +81,7 @@ class PlantDraws:
             MissingError: R301, a package is not installed.
             UsageError: U101, there is no such requirement.
         """
-        rules = _chosen(self.judge.monitor.compiled.requirements, self.require)
+        rules = chosen(self.judge.monitor.compiled.requirements, self.require)
         points = self.judge.random_points(seeds)
         for run in self.judge.runs(points, seeds, jobs=self.jobs, stream=self.judge.long):
             if run.finding is not None:
@@ -148,7 +148,7 @@ class ModelDraws:
         from stlc.assurance.model_simulator import in_scope
 
         task = self.simulator.task
-        rules = _chosen(task.rules, self.require)
+        rules = chosen(task.rules, self.require)
         states = [task.system.sample(1, seed=seed, dtype=torch.float64) for seed in seeds]
         columns = self.simulator.columns_from(torch.cat(states))
         scope = in_scope(task, columns)
@@ -197,15 +197,6 @@ class FailedDraw:
 
 def _conditions(overrides: Mapping[str, str], require: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
     return {"overrides": dict(overrides), "require": list(require), "seeds": seed_ranges(seeds)}
-
-
-def _chosen(rules: Sequence[CompiledRequirement], require: Sequence[str]) -> tuple[CompiledRequirement, ...]:
-    """Return the requirements that count. Raises UsageError (U101) if one of `require` does not exist."""
-    names = [rule.name for rule in rules]
-    for name in require:
-        if name not in names:
-            raise unknown_requirement(name, names)
-    return tuple(rule for rule in rules if rule.name in require or not require)
 
 
 def _sample(rules: Sequence[CompiledRequirement], judged: Sequence[Judged]) -> Sample:

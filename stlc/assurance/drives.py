@@ -21,7 +21,7 @@ from stlc.controller.training.checkpoint import FOLDER, POINTER, CheckpointHead
 from stlc.controller.training.run import CONFIG, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.robots.functions import function_files
-from stlc.monitor.judgement import unknown_requirement
+from stlc.monitor.judgement import chosen
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
 from stlc.rundir import MOST_ARRAYS, RunDir
@@ -62,16 +62,14 @@ def sample_of(
         SpecError: the rules use names that the system does not have.
     """
     found = _judged_by_plans(task, recording) if rules is None else _judged_by_rules(task, recording, rules)
-    names = [each.name for each in found.judged]
-    for name in require:
-        if name not in names:
-            raise unknown_requirement(name, names)
-    chosen = tuple(each for each in found.judged if each.name in require or not require)
+    counted = chosen(found.judged, require)
     rows = len(recording.states)
     alone = recording.agents == 1 or independent_agents(world_type(task.system.decl))
     units = np.arange(rows) if alone else np.arange(rows) // recording.agents
     noun: Noun = "drive" if alone and recording.agents > 1 else "world"
-    return Sample(together(chosen, found.weights), chosen, units, noun, recording.rho).in_scope(found.inside)
+    return Sample(together(counted, found.weights), counted, units, noun, recording.rho).in_scope(
+        found.inside
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,7 +101,7 @@ class Falsification:
     spurious: tuple[Counterexample, ...]
     simulations: int
     inconclusive: int
-    least: float
+    least: Num
     coverage: float
     rejected: int
     seconds: float

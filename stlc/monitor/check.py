@@ -166,13 +166,11 @@ class Loaded:
 
     Attributes:
         traces: one, or one for each object with times of its own.
-        source: text of the specification.
         monitor: its monitor.
         note: remark to print; "" if there is none.
     """
 
     traces: tuple[Trace, ...]
-    source: Source
     monitor: Monitor
     note: str
 
@@ -191,9 +189,11 @@ def load(path: Path, question: Question, *, known: Monitor | None = None, planne
     known = known or _named(question)
     recording = read_recording(path, reading_options(known, question).wanted)
     carried = recording.meta.planned if planned else recording.meta.carried
-    source, note = (known.spec.source, "") if known else specification(recording.name, carried)
-    monitor = known or monitor_of(source, question, carried)
-    return Loaded(traces_of(recording, reading_options(monitor, question)), source, monitor, note)
+    note = ""
+    if known is None:
+        source, note = specification(recording.name, carried)
+        known = monitor_of(source, question, carried)
+    return Loaded(traces_of(recording, reading_options(known, question)), known, note)
 
 
 def _named(question: Question) -> Monitor | None:
@@ -235,12 +235,12 @@ def _in_pieces(path: Path, question: Question, known: Monitor | None, chunk: int
     read = pieces(path, chunk or CHUNK, reading_options(known, question))
     first = next(read)
     note = ""
-    if (monitor := known) is None:
+    if known is None:
         source, note = specification(str(path), first.meta.carried)
-        monitor = monitor_of(source, question, first.meta.carried)
+        known = monitor_of(source, question, first.meta.carried)
     at = instant_of(question.at, str(path), first.dt, first.t0, None)
     how = How(at, question.end, question.tolerance, first.t0, reasons=True)
-    online = monitor.online(how, require=question.require, like=first)
+    online = known.online(how, require=question.require, like=first)
     online.feed(first)
     for piece in read:
         online.feed(piece)

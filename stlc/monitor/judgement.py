@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from stlc.monitor.signals import Gap
 from stlc.provenance import sha256
 from stlc.registry import closest
 from stlc.source import Source
+from stlc.tabular import frame, html_table
 from stlc.trace.recording import Clock
 from stlc.trace.resample import TimeRange
 
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
 Bools: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.int64]
+R = TypeVar("R", bound=Any)
 
 MOST = 500
 """Greatest number of violated requirements explained at once; each takes half a millisecond."""
@@ -136,6 +138,26 @@ class RequirementVerdict:
     facts: tuple[Fact, ...] = ()
     violated_at: float | None = None
     subject: Prepared | None = field(default=None, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        return f"RequirementVerdict({self.name}: {self.overall} · {self.brief})"
+
+    @property
+    def amount(self) -> str:
+        """Least robustness with its unit; bounds, if it is inconclusive."""
+        found = self.figures
+        if found.min is None:
+            return "no trace in scope"
+        text = (
+            f"{found.min:.4g}" if self.overall != "inconclusive" else f"[{found.low:.4g}, {found.high:.4g}]"
+        )
+        return f"{text} {found.unit}".rstrip()
+
+    @property
+    def brief(self) -> str:
+        """Least robustness, and where it is: `-0.3 m at t = 4 s`."""
+        where = self.where
+        return self.amount + (f" {'' if where.startswith('from') else 'at '}{where}" if where else "")
 
     @property
     def margins(self) -> tuple[Floats, Floats]:
@@ -435,6 +457,36 @@ class Verdict:
     streamed: bool = False
     judged_on: Prepared | None = field(default=None, repr=False, compare=False)
 
+    def __repr__(self) -> str:
+        status = self.scoped
+        chosen = [each for each in self if each.overall == status] or list(self.requirements)
+        worst = min(chosen, key=lambda each: float(each.low.min()) * each.rule.factor)
+        count = f"{len(chosen)} of {len(self.requirements)}" if status != "satisfied" else f"{len(chosen)}"
+        traces = f" on {self.traces:,} traces" if self.traces > 1 else ""
+        return f"Verdict({status}: {count}{traces} · {worst.name} {worst.brief})"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (row.name, row.overall, row.amount, row.where, "" if row.cause is None else row.cause.because)
+            for row in self
+        ]
+        header = ("requirement", "verdict", "robustness", "where", "why")
+        bad = [row.overall == "violated" for row in self]
+        return html_table(f"{self.about.spec_name} on {self.about.trace}: {self.scoped}", header, rows, bad)
+
+    def to_frame(self) -> Any:
+        """Return a data frame of pandas or polars with a row for each requirement and trace.
+
+        Raises MissingError (R301) if neither package is installed.
+        """
+        rows = [
+            (row.name, trace, status, float(least), row.unit, float(held) / row.instants)
+            for row in self
+            for trace, (status, least, held) in enumerate(zip(row.statuses, row.least, row.held, strict=True))
+        ]
+        names = ("requirement", "trace", "verdict", "robustness", "unit", "share")
+        return frame(dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)))
+
     @property
     def subject(self) -> Prepared:
         """The evaluated signals and the compiled requirements, which a told verdict does not have."""
@@ -524,10 +576,7 @@ class Verdict:
 
     def __getitem__(self, name: str) -> RequirementVerdict:
         """Return the verdict on the requirement `name`. Raises UsageError (U101) for an unknown name."""
-        for each in self.requirements:
-            if each.name == name:
-                return each
-        raise unknown_requirement(name, [each.name for each in self.requirements])
+        return chosen(self.requirements, [name])[0]
 
     def __iter__(self) -> Iterator[RequirementVerdict]:
         return iter(self.requirements)
@@ -652,7 +701,23 @@ def beside(moment: str, start: str) -> str:
     return moment if moment == start else f"{moment} (window from {start.removeprefix('t = ')})"
 
 
-def unknown_requirement(name: str, names: list[str]) -> UsageError:
+def chosen(rules: Sequence[R], names: Sequence[str]) -> tuple[R, ...]:
+    """Return the requirements, or verdicts on them, that are called `names`; all if there are no names.
+
+    Raises UsageError (U101) if there is no requirement of a name.
+    """
+    require_known(names, [rule.name for rule in rules])
+    return tuple(rule for rule in rules if not names or rule.name in names)
+
+
+def require_known(names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise UsageError (U101) if one of `names` is not that of a requirement; `known` are their names."""
+    for name in names:
+        if name not in known:
+            raise unknown_requirement(name, known)
+
+
+def unknown_requirement(name: str, names: Sequence[str]) -> UsageError:
     """Return the error U101: no requirement is called `name`."""
     near = closest(name, names)
     help_ = (f"did you mean `{near}`?",) if near else ()

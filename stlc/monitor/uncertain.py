@@ -42,16 +42,11 @@ class Uncertainty:
         unit: unit of `absolute`; without text it is that of the signal.
     """
 
-    JSON: ClassVar = "absolute relative unit=unit_text"
+    JSON: ClassVar = "absolute relative unit=unit.text"
 
     absolute: Num = 0.0
     relative: Num = 0.0
     unit: Unit = DIMENSIONLESS
-
-    @property
-    def unit_text(self) -> str:
-        """Unit of `absolute` in words; "" for that of the signal."""
-        return self.unit.text
 
     @staticmethod
     def parse(text: str) -> Uncertainty:

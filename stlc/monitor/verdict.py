@@ -38,7 +38,7 @@ from stlc.monitor.instants import (
     starts_of,
     window_of,
 )
-from stlc.monitor.judgement import About, Bools, RequirementVerdict, Verdict, unknown_requirement
+from stlc.monitor.judgement import About, Bools, RequirementVerdict, Verdict, chosen
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import Need, arrange, needs_of, reading_of
 from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
@@ -110,12 +110,8 @@ class Monitor:
 
     def reads(self, require: Sequence[str] = ()) -> frozenset[str]:
         """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
-        known = [each.name for each in self.resolved.requirements]
-        for name in require:
-            if name not in known:
-                raise unknown_requirement(name, known)
-        chosen = [each for each in self.resolved.requirements if not require or each.name in require]
-        formulas = [each.formula for each in (*chosen, *self.resolved.assumptions)]
+        rules = chosen(self.resolved.requirements, require)
+        formulas = [each.formula for each in (*rules, *self.resolved.assumptions)]
         return frozenset().union(*(columns_of(num) for formula in formulas for num in numbers(formula)))
 
     @property
@@ -323,11 +319,7 @@ def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequireme
     """Requirements called `names`; all if there are no names. Raises UsageError (U101) if there are none."""
     if not compiled.requirements:
         raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
-    known = [rule.name for rule in compiled.requirements]
-    for name in names:
-        if name not in known:
-            raise unknown_requirement(name, known)
-    return tuple(rule for rule in compiled.requirements if not names or rule.name in names)
+    return chosen(compiled.requirements, names)
 
 
 def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:

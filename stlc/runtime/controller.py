@@ -140,6 +140,10 @@ class Controller:
         """
         self._previous = self._added = None
 
+    def __call__(self, state: ArrayLike | Mapping[str, ArrayLike]) -> Numbers:
+        """Return the command to apply until the next call, (m,) or (agents, m): that of `decide`."""
+        return self.decide(state).control
+
     def decide(self, state: ArrayLike | Mapping[str, ArrayLike], *, elapsed: int = 1) -> ControlDecision:
         """Return the decision for a state.
 

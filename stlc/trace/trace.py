@@ -93,6 +93,10 @@ class Trace:
     sources: Mapping[str, str] = field(default_factory=dict)
     labels: Mapping[str, int] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        size = f"{self.traces} x {self.samples} samples of {len(self.signature)} signals"
+        return f"Trace({self.name}: {size}, dt {self.dt:g} s)"
+
     @property
     def file(self) -> str:
         """Path of the file as the user gave it."""

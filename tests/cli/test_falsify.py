@@ -163,10 +163,12 @@ def test_bad_input_is_named(args, message, capsys):
 def test_a_counterexample_of_another_system_is_refused(capsys, tmp_path):
     found(capsys, "--require", "near", "-o", str(tmp_path))
     stored = json.loads((tmp_path / "near.json").read_text())
-    for point in ([0.5], [*stored["point"][:-1], 2.0], ["a"]):
+    unlike = "does not belong to this system"
+    damaged = "`point.0` is 'a', not a number"
+    for point, said in (([0.5], unlike), ([*stored["point"][:-1], 2.0], unlike), (["a"], damaged)):
         (tmp_path / "other.json").write_text(json.dumps({**stored, "point": point}))
         assert main(["falsify", "latest", "--replay", str(tmp_path / "other.json")]) == 2
-        assert "does not belong to this system" in capsys.readouterr().err
+        assert said in capsys.readouterr().err
 
 
 def test_drives_that_end_before_a_verdict_are_no_evidence(capsys):

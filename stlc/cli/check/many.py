@@ -164,25 +164,11 @@ def seen_at(name: str, runs: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-@dataclass(frozen=True, slots=True)
-class Places:
-    """Workers that judge files.
-
-    Attributes:
-        jobs: number of processes of this machine; 0: one per core.
-        cluster: address of a Ray cluster, instead of this machine; None without one.
-    """
-
-    jobs: int = 1
-    cluster: str | None = None
-
-    def processes(self, files: int) -> int:
-        """Number of processes of this machine for a number of files."""
-        return min(self.jobs or os.cpu_count() or 1, files)
-
-
 def all_outcomes(
-    works: Sequence[Work], places: Places, progress: Callable[[str], object] = lambda _: None
+    works: Sequence[Work],
+    jobs: int,
+    cluster: str | None = None,
+    progress: Callable[[str], object] = lambda _: None,
 ) -> list[Outcome]:
     """Judge all files, and return their outcomes in order.
 
@@ -192,25 +178,27 @@ def all_outcomes(
 
     Args:
         works: the files.
-        places: workers that judge them.
+        jobs: number of processes of this machine that judge them; 0: one per core.
+        cluster: address of a Ray cluster, instead of this machine; None without one.
         progress: function that receives the progress as text.
 
     Raises:
         MissingError: R301, R302, R406: the cluster cannot be used.
     """
-    if places.cluster is None and len(works) == 1:
+    if cluster is None and len(works) == 1:
         return outcomes_of(works[0])
     outcomes: list[list[Outcome]] = [[]] * len(works)
     known: dict[Any, Any] = {}
-    for done, (index, found_) in enumerate(_judged(works, places), start=1):
+    for done, (index, found_) in enumerate(_judged(works, jobs, cluster), start=1):
         outcomes[index] = [outcome.sharing(known) for outcome in found_]
         progress(f"{done:,} of {len(works):,} files judged")
     return [outcome for each in outcomes for outcome in each]
 
 
-def _judged(works: Sequence[Work], places: Places) -> Iterator[tuple[int, list[Outcome]]]:
+def _judged(works: Sequence[Work], jobs: int, cluster: str | None) -> Iterator[tuple[int, list[Outcome]]]:
     """Yield the position of each file and the outcomes of its objects when it is judged."""
-    if places.cluster is None and places.processes(len(works)) == 1:
+    processes = min(jobs or os.cpu_count() or 1, len(works))
+    if cluster is None and processes == 1:
         yield from enumerate(map(safe_outcomes, works))
         return
     from stlc.controller.parallel import workers_of
@@ -218,14 +206,14 @@ def _judged(works: Sequence[Work], places: Places) -> Iterator[tuple[int, list[O
 
     sent: Sequence[Work] = works
     texts: Sequence[Path] = ()
-    if places.cluster is not None:
+    if cluster is not None:
         sent = [replace(work, name=_seen(work)) for work in works]
         texts = _texts(works[0].question)
 
     def read(work: Work) -> CallFiles:
         return CallFiles((*texts, Path(work.name)), () if work.out is None else (work.out,))
 
-    with workers_of(places.processes(len(works)), places.cluster, files=texts) as workers:
+    with workers_of(processes, cluster, files=texts) as workers:
         for ended in results(workers, safe_outcomes, sent, files=read):
             value = ended.value
             yield ended.index, [_lost(works[ended.index], value)] if isinstance(value, LostCall) else value

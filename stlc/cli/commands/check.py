@@ -109,7 +109,7 @@ def check(
     with -q nothing is printed.
     """
     from stlc.cli.check.junit import junit as junit_xml
-    from stlc.cli.check.many import Places, Work, all_outcomes, exit_code, out_paths
+    from stlc.cli.check.many import Work, all_outcomes, exit_code, out_paths
     from stlc.cli.check.table import require_table, write_table
 
     repetition = None if again is None else _repetition(again, files)
@@ -144,7 +144,7 @@ def check(
             Work(name, question, judging.runs, path, min(chunk, MOST_SAMPLES), table is not None, words)
             for name, path in zip(traces, paths, strict=True)
         ]
-        outcomes = all_outcomes(works, Places(jobs, cluster), PULSE.now)
+        outcomes = all_outcomes(works, jobs, cluster, PULSE.now)
     if table is not None:
         write_table(table, outcomes)
     if junit is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_text
 import math
 import shlex
 from contextlib import AbstractContextManager, nullcontext
@@ -32,9 +31,9 @@ from stlc.cli.framework.options import (
 )
 from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, MissingError, SpecError, usage
+from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError, usage
 from stlc.files import read_source
-from stlc.registry import GUARDS, closest
+from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -42,22 +41,24 @@ if TYPE_CHECKING:
     import numpy as np
 
     from stlc.assurance.drive_simulator import DriveSimulator
-    from stlc.assurance.falsify import Falsification
-    from stlc.assurance.model_simulator import ModelSimulator
-    from stlc.assurance.plant_simulator import PlantSimulator
-    from stlc.assurance.sharing import SimulatorWorkers
-    from stlc.cli.framework.assured import (
+    from stlc.assurance.falsified import (
         FalsifiedRequirement,
         FalsifiedSystem,
         ReplayedCounterexample,
         ReplayedFinding,
+        StoredCounterexample,
+        StoredFinding,
+        StoredSettings,
     )
+    from stlc.assurance.falsify import Falsification
+    from stlc.assurance.model_simulator import ModelSimulator
+    from stlc.assurance.plant_simulator import PlantSimulator
+    from stlc.assurance.sharing import SimulatorWorkers
     from stlc.controller.parallel.workers import CallFiles
     from stlc.trace import Trace
 
     _Simulator: TypeAlias = ModelSimulator | DriveSimulator | PlantSimulator
 
-FORMAT = "stlc-counterexample/1"
 RUNS = Path("runs")
 """Folder of runs, unless another one is given."""
 
@@ -124,8 +125,10 @@ def falsify(
     is no evidence. Exit code: 1 if a requirement is violated or a simulation fails; else 5 if simulations
     were lost with their processes, three times each; else 4 if simulations ended before a verdict; else 0.
     """
+    from stlc.assurance.falsified import FalsifiedSystem
     from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
     from stlc.files import require_folder
+    from stlc.monitor.judgement import require_known
     from stlc.rundir import RunDir
 
     made = _Target(target, system, plant, guard, agents, steps, scenario, seed)
@@ -139,7 +142,9 @@ def falsify(
     require_no_jobs(cluster, jobs)
     source = _Source(made, overrides, runs, jobs, cluster)
     simulator = source.load()
-    wanted = _wanted(simulator.requirements, require)
+    names = simulator.requirements
+    require_known(require or (), names)
+    wanted = [index for index, name in enumerate(names) if not require or name in require]
     order = SearchOrder(SearchBudget(simulations, limit), seed, random, batch=batch)
     found: list[FalsifiedRequirement] = []
     with source.workers() as workers:
@@ -150,20 +155,17 @@ def falsify(
             found.append(_written(source, simulator, result, output))
     failed = [*getattr(simulator, "findings", ()), *(() if workers is None else workers.findings)]
     _require_simulations(found, failures=len(failed))
-    document: FalsifiedSystem = {
-        "target": target,
-        "simulations": simulations,
-        "seed": seed,
-        "coordinates": simulator.space.dim,
-        "failures": list(dict.fromkeys(f"{each.finding.reason}: {each.finding.message}" for each in failed)),
-        "findings": findings.written(failed, output, source.settings(), partial(_command, source)),
-        "requirements": found,
-        "lost": 0 if workers is None else workers.lost,
-    }
+    document = FalsifiedSystem(
+        *(target, simulations, seed, simulator.space.dim),
+        tuple(dict.fromkeys(f"{each.finding.reason}: {each.finding.message}" for each in failed)),
+        tuple(findings.written(failed, output, source.settings(), partial(_command, source))),
+        tuple(found),
+        0 if workers is None else workers.lost,
+    )
     lost = () if workers is None or not workers.lost else (_lost(workers),)
-    code = INCONCLUSIVE if any(each["inconclusive"] for each in found) else 0
+    code = INCONCLUSIVE if any(each.search.inconclusive for each in found) else 0
     code = MissingError.exit_code if lost else code
-    if document["failures"] or any(each["verdict"] == "violated" for each in found):
+    if document.failures or document.violated:
         code = 1
 
     def show() -> None:
@@ -253,17 +255,13 @@ class _Source:
     jobs: int = 1
     cluster: str | None = None
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> StoredSettings:
         """Settings of the simulations that a replay needs."""
+        from stlc.assurance.falsified import StoredSettings
+
         target = self.target
-        return {
-            "guard": target.guard,
-            "agents": target.agents,
-            "steps": target.steps,
-            "scenario": target.scenario,
-            "seed": target.seed,
-            "set": dict(self.overrides),
-        }
+        given = (target.guard, target.agents, target.steps, target.scenario, target.seed)
+        return StoredSettings(*given, dict(self.overrides))
 
     def load(self) -> _Simulator:
         """Load the simulator."""
@@ -308,20 +306,6 @@ def _lost(workers: SimulatorWorkers) -> Diagnostic:
     return Diagnostic("R406", message, note=tuple(workers.reasons))
 
 
-def _wanted(names: Sequence[str], require: list[str] | None) -> list[int]:
-    """Indices of the requirements to search.
-
-    Raises:
-        UsageError: U101, there is no such requirement.
-    """
-    for each in require or ():
-        if each not in names:
-            near = closest(each, names)
-            advice = f"did you mean `{near}`?" if near else f"requirements: {', '.join(names)}"
-            raise usage(f"there is no requirement `{each}`", advice)
-    return [index for index, name in enumerate(names) if not require or name in require]
-
-
 # ------------------------------------------------------------------------ counterexamples
 
 
@@ -331,8 +315,8 @@ def _require_simulations(found: Sequence[FalsifiedRequirement], *, failures: int
     Raises:
         UsageError: U101, the conditions of the specification hold in no simulation.
     """
-    rejected = sum(each["rejected"] for each in found)
-    if rejected and not failures and not any(each["simulations"] for each in found):
+    rejected = sum(each.search.rejected for each in found)
+    if rejected and not failures and not any(each.search.simulations for each in found):
         raise usage(f"`assume` or `where` excludes all of {rejected:,} points", "weaken these conditions")
 
 
@@ -340,51 +324,27 @@ def _written(
     source: _Source, simulator: _Simulator, result: Falsification, folder: Path
 ) -> FalsifiedRequirement:
     """Write the counterexample of a requirement, if there is one, and return its record."""
+    from stlc.assurance.falsified import FalsifiedRequirement, StoredCounterexample
     from stlc.escape import file_part
     from stlc.files import write_atomic
     from stlc.jsontext import dumps
     from stlc.trace import save_trace
 
-    best, judged = result.shrunk or result.found, result.simulations > result.inconclusive
-    path = folder / f"{file_part(result.requirement, empty='requirement')}.json"
-    margin = math.nan if best is None else best.margin
-    if best is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        trace = path.with_suffix(".npz")
-        if source.target.plant is None:
-            save_trace(trace, simulator.trace(best.point[None]))
-        else:
-            repeated = _plant_of(simulator, path).repeated(
-                best.point, simulator.requirements.index(result.requirement)
-            )
-            save_trace(trace, repeated.trace)
-            margin = repeated.margin
-        stored = {
-            "format": FORMAT,
-            "requirement": result.requirement,
-            "margin": margin,
-            "trace": trace.name,
-            "settings": source.settings(),
-            "point": best.point.tolist(),
-        }
-        write_atomic(path, dumps(stored) + "\n")
-    return {
-        "name": result.requirement,
-        "verdict": "violated" if best is not None else "open" if judged else "inconclusive",
-        "simulations": result.simulations,
-        "inconclusive": result.inconclusive,
-        "least": result.least,
-        "found": result.found,
-        "simpler": result.shrunk,
-        "spurious": list(result.spurious),
-        "coverage": result.coverage,
-        "rejected": result.rejected,
-        "seconds": result.seconds,
-        "strategies": result.strategies,
-        "file": None if best is None else str(path),
-        "replay": None if best is None else _command(source, path),
-        "trace_margin": None if best is None else margin,
-    }
+    best = FalsifiedRequirement(result).counterexample
+    if best is None:
+        return FalsifiedRequirement(result)
+    path, name = folder / f"{file_part(result.requirement, empty='requirement')}.json", result.requirement
+    margin, trace = best.margin, path.with_suffix(".npz")
+    folder.mkdir(parents=True, exist_ok=True)
+    if source.target.plant is None:
+        save_trace(trace, simulator.trace(best.point[None]))
+    else:
+        repeated = _plant_of(simulator, path).repeated(best.point, simulator.requirements.index(name))
+        save_trace(trace, repeated.trace)
+        margin = repeated.margin
+    stored = StoredCounterexample(name, margin, trace.name, source.settings(), best.point.tolist())
+    write_atomic(path, dumps(stored) + "\n")
+    return FalsifiedRequirement(result, str(path), _command(source, path), margin)
 
 
 def _command(source: _Source, path: Path) -> str:
@@ -402,48 +362,40 @@ def _replayed(
     target: _Target, path: Path, overrides: Mapping[str, str], runs: Path
 ) -> Answer[FalsifiedSystem | ReplayedCounterexample | ReplayedFinding]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
+    from stlc.assurance.falsified import ReplayedCounterexample, StoredFinding
     from stlc.compile.semantics.tolerance import TOLERANCE
+    from stlc.monitor.judgement import require_known
     from stlc.trace import load_trace
 
     stored = _stored(path)
-    given = stored["settings"]
+    given = stored.settings
     again = _Target(
-        *(target.name, target.system, target.plant, str(given.get("guard", GUARDS.default))),
-        *(_optional(given.get("agents")), _optional(given.get("steps"))),
-        None if given.get("scenario") is None else str(given["scenario"]),
-        _optional(given.get("seed")) or 0,
+        *(target.name, target.system, target.plant, given.guard, given.agents, given.steps),
+        *(given.scenario, given.seed),
     )
-    changed = given.get("set")
-    kept = {str(name): str(text) for name, text in changed.items()} if isinstance(changed, dict) else {}
-    simulator = again.simulator({**kept, **overrides}, runs)
-    if stored["format"] == findings.FORMAT:
-        point = _point(stored, simulator.space.dim, path)
+    simulator = again.simulator({**given.overrides, **overrides}, runs)
+    point = _point(stored.point, simulator.space.dim, path)
+    if isinstance(stored, StoredFinding):
         return findings.replayed(_plant_of(simulator, path), point, stored)
-    index = _wanted(simulator.requirements, [stored["requirement"]])[0]
-    point = _point(stored, simulator.space.dim, path)
+    require_known([stored.requirement], simulator.requirements)
+    index = simulator.requirements.index(stored.requirement)
     outcome = simulator.simulate(point[None], index)
     margin, inside = float(outcome.margins[0]), bool(outcome.admissible[0])
     violated, judged = inside and margin < -TOLERANCE, not inside or bool(outcome.judged[0])
     verdict: Any = "violated" if violated else "satisfied" if judged else "inconclusive"
     if getattr(simulator, "findings", ()):
-        before = {"reason": f"a violation of {stored['requirement']}"}
+        before = StoredFinding(f"a violation of {stored.requirement}", "", given, stored.point)
         return findings.replayed(_plant_of(simulator, path), point, before)
-    different = _different(
-        load_trace(path.parent / Path(str(stored["trace"])).name), simulator.trace(point[None])
+    different = _different(load_trace(path.parent / Path(stored.trace).name), simulator.trace(point[None]))
+    said: Any = verdict if inside else "out of scope"
+    document = ReplayedCounterexample(
+        stored.requirement, said, margin, stored.margin, not different, different
     )
-    document: ReplayedCounterexample = {
-        "requirement": stored["requirement"],
-        "verdict": verdict if inside else "out of scope",
-        "margin": margin,
-        "stored_margin": stored["margin"],
-        "identical": not different,
-        "different": different,
-    }
 
     def show() -> None:
-        verdict = document["verdict"] if inside else "out of scope (`assume` or `where` excludes it)"
+        shown = said if inside else f"{said} (`assume` or `where` excludes it)"
         same = "the trace is the same, bit for bit" if not different else f"different: {', '.join(different)}"
-        emit(f"{document['requirement']}: {verdict}, robustness {margin:.6g}; {same}")
+        emit(f"{stored.requirement}: {shown}, robustness {margin:.6g}; {same}")
 
     return Answer(document, show, int(violated) if judged else INCONCLUSIVE)
 
@@ -459,60 +411,40 @@ def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:
     return simulator
 
 
-def _optional(value: object) -> int | None:
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    return int(value) if whole and 0 <= int(value) <= MOST_SEED else None  # type: ignore[call-overload]
-
-
-def _stored(path: Path) -> dict[str, Any]:
+def _stored(path: Path) -> StoredCounterexample | StoredFinding:
     """Content of a counterexample's file.
 
     Raises:
         UsageError: U102, there is no such file; U101, it is not a counterexample.
     """
+    from stlc.assurance.falsified import StoredCounterexample, StoredFinding
+    from stlc.jsontext import data_of
+    from stlc.records import read
+
     try:
-        found = json_text.loads(read_source(path).text)
-    except (SpecError, ValueError, RecursionError):
-        found = None
-    wrong = usage(f"`{path}` is not a counterexample", "a file that `stlc falsify` wrote")
-    keys: dict[str, Any] = {
-        "requirement": str,
-        "margin": (int, float, str),
-        "trace": str,
-        "settings": dict,
-        "point": list,
-    }
-    kind = found.get("format") if isinstance(found, dict) else None
-    keys = dict(findings.KEYS) if kind == findings.FORMAT else keys
-    if kind not in (FORMAT, findings.FORMAT) or not all(
-        isinstance(found.get(key), kind) for key, kind in keys.items()
-    ):
-        raise wrong
-    if kind == FORMAT:
-        try:
-            found["margin"] = float(found["margin"])  # an infinite one is a text
-        except (ValueError, OverflowError):
-            raise wrong from None
-        name = str(found["trace"])
-        if math.isnan(found["margin"]) or "\0" in name or Path(name).name != name or name in ("", ".."):
-            raise wrong
-    return dict(found)
+        found = data_of(read_source(path).text)
+        kind = found.get("format") if isinstance(found, dict) else None
+        stored: StoredCounterexample | StoredFinding
+        stored = read(StoredFinding if kind == findings.FORMAT else StoredCounterexample, found)
+        if isinstance(stored, StoredCounterexample) and (
+            math.isnan(stored.margin) or Path(stored.trace).name != stored.trace or "\0" in stored.trace
+        ):
+            raise ValueError("`margin` or `trace` is not what stlc writes")
+        if stored.settings.seed > MOST_SEED:
+            raise ValueError("`settings.seed` is too large")
+    except (SpecError, ValueError, RecursionError) as error:
+        help_, why = ("a file that `stlc falsify` wrote",), str(error)[:200]
+        message = f"`{path}` is not a counterexample"
+        raise UsageError(Diagnostic("U101", message, help=help_, note=(why,))) from None
+    return stored
 
 
-def _point(stored: Mapping[str, Any], dim: int, path: Path) -> np.ndarray:
-    """The point of a stored counterexample, (dim,).
-
-    Raises:
-        UsageError: U101, it does not belong to this system.
-    """
+def _point(values: Sequence[float], dim: int, path: Path) -> np.ndarray:
+    """The point of a stored counterexample, (dim,). Raises UsageError (U101) if it is not of this system."""
     import numpy as np
 
-    try:
-        point = np.array(stored["point"], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        point = np.zeros(0)
-    inside = point.shape == (dim,) and bool(((point >= 0.0) & (point <= 1.0)).all())
-    if not inside:
+    point = np.array(values, dtype=np.float64)
+    if point.shape != (dim,) or not bool(((point >= 0.0) & (point <= 1.0)).all()):
         raise usage(
             f"the counterexample `{path}` does not belong to this system", "the system may have changed"
         )
@@ -537,29 +469,27 @@ def _different(stored: Trace, again: Trace) -> list[str]:
 
 def _lines(document: FalsifiedSystem) -> list[str]:
     lines = []
-    for each in document["requirements"]:
-        lines.extend(_of_requirement(each, failed=bool(document["failures"])))
-    return [*lines, *findings.lines(document["findings"])]
+    for each in document.requirements:
+        lines.extend(_of_requirement(each, failed=bool(document.failures)))
+    return [*lines, *findings.lines(document.findings)]
 
 
 def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:
     """Lines about a requirement; `failed`: whether there are simulations without a trace."""
     from stlc.view.words import share
 
-    name, found = each["name"], each["found"]
-    lost = len(each["spurious"])
+    search = each.search
+    name, found, lost = search.requirement, search.found, len(search.spurious)
     spurious = f"; {lost} violations vanish at half the time step" if lost else ""
     if found is None:
-        judged, least = each["simulations"] - each["inconclusive"], float(each["least"])
+        judged, least = search.simulations - search.inconclusive, search.least
         ended = "failed, or ended before a verdict" if failed else "ended before a verdict"
-        told = (
-            [f"  {each['inconclusive']:,} simulations {ended}: no evidence"] if each["inconclusive"] else []
-        )
+        told = [f"  {search.inconclusive:,} simulations {ended}: no evidence"] if search.inconclusive else []
         if not judged:
             return [f"{name}: inconclusive{spurious}", *told]
         return [
             f"{name}: no violation in {judged:,} simulations, least robustness {least:.4g}{spurious}",
-            f"  pairwise coverage of the search space {share(each['coverage'])}; this is no proof",
+            f"  pairwise coverage of the search space {share(search.coverage)}; this is no proof",
             *told,
         ]
     half = "" if found.half_step is None else f", {found.half_step:.4g} at half the time step"
@@ -568,13 +498,13 @@ def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:
         f"{name}: violated, robustness {found.margin:.4g}{half}; simulation "
         f"{found.simulation:,}, {found.strategy}{spurious}"
     ]
-    simpler = each["simpler"]
+    simpler = search.shrunk
     if simpler is not None and simpler.margin != found.margin:
         lines.append(f"  simpler: robustness {simpler.margin:.4g}")
-    kept = each["trace_margin"]
+    kept = each.trace_margin
     if kept is not None and kept != (simpler or found).margin:
         lines += [
-            f"  the plant does not repeat itself: simulated again for the trace, {float(kept):.4g}",
+            f"  the plant does not repeat itself: simulated again for the trace, {kept:.4g}",
             "  (`limit: {fresh: true}` starts a process per simulation; seed random numbers in `reset`)",
         ]
-    return [*lines, f"  {each['replay']}"]
+    return [*lines, f"  {each.replay}"]

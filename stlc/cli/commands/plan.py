@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,10 +26,7 @@ from stlc.diagnostics import usage
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from stlc.assurance.verification.tubes import TubeModel
-    from stlc.cli.framework.plan_documents import Plans, PlanTubes
+    from stlc.assurance.verification.planned import Plans, PlanTubes
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner import PlanResult
     from stlc.controller.training.config import PlannerChoice
@@ -91,6 +88,7 @@ def plan(
     plan then counts as satisfying only if the lower bound does. Without --fail-under, the exit code is 1 if a
     plan does not satisfy the specification.
     """
+    from stlc.assurance.verification.planned import PlanTubes
     from stlc.assurance.verification.tubes import TubeModel
     from stlc.controller.planning.traces import following, starts_of, trace_of
     from stlc.controller.problem.load import load_task
@@ -133,11 +131,12 @@ def plan(
         if not len(result.rho):
             raise SystemExit(signals[0])
     with PULSE.doing("trying other planners"):
-        document = _record(task, result, choice, output, stopped=bool(signals))
-    if model is not None:
-        document["tube"] = _bounded(model, result, tube, following(task, from_))
-    good = document["tube"]["guaranteed"] if model is not None else document["satisfied"]
-    short = good / document["starts"] < (1.0 if fail_under is None else fail_under)
+        bounds = None
+        if model is not None:
+            bounds = PlanTubes.of(model, result, tube or "", following(task, from_))
+        document = _record(task, result, choice, output, bounds, stopped=bool(signals))
+    good = document.satisfied if bounds is None else bounds.guaranteed
+    short = good / document.starts < (1.0 if fail_under is None else fail_under)
     return Answer(document, lambda: emit("\n".join(_lines(document))), signals[0] if signals else int(short))
 
 
@@ -152,66 +151,38 @@ def _target(text: str) -> float:
     return found
 
 
-def _record(task: Task, result: PlanResult, choice: PlannerChoice, output: Path, *, stopped: bool) -> Plans:
+def _record(
+    task: Task,
+    result: PlanResult,
+    choice: PlannerChoice,
+    output: Path,
+    tube: PlanTubes | None,
+    *,
+    stopped: bool,
+) -> Plans:
     """Record of the result. If the search was not `stopped`, other planners are tried where it failed."""
+    from stlc.assurance.verification.planned import PlanRobustness, Plans, PlanSeconds
     from stlc.controller.planning.missed import better_planner, missed
 
     rho, spent = result.rho, result.seconds
     bad = ~result.satisfied & ~result.infeasible
     states = result.states[bad]
-    better = None if stopped else better_planner(task, states, choice.name, float(spent[bad].sum()))
-    return {
-        "spec": task.compiled.name,
-        "system": task.system.decl.name,
-        "method": choice.name,
-        "budget": choice.seconds,
-        "starts": len(rho),
-        "satisfied": int(result.satisfied.sum()),
-        "infeasible": int(result.infeasible.sum()),
-        "robustness": {
-            "least": float(rho.min()),
-            "median": float(rho.median()),
-            "greatest": float(rho.max()),
-        },
-        "seconds": {"mean": float(spent.mean()), "median": float(spent.median()), "most": float(spent.max())},
-        "evaluations": float(result.evaluations.double().mean()),
-        "missed": [asdict(each) for each in missed(task, states, result.plans[bad])],
-        "better": None if better is None else asdict(better),
-        "trace": str(output),
-    }
-
-
-def _bounded(model: TubeModel, result: PlanResult, scenario: str | None, start: Sequence[str]) -> PlanTubes:
-    """Bounds on the robustness of the plans for all errors of the scenario.
-
-    `start`: names of the columns that follow from the others at the start.
-    """
-    from stlc.assurance.verification.tubes import DEVIATIONS
-    from stlc.controller.problem.task import satisfied
-
-    found, loose = model.tube(result.states, result.plans, start=start), model.uncertain
-    low, high = (model.task.graph.overall(each) for each in (found.low, found.high))
-    return {
-        "scenario": scenario or "",
-        "deviations": DEVIATIONS if model.truncated else None,
-        "numbers": [] if loose is None else [str(each) for each in loose.numbers],
-        "exact": [] if loose is None else list(loose.exact),
-        "guaranteed": int(satisfied(low).sum()),
-        "robustness": [float(low.min()), float(high.max())],
-        "requirements": {
-            rule.name: {
-                "low": float(found.low[:, index].min()),
-                "high": float(found.high[:, index].max()),
-                "guaranteed": int(satisfied(found.low[:, index]).sum()),
-            }
-            for index, rule in enumerate(model.task.rules)
-        },
-    }
+    return Plans(
+        *(task.compiled.name, task.system.decl.name, choice.name, choice.seconds, len(rho)),
+        *(int(result.satisfied.sum()), int(result.infeasible.sum())),
+        PlanRobustness(float(rho.min()), float(rho.median()), float(rho.max())),
+        PlanSeconds(float(spent.mean()), float(spent.median()), float(spent.max())),
+        float(result.evaluations.double().mean()),
+        missed(task, states, result.plans[bad]),
+        None if stopped else better_planner(task, states, choice.name, float(spent[bad].sum())),
+        str(output),
+        tube,
+    )
 
 
 def _lines(plans: Plans) -> list[str]:
     """Lines of text that show the result of `stlc plan`."""
-    return [*_found_lines(plans), *_missed_lines(plans), *_tube_lines(plans), f"trace {plans['trace']}"]
+    return [*_found_lines(plans), *_missed_lines(plans), *_tube_lines(plans), f"trace {plans.trace}"]
 
 
 def _bound(value: float) -> str:
@@ -227,16 +198,14 @@ def _missed_lines(plans: Plans) -> list[str]:
     from stlc.view.words import seconds as duration
 
     lines = []
-    for each in plans["missed"]:
-        most = float(each["robustness"])
+    for each in plans.missed:
+        most = each.robustness
         by = "no plan can satisfy it any more" if most == -math.inf else f"by {number(-most)} or more"
-        many = f", in {each['starts']:,} of {plans['starts']:,} best plans" if plans["starts"] > 1 else ""
-        lines.append(f"  `{each['requirement']}` is violated{many}: {by}")
-    if better := plans["better"]:
-        found = (
-            f"{better['satisfied']:,} of {better['starts']:,} tried starts" if plans["starts"] > 1 else "it"
-        )
-        lines.append(f"  `--method {better['method']}` solves {found} in {duration(better['seconds'])}")
+        many = f", in {each.starts:,} of {plans.starts:,} best plans" if plans.starts > 1 else ""
+        lines.append(f"  `{each.requirement}` is violated{many}: {by}")
+    if better := plans.better:
+        found = f"{better.satisfied:,} of {better.starts:,} tried starts" if plans.starts > 1 else "it"
+        lines.append(f"  `--method {better.method}` solves {found} in {duration(better.seconds)}")
     return lines
 
 
@@ -244,23 +213,23 @@ def _tube_lines(plans: Plans) -> list[str]:
     """Lines with the bounds of `--tube`; none without it."""
     from stlc.view.words import listing
 
-    found = plans.get("tube")
+    found = plans.tube
     if found is None:
         return []
-    within = f", noise within {found['deviations']:g} standard deviations" if found["deviations"] else ""
-    many, good = plans["starts"], found["guaranteed"]
+    within = f", noise within {found.deviations:g} standard deviations" if found.deviations else ""
+    many, good = plans.starts, found.guaranteed
     said = f"{good:,} of {many:,} plans are guaranteed to satisfy it"
     if many == 1:
         said = "the plan is guaranteed to satisfy it" if good else "no guarantee that the plan satisfies it"
-    lines = [f"{found['scenario']}: {said}{within}"]
-    if numbers := listing(found["numbers"]):
+    lines = [f"{found.scenario}: {said}{within}"]
+    if numbers := listing(found.numbers):
         lines.append(f"  numbers that may be wrong: {numbers}")
-    if exact := listing(found["exact"]):
+    if exact := listing(found.exact):
         lines.append(f"  taken as exact, as conditions or limits read them: {exact}")
-    width = max(map(len, found["requirements"]))
-    for name, each in found["requirements"].items():
-        low, high = (_bound(float(each[end])) for end in ("low", "high"))
-        count = f"   {each['guaranteed']:,} guaranteed" if many > 1 else ""
+    width = max(map(len, found.requirements))
+    for name, each in found.requirements.items():
+        low, high = (_bound(getattr(each, end)) for end in ("low", "high"))
+        count = f"   {each.guaranteed:,} guaranteed" if many > 1 else ""
         lines.append(f"  {name:<{width}}  {low} to {high}{count}")
     return lines
 
@@ -271,23 +240,23 @@ def _found_lines(plans: Plans) -> list[str]:
     from stlc.view.words import seconds as duration
     from stlc.view.words import share as percent
 
-    count, good, spent = plans["starts"], plans["satisfied"], plans["seconds"]
+    count, good, spent = plans.starts, plans.satisfied, plans.seconds
     least, middle, greatest = (
-        "none" if math.isinf(float(value)) else number(float(value))  # type: ignore[arg-type]
-        for value in plans["robustness"].values()
+        "none" if math.isinf(value) else number(value)
+        for value in (plans.robustness.least, plans.robustness.median, plans.robustness.greatest)
     )
-    judged = f"{plans['evaluations']:,.0f} plans judged"
+    judged = f"{plans.evaluations:,.0f} plans judged"
     if count == 1:
         verdict = f"the plan {'satisfies' if good else 'violates'} it, robustness {least}"
-        if plans["infeasible"]:
+        if plans.infeasible:
             verdict = "there is no satisfying plan, proved"
-        cost = f"{plans['method']}: {duration(spent['mean'])}, {judged}"
-        return [f"{plans['spec']}: {verdict}", cost]
-    proved = f", {plans['infeasible']:,} proved infeasible" if plans["infeasible"] else ""
+        cost = f"{plans.method}: {duration(spent.mean)}, {judged}"
+        return [f"{plans.spec}: {verdict}", cost]
+    proved = f", {plans.infeasible:,} proved infeasible" if plans.infeasible else ""
     within = f"{percent(good / count)}, 95 % interval {interval(wilson(good / count, count))}"
     return [
-        f"{plans['spec']}: {good:,} of {count:,} plans satisfy it ({within}){proved}",
+        f"{plans.spec}: {good:,} of {count:,} plans satisfy it ({within}){proved}",
         f"robustness {least} to {greatest}, median {middle}",
-        f"{plans['method']}: {duration(spent['mean'])} of processor time a plan (median "
-        f"{duration(spent['median'])}, most {duration(spent['most'])}), {judged} for each",
+        f"{plans.method}: {duration(spent.mean)} of processor time a plan (median "
+        f"{duration(spent.median)}, most {duration(spent.most)}), {judged} for each",
     ]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from stlc.cli.framework.output import Answer, emit
 from stlc.escape import file_part, visible
@@ -14,13 +14,10 @@ from stlc.jsontext import dumps
 if TYPE_CHECKING:
     import numpy as np
 
+    from stlc.assurance.falsified import FalsifiedFinding, ReplayedFinding, StoredFinding, StoredSettings
     from stlc.assurance.plant_simulator import FailedSimulation, PlantSimulator
-    from stlc.cli.framework.assured import FalsifiedFinding, ReplayedFinding
-    from stlc.plants.plant import PlantFinding
 
 FORMAT = "stlc-finding/1"
-KEYS: Mapping[str, Any] = {"reason": str, "message": str, "settings": dict, "point": list}
-"""Keys of the file of a finding, and their types."""
 MOST_WRITTEN = 10
 """Kinds of failures, by reason and message, that are written to files; the first of each kind."""
 MOST_LINES = 5
@@ -30,7 +27,7 @@ MOST_LINES = 5
 def written(
     failures: Sequence[FailedSimulation],
     folder: Path,
-    settings: Mapping[str, Any],
+    settings: StoredSettings,
     command: Callable[[Path], str],
 ) -> list[FalsifiedFinding]:
     """Write the first failed simulation of each kind to a file, and return the records.
@@ -41,6 +38,8 @@ def written(
         settings: settings of the simulations.
         command: function that returns the command that replays a file.
     """
+    from stlc.assurance.falsified import FalsifiedFinding, StoredFinding
+
     kinds: dict[tuple[str, str], list[FailedSimulation]] = {}
     for each in failures:
         kinds.setdefault((each.finding.reason, each.finding.message), []).append(each)
@@ -49,50 +48,27 @@ def written(
         finding = alike[0].finding
         part = file_part(finding.reason.replace(" ", "-"), empty="failure")
         path = folder / f"finding-{index + 1}-{part}.json"
-        stored = {
-            "format": FORMAT,
-            **_described(finding),
-            "settings": dict(settings),
-            "values": dict(finding.point),
-            "point": alike[0].point.tolist(),
-        }
+        stored = StoredFinding(
+            *(finding.reason, finding.message, settings, alike[0].point.tolist()),
+            *(finding.time, finding.stderr, dict(finding.point)),
+        )
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(path, dumps(stored) + "\n")
-        records.append(
-            {
-                "reason": finding.reason,
-                "message": finding.message,
-                "time": finding.time,
-                "stderr": finding.stderr,
-                "simulations": len(alike),
-                "point": dict(finding.point),
-                "file": str(path),
-                "replay": command(path),
-            }
-        )
+        records.append(FalsifiedFinding(finding, len(alike), str(path), command(path)))
     return records
-
-
-def _described(finding: PlantFinding) -> dict[str, Any]:
-    return {
-        "reason": finding.reason,
-        "message": finding.message,
-        "time": finding.time,
-        "stderr": finding.stderr,
-    }
 
 
 def lines(records: Sequence[FalsifiedFinding]) -> Iterator[str]:
     """Lines of text that show failed simulations."""
     for each in records:
-        count = each["simulations"]
+        count, finding = each.simulations, each.finding
         times = f"{count:,} simulations failed" if count > 1 else "a simulation failed"
-        yield f"{times}, {_told(each['reason'], each['time'], each['message'])}"
-        values = ", ".join(f"{visible(name)}={value:.6g}" for name, value in each["point"].items())
+        yield f"{times}, {_told(finding.reason, finding.time, finding.message)}"
+        values = ", ".join(f"{visible(name)}={value:.6g}" for name, value in finding.point.items())
         if values:
             yield f"  at {values}"
-        yield from (f"  | {visible(line)}" for line in each["stderr"].splitlines()[-MOST_LINES:])
-        yield f"  {each['replay']}"
+        yield from (f"  | {visible(line)}" for line in finding.stderr.splitlines()[-MOST_LINES:])
+        yield f"  {each.replay}"
 
 
 def _told(reason: str, time: float | None, message: str) -> str:
@@ -100,31 +76,25 @@ def _told(reason: str, time: float | None, message: str) -> str:
     return f"{reason}{at}: {visible(message)}"
 
 
-def replayed(
-    simulator: PlantSimulator, point: np.ndarray, stored: Mapping[str, Any]
-) -> Answer[ReplayedFinding]:
+def replayed(simulator: PlantSimulator, point: np.ndarray, stored: StoredFinding) -> Answer[ReplayedFinding]:
     """Simulate a failed simulation again, at a point of the unit cube, (dim,)."""
+    from stlc.assurance.falsified import ReplayedFinding
     from stlc.plants.plant import PlantFinding
 
     found = simulator.outcome(point)
     failed = found if isinstance(found, PlantFinding) else None
-    before = {key: stored.get(key) for key in ("reason", "message", "time")}
-    again = None if failed is None else {key: _described(failed)[key] for key in before}
-    document: ReplayedFinding = {
-        "reason": None if failed is None else failed.reason,
-        "message": None if failed is None else failed.message,
-        "time": None if failed is None else failed.time,
-        "stored_reason": str(stored["reason"]),
-        "identical": again == before,
-    }
+    reason, message, time = (
+        (None, None, None) if failed is None else (failed.reason, failed.message, failed.time)
+    )
+    same = (reason, message, time) == (stored.reason, stored.message, stored.time)
 
     def show() -> None:
         if failed is None:
-            emit(f"the simulation gives a trace; before: {visible(str(stored['reason']))}")
+            emit(f"the simulation gives a trace; before: {visible(stored.reason)}")
             return
-        same = "as before" if again == before else f"before: {visible(str(stored['reason']))}"
-        emit(f"the simulation fails, {same}; {_told(failed.reason, failed.time, failed.message)}")
+        before = "as before" if same else f"before: {visible(stored.reason)}"
+        emit(f"the simulation fails, {before}; {_told(failed.reason, failed.time, failed.message)}")
         for line in failed.stderr.splitlines()[-MOST_LINES:]:
             emit(f"  | {visible(line)}")
 
-    return Answer(document, show, int(failed is not None))
+    return Answer(ReplayedFinding(reason, message, time, stored.reason, same), show, int(failed is not None))

@@ -4,7 +4,6 @@ from typing import Annotated, Any, Literal, TypeAlias, TypedDict
 
 from stlc.assurance.certificate import Assessment
 from stlc.assurance.draws import FailedDraw
-from stlc.assurance.falsify import Counterexample
 from stlc.controller.guard.kind import compared_guards
 from stlc.registry import GUARDS
 
@@ -99,76 +98,6 @@ class DrawnCertificate(TypedDict):
 BoundedDrives: TypeAlias = Annotated[Assessment, Certificate]
 BoundedDraws: TypeAlias = Annotated[Assessment, DrawnCertificate]
 """Bounds and what they depend on, the content of a certificate."""
-
-
-class FalsifiedRequirement(TypedDict):
-    """Search for a violation of one requirement; see `stlc.assurance.falsify.Falsification`.
-
-    It is inconclusive if no simulation has a verdict.
-    """
-
-    name: str
-    verdict: Literal["violated", "open", "inconclusive"]
-    simulations: int
-    inconclusive: int
-    least: Num
-    found: Counterexample | None
-    simpler: Counterexample | None
-    spurious: list[Counterexample]
-    coverage: float
-    rejected: int
-    seconds: float
-    strategies: dict[str, int]
-    file: str | None
-    replay: str | None
-    trace_margin: Num | None
-
-
-class FalsifiedFinding(TypedDict):
-    """Failed simulations of a plant of one kind: how many, and the first of them."""
-
-    reason: str
-    message: str
-    time: float | None
-    stderr: str
-    simulations: int
-    point: dict[str, float]
-    file: str
-    replay: str
-
-
-class FalsifiedSystem(TypedDict):
-    """Searches for violations of the requirements of a system or run; failures are those of a plant."""
-
-    target: str
-    simulations: int
-    seed: int
-    coordinates: int
-    failures: list[str]
-    findings: list[FalsifiedFinding]
-    lost: int
-    requirements: list[FalsifiedRequirement]
-
-
-class ReplayedCounterexample(TypedDict):
-    """Counterexample that was simulated again, and how it differs from its trace."""
-
-    requirement: str
-    verdict: Literal["violated", "satisfied", "inconclusive", "out of scope"]
-    margin: Num
-    stored_margin: Num
-    identical: bool
-    different: list[str]
-
-
-class ReplayedFinding(TypedDict):
-    """Failed simulation of a plant that was simulated again; without a reason if it gives a trace now."""
-
-    reason: str | None
-    message: str | None
-    time: float | None
-    stored_reason: str
-    identical: bool
 
 
 class FalsificationRounds(TypedDict):

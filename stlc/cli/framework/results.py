@@ -33,14 +33,14 @@ RESULTS: dict[str, tuple[str, ...]] = {
     ),
     "export": ("stlc.export.write:Exported",),
     "falsify": (
-        f"{_ASSURED}:FalsifiedSystem",
-        f"{_ASSURED}:ReplayedCounterexample",
-        f"{_ASSURED}:ReplayedFinding",
+        "stlc.assurance.falsified:FalsifiedSystem",
+        "stlc.assurance.falsified:ReplayedCounterexample",
+        "stlc.assurance.falsified:ReplayedFinding",
     ),
     "fmt": (f"{_DOCUMENTS}:FormattedFiles",),
     "init": (f"{_DOCUMENTS}:CreatedFiles",),
     "lint": (f"{_DOCUMENTS}:LintedFiles",),
-    "plan": ("stlc.cli.framework.plan_documents:Plans",),
+    "plan": ("stlc.assurance.verification.planned:Plans",),
     "plot": (f"{_DOCUMENTS}:PlottedTrace",),
     "report": (f"{_DOCUMENTS}:WrittenReport",),
     "runs": tuple(

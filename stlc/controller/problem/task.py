@@ -172,6 +172,14 @@ class Task:
             compiled = replace(compiled, parameters=fixed(compiled.parameters, values))
         return cls(compiled, system)
 
+    def __repr__(self) -> str:
+        return f"Task({self.compiled.name} on {self.system.facts})"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the states, in the order of their columns; those that the specification adds are last."""
+        return self.system.names
+
     @property
     def horizon(self) -> int:
         """Number of steps of a plan: the horizon of the system, or more if plans reach to a mission's end."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
@@ -120,6 +120,7 @@ def train_here(
     steps: int | None = None,
     seed: int | None = None,
     method: str | None = None,
+    **options: Any,
 ) -> Run:
     """Train a policy in a new folder below `runs/` and return the run.
 
@@ -131,6 +132,8 @@ def train_here(
         seed: seed of all random numbers; None: that of the system file.
         method: name of the method, such as `guided` (search and distil) or `gradient` (Meng and Fan 2023);
             None: that of the system file.
+        options: further fields of `stlc.controller.training.config.TrainConfig`, such as `held_out` or
+            `drives`.
 
     Raises:
         UsageError: U101, `budget` is not a positive number, `steps` is below 1, `seed` is negative, or there
@@ -140,7 +143,7 @@ def train_here(
         raise usage(f"a training time of {budget} s is not a positive number")
     if (steps is not None and steps < 1) or (seed is not None and seed < 0):
         raise usage("a training has at least 1 step, and its seed is at least 0")
-    config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed)
+    config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed, **options)
     prepared = prepare(task, config)
     return run(prepared, open_folder(task, config)).run
 

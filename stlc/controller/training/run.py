@@ -21,7 +21,7 @@ from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.plugins import variable
 from stlc.provenance import sha256
-from stlc.registry import METHODS, PLANNERS, PackageRegistry
+from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import HELD_OUT, RUNS, SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.evaluation.held_out import Score
+    from stlc.controller.guard.loop import GuardedLoop
     from stlc.controller.policies.policy import PlanProposer, Policy
     from stlc.controller.problem.task import PlanVerdicts
     from stlc.dynamics.declaration.decl import SystemDecl
@@ -86,6 +87,28 @@ class Run:
         task = task_of_run(folder, overrides, scenario)
         config = load_config(folder)
         return cls(folder, task, METHODS.get(config.method).load(task, folder, config, device))
+
+    def __repr__(self) -> str:
+        name = f"{self.dir.path.parent.name}/{self.dir.name}"
+        result = self.dir.record().get("result") or {}
+        share, count = result.get("accuracy"), result.get("held_out") or 0
+        told = self.dir.status if share is None else f"{share:.3f} of {count:,} held-out starts"
+        return f"Run({name}: {told})"
+
+    def guard(self, name: str = GUARDS.default, *, seed: int = 0) -> GuardedLoop:
+        """Return a guard for a loop of one's own, which is called with a state at each step, in NumPy.
+
+        Args:
+            name: name of the guard, such as "paper" or "none".
+            seed: seed of the parameters of the specification, if it has any.
+
+        Raises:
+            UsageError: U101, there is no such guard, or the task lacks what it needs.
+        """
+        from stlc.controller.guard.guard import Guard
+        from stlc.controller.guard.loop import GuardedLoop
+
+        return GuardedLoop(Guard(self.task, self.policy, name), seed)
 
     @property
     def network(self) -> PlanProposer:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
 
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
@@ -24,6 +24,7 @@ from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line
 from stlc.dynamics.schema.record import OF, SECONDS, integer, key, read, word
 from stlc.dynamics.schema.yaml_nodes import Entry, Node
+from stlc.jsontext import Num
 from stlc.signature import Column
 from stlc.units import Unit
 
@@ -60,14 +61,21 @@ class InputDecl:
         free_times: whether the times at which pieces end are drawn, too. If not, all pieces have one length.
     """
 
+    JSON: ClassVar = "name low high pieces interpolate free_times unit=unit.shown seconds columns"
+
     name: str
     unit: Unit
-    low: float
-    high: float
+    low: Num
+    high: Num
     pieces: int
     interpolate: Interpolate
     duration: Fraction
     free_times: bool
+
+    @property
+    def seconds(self) -> Num:
+        """Length of all pieces together, in seconds."""
+        return float(self.duration)
 
     @property
     def points(self) -> int:

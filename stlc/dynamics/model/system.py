@@ -74,6 +74,16 @@ class System:
         self.initial = InitialStates(decl.init, decl.signature.names)
         self._steppers: dict[bool, Stepper] = {}
 
+    @property
+    def facts(self) -> str:
+        """Name and size in words: `car: 7 states, 1 control, 25 steps of 0.1 s`."""
+        sizes = ((len(self.names), "state"), (len(self.control_names), "control"))
+        counts = ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for count, noun in sizes)
+        return f"{self.decl.name}: {counts}, {self.horizon} steps of {self.dt:g} s"
+
+    def __repr__(self) -> str:
+        return f"System({self.facts})"
+
     def __deepcopy__(self, memo: object) -> Self:
         """Return the system itself, which is immutable."""
         return self

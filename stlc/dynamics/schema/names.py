@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from collections.abc import Mapping as MappingType
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 from stlc.compile.frontend.scope import Entry, Known, Scope, enforced
 from stlc.compile.frontend.values import Number, VectorValue
@@ -16,6 +16,7 @@ from stlc.dynamics.schema.expressions import SECOND, Expressions
 from stlc.dynamics.schema.reader import Reader
 from stlc.dynamics.schema.yaml_nodes import Scalar
 from stlc.grammar import ast
+from stlc.jsontext import Num
 from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import Unit
@@ -36,10 +37,12 @@ class ControlDecl:
         levels: values that a search may try; if empty, values spread evenly over the range.
     """
 
+    JSON: ClassVar = "name low high unit=unit.shown"
+
     name: str
     unit: Unit
-    low: float
-    high: float
+    low: Num
+    high: Num
     squash: Squash = "tanh"
     levels: tuple[float, ...] = ()
 

@@ -1,0 +1,73 @@
+"""Verdicts as Python shows them, and as they are sent to other processes."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+
+import numpy as np
+import pytest
+
+import stlc
+from stlc.jsontext import plain
+
+TEXT = "spec tank\nsignal level [m]\nrequire low: always level < 3 m\nrequire `a<b>`: always level > 0 m\n"
+BATCH = {"level": np.array([[1.0, 2.0, 4.0], [1.0, 2.0, 2.5]])}
+
+
+@pytest.fixture
+def verdict() -> stlc.Verdict:
+    return stlc.Monitor(TEXT, dt=1.0).check({"level": [1.0, 2.0, 4.0]})
+
+
+def test_one_line_says_the_worst(verdict):
+    assert repr(verdict) == "Verdict(violated: 1 of 2 · low -1 m at t = 2 s)"
+    assert repr(verdict["low"]) == "RequirementVerdict(low: violated · -1 m at t = 2 s)"
+    several = stlc.Monitor(TEXT, dt=1.0).check(BATCH)
+    assert repr(several) == "Verdict(violated: 1 of 2 on 2 traces · low -1 m at trace 0, t = 2 s)"
+    open_ = stlc.Monitor("signal x\nrequire r: always[0 s, 9 s] x < 3", dt=1.0).check({"x": [1.0]})
+    assert repr(open_) == "Verdict(inconclusive: 1 of 1 · r [-inf, 2])"
+
+
+def test_a_notebook_shows_a_table_whose_texts_are_escaped(verdict):
+    shown = verdict._repr_html_()
+    assert "<a<b>" not in shown
+    assert "a&lt;b&gt;" in shown
+    assert shown.count('style="color') == 1
+    assert "level &lt; 3 m` is false where level = 4 m" in shown
+
+
+def test_a_frame_has_a_row_for_each_requirement_and_trace():
+    pytest.importorskip("pandas")
+    frame = stlc.Monitor(TEXT, dt=1.0).check(BATCH).to_frame()
+    assert frame["verdict"].tolist() == ["violated", "satisfied", "satisfied", "satisfied"]
+    assert frame["robustness"].tolist() == [-1.0, 0.5, 1.0, 1.0]
+
+
+def test_without_a_package_for_frames_the_error_names_one(verdict, monkeypatch):
+    for name in ("pandas", "polars"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(stlc.StlcError, match="R301"):
+        verdict.to_frame()
+
+
+def test_a_told_verdict_says_the_same_without_the_signals(verdict):
+    told = pickle.loads(pickle.dumps(verdict.told()))
+    assert told.judged_on is None
+    assert plain(told) == plain(verdict.told())
+    assert repr(told) == repr(verdict)
+    assert told._repr_html_() == verdict._repr_html_()
+    assert (told.share, told.robustness, told.facts) == (verdict.share, verdict.robustness, verdict.facts)
+
+
+@pytest.mark.parametrize("at", ["all", 1, None])
+def test_what_was_counted_stays(verdict, at):
+    found = stlc.Monitor("signal level [m]\nrequire low: always[0 s, 1 s] level < 3 m", dt=1.0).check(
+        BATCH, at=at
+    )
+    told = found.told()
+    for one, other in zip(found, told, strict=True):
+        assert one.worst == other.worst
+        assert (one.instants, one.share, one.statuses) == (other.instants, other.share, other.statuses)
+        assert one.figures == other.figures
+    assert verdict.told().told().facts == verdict.facts
