@@ -218,28 +218,13 @@ def _replaced(drawn: Tensor, values: Tensor) -> Tensor:
     return found.view(drawn.shape)
 
 
-def _uniforms(drawn: Tensor, given: Tensor, *_: Any) -> Tensor:
-    return _replaced(drawn, given.clamp(max=1.0 - 0.5 * torch.finfo(drawn.dtype).eps))
-
-
-def _normals(drawn: Tensor, given: Tensor, *_: Any) -> Tensor:
-    return _replaced(drawn, _normal_quantiles(given))
-
-
-def _integers(drawn: Tensor, given: Tensor, args: tuple[Any, ...], options: Mapping[str, Any]) -> Tensor:
-    low, span = _ends(args, options)
-    return _replaced(drawn, low + torch.floor(given * span))
-
-
-def _permutation(drawn: Tensor, given: Tensor, *_: Any) -> Tensor:
-    return torch.argsort(given, stable=True).to(drawn.dtype) if len(given) == len(drawn) else drawn
-
-
 _READERS: dict[str, Callable[..., Tensor]] = {
-    "rand": _uniforms,
-    "randn": _normals,
-    "randint": _integers,
-    "randperm": _permutation,
+    "rand": lambda drawn, at, *_: _replaced(drawn, at.clamp(max=1.0 - 0.5 * torch.finfo(drawn.dtype).eps)),
+    "randn": lambda drawn, at, *_: _replaced(drawn, _normal_quantiles(at)),
+    "randint": lambda drawn, at, *call: _replaced(drawn, _ends(*call)[0] + torch.floor(at * _ends(*call)[1])),
+    "randperm": lambda drawn, at, *_: (
+        torch.argsort(at, stable=True).to(drawn.dtype) if len(at) == len(drawn) else drawn
+    ),
 }
 """Functions of torch that are replaced while a tape is in effect."""
 

@@ -143,12 +143,14 @@ def score(
         known[few] = plan(task, states[few], budget=PlanBudget(torch.inf, JUDGED, stop=enough)).satisfied
         searched |= known
     accuracy = float(good.double().mean())
+    solved, tried = int(known[failing].sum()), int(searched[failing].sum())
+    assumed = (len(failing) - tried) * solved / max(1, tried)  # as among those that were searched
     return Score(
         accuracy=accuracy,
         interval=wilson(accuracy, n),
         endless=None if task.compiled.recurring is None else mission_steps(task) * task.system.dt,
         requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
-        feasible=_feasible(known, searched, failing),
+        feasible=(int(known.sum()) + assumed) / n,
         states=states,
         rho=rho,
         each=each,
@@ -181,17 +183,6 @@ def _judged(
         each.append(judged.requirements)
     count = sum(map(len, rho))
     return states[:count], torch.cat(plans), torch.cat(rho), torch.cat(each)
-
-
-def _feasible(known: Tensor, searched: Tensor, failing: Tensor) -> float:
-    """Estimated share of the states from which a satisfying plan exists.
-
-    The share that was solved among the searched failing states is assumed for the other failing states.
-    `known`, `searched`: masks as in `Score`, (n,). `failing`: indices of the failing states, (k,).
-    """
-    found, tried = int(known[failing].sum()), int(searched[failing].sum())
-    left = len(failing) - tried
-    return (int(known.sum()) + left * found / max(1, tried)) / len(known)
 
 
 def wilson(share: float, n: int) -> tuple[float, float]:

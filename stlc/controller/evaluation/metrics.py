@@ -101,10 +101,6 @@ class Metric:
         return float(counted.mean()) if counted.size else math.nan
 
 
-def _eventless_and_viable(seed: Seed) -> Mask | None:
-    return None if seed.eventless is None else seed.eventless & seed.of_viable
-
-
 _ALL = (
     Metric(
         "plan_accuracy",
@@ -220,7 +216,7 @@ _ALL = (
         "safe, starts without exogenous event",
         "share of those of viable agents from which the drive satisfies the requirements tagged @safety",
         lambda seed: seed.safe,
-        _eventless_and_viable,
+        lambda seed: None if seed.eventless is None else seed.eventless & seed.of_viable,
         safety=True,
     ),
 )

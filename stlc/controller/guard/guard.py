@@ -138,14 +138,9 @@ class Guard:
             judged.rho,
             fresh,
         )
-        return decision if self.strict is self.task else self._plainly(decision, x, fresh)
-
-    def _plainly(self, decision: GuardDecision, x: Tensor, fresh: Tensor) -> GuardDecision:
-        """Return `decision` with its robustness and verdicts recomputed without robustness margins.
-
-        `x`: states, (agents, n). `fresh`: the policy's plans, (agents, T, m).
-        """
-        taken = self.task.judge(x, decision.plan, states=False)
+        if self.strict is self.task:
+            return decision
+        taken = self.task.judge(x, decision.plan, states=False)  # without robustness margins
         policy_rho = self.task.judge(x, fresh, states=False).rho
         return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
 
@@ -232,17 +227,9 @@ class Guard:
             return found
         rest = self.strict.judge(x, previous.plan)
         better = rank(rest.rho, self.strict.cost(rest)) >= rank(judged.rho, self.strict.cost(judged))
-        keep = ((better | self._deepened(rest)) & (rest.rho >= -TOLERANCE)).nonzero()[:, 0]
+        if self.task.pending_goals.items:
+            better |= self.task.pending_goals.deepened(rest.columns)
+        keep = (better & (rest.rho >= -TOLERANCE)).nonzero()[:, 0]
         before = Candidates(previous.plan, rest.rho, rest.safe, found.cost, previous.source, previous.t0)
         found.put(keep, before.of(keep))
         return found
-
-    def _deepened(self, rest: PlanVerdicts) -> Tensor:
-        """Mask of the agents whose previous plan increases the margin of a goal in its next step, (agents,).
-
-        The margin is the robustness of the goal. A goal counts only if it holds in the present state with a
-        smaller margin than plans should reach. `rest`: verdicts on the remainders of the previous plans.
-        """
-        if not self.task.pending_goals.items:
-            return torch.zeros_like(rest.rho, dtype=torch.bool)
-        return self.task.pending_goals.deepened(rest.columns)

@@ -27,7 +27,6 @@ from stlc.controller.search.starts import extremes
 from stlc.native import ObjectiveSlopes
 
 if TYPE_CHECKING:
-    from stlc.controller.problem.native import NativeGradient
     from stlc.controller.problem.task import Task
 
 NEAR = 8
@@ -99,27 +98,17 @@ class GradientAscent:
         return torch.from_numpy(np.concatenate(parts)).to(places.device)
 
     def _risen(self, x: Numbers, places: Numbers, until: float) -> Numbers:
-        best, value = self._round(x, self._changed(places), RATES[0], until)
+        best, value = self._raised(x, self._changed(places), RATES[0], until)
         for at, rate in enumerate(RATES[1:]):
             left = np.flatnonzero(value[:, 0] < APART + self.enough)
             if not len(left) or perf_counter() >= until:
                 break
             far = np.broadcast_to(self._far[at], (len(left), *self._far[at].shape))
             starts = np.concatenate((self._changed(best[left]), far), 1)
-            best[left], value[left] = self._round(x[left], starts, rate, until)
+            best[left], value[left] = self._raised(x[left], starts, rate, until)
         done = np.flatnonzero(value[:, 0] >= APART + self.enough)
         best[done, 0] = self._eased(x[done], places[done, 0], best[done, 0])
         return best
-
-    def _round(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """Run one round of ascent; return the best plans, (agents, KEPT, T, m), and their values, best first.
-
-        Plans are compared by their values, (agents, KEPT); larger is better. `x`: states, (agents, n).
-        `plans`: starting plans, (agents, k, T, m). `rate`: initial step size. `until`: deadline.
-        """
-        plans, value = self._raised(x, plans, rate, until)
-        order = np.argsort(-value, axis=1, kind="stable")[:, :KEPT]
-        return np.take_along_axis(plans, order[..., None, None], 1), np.take_along_axis(value, order, 1)
 
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
         """Move repaired plans `found` back towards the policy's plans `own`, (agents, T, m) each.
@@ -136,12 +125,12 @@ class GradientAscent:
         return eased
 
     def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
-        """Run gradient ascent from the plans `plans`, (agents, k, T, m).
+        """Run one round of gradient ascent from the plans `plans`, (agents, k, T, m).
 
         `x`: states, (agents, n). `rate`: initial step size. `until`: deadline.
 
         Returns:
-            The best iterate from each plan, (agents, k, T, m), and its value (see `_worth`), (agents, k).
+            The best plans, (agents, KEPT, T, m), and their values (see `_worth`), (agents, KEPT), best first.
         """
         agents, count = plans.shape[:2]
         starts, rows = np.repeat(x, count, 0), plans.reshape(-1, *plans.shape[2:])
@@ -166,7 +155,9 @@ class GradientAscent:
             size = np.sqrt(second / (1.0 - 0.99 ** (step + 1))) + 1e-8
             far = rate * (1.0 - step / STEPS) / (1.0 - 0.9 ** (step + 1))
             rows = self._bounded(rows + far * self._span * first / size)
-        return best.reshape(plans.shape), value.reshape(agents, count)
+        order = np.argsort(-value.reshape(agents, count), axis=1, kind="stable")[:, :KEPT]
+        rows = order + count * np.arange(agents)[:, None]
+        return best[rows], value[rows]
 
     def _worth(self, each: Numbers) -> Numbers:
         """Values by which plans are compared: (rows, R) -> (rows,); larger is better.
@@ -193,21 +184,19 @@ class GradientAscent:
             NaN becomes -inf. The function maps weights w, (rows, R), to the gradient of the sum of w times
             the unscaled robustness with respect to the plans, (rows, T, m).
         """
-        if self._native is None:
+        native, threads = self._native, torch.get_num_threads()
+
+        def natively(by: Numbers) -> Numbers:
+            assert native is not None
+            return native.adjoint.pull(x, u, ObjectiveSlopes(by, None, SLOPE), threads=threads)
+
+        if native is None:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
         else:
-            each, pull = self._natively(self._native, x, u)
+            each, pull = native.judge.kernel.judge(x, u, threads=threads)[0], natively
         found = np.stack([weighed(row, f, NUMPY) for row, f in zip(each.T, self._factors, strict=True)], 1)
         found[np.isnan(found)] = -np.inf
         return found, pull
-
-    def _natively(self, native: NativeGradient, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
-        threads = torch.get_num_threads()
-
-        def pull(by: Numbers) -> Numbers:
-            return native.adjoint.pull(x, u, ObjectiveSlopes(by, None, SLOPE), threads=threads)
-
-        return native.judge.kernel.judge(x, u, threads=threads)[0], pull
 
     def _differentiated(self, x: Tensor, u: Tensor) -> tuple[Numbers, Pull]:
         """Compute the robustness of plans in torch, and a function that returns gradients.

@@ -128,15 +128,13 @@ class GoalScheduler:
         """True if a formula only compares the states of one sample, that is, if it is a condition."""
         known = self._decidable.get(id(formula))
         if known is None:
-            known = self._decidable[id(formula)] = self._decided(formula)
+            read = (
+                leaf for num in numbers(formula) for leaf in leaves(num) if not isinstance(leaf, ir.Const)
+            )
+            known = self._decidable[id(formula)] = all(
+                isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in nodes(formula)
+            ) and all(isinstance(leaf, ir.Signal) and leaf.name in self._states for leaf in read)
         return known
-
-    def _decided(self, formula: ir.Formula) -> bool:
-        return all(isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in nodes(formula)) and all(
-            isinstance(leaf, ir.Const) or (isinstance(leaf, ir.Signal) and leaf.name in self._states)
-            for num in numbers(formula)
-            for leaf in leaves(num)
-        )
 
     @cached_property
     def forms(self) -> tuple[list[ir.Formula], list[ir.Formula]]:

@@ -115,6 +115,11 @@ def _told(
     start = ", ".join(f"{column.name} = {value:.4g}" for column, value in columns)
     rho = float(nearest.rho[row])
     missing = f"{-rho:.4g}" if math.isfinite(rho) else "a deadline that was over before the plan"
+    rest = "" if len(core) == 1 else "; without one of these requirements some were found"
+    tried = (
+        f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
+        f"from some of them{rest}; that is no proof that there is none"
+    )
     if proved:
         message, label = f"no plan satisfies {names[0]}", "out of reach whatever a plan does"
     elif len(core) == 1:
@@ -136,21 +141,9 @@ def _told(
             "`stlc compile` shows what is asked for in steps",
         ),
         note=(
-            PROOF if proved else _tried(core),
+            PROOF if proved else tried,
             f"the nearest misses by {missing}, from {start}",
         ),
-    )
-
-
-def _tried(core: Sequence[CompiledRequirement]) -> str:
-    """Sentence for a message. It says how many plans the search tried, and that this is not a proof.
-
-    `core`: the conflicting requirements.
-    """
-    rest = "" if len(core) == 1 else "; without one of these requirements some were found"
-    return (
-        f"{TRIES:,} plans were tried for each of {STARTS} starts, and plans were put together step by step "
-        f"from some of them{rest}; that is no proof that there is none"
     )
 
 

@@ -99,11 +99,13 @@ class FinalEvaluation:
         The status of the run becomes `finished`.
         """
         self.trained = self.time.now()
-        result = score(
-            self.task, policy, n=self.config.held_out, enough=self._out_of_time, report=self.report
-        )
+
+        def late(factor: float = 1.0) -> bool:
+            return self.time.now() - self.trained > factor * self._verdict_seconds
+
+        result = score(self.task, policy, n=self.config.held_out, enough=late, report=self.report)
         self.writer.held_out(self.task, result)
-        why = conflict(self.task, self._late) if result.feasible == 0.0 else None
+        why = conflict(self.task, lambda: late(2.0)) if result.feasible == 0.0 else None
         run = Run(self.writer.folder, self.task, policy)
         simulated = self._simulated(run) if why is None else None
         found: dict[str, object] = {"seconds": self.time.spent}
@@ -130,14 +132,6 @@ class FinalEvaluation:
             end = started + SIMULATION_SHARE * whole
         last = max(end, started + min(FIRST_DRIVES, FIRST_SHARE * whole))
         return closed_loop(run, lambda: last - time.now(), self.config.drives, extra=last - end)
-
-    def _out_of_time(self) -> bool:
-        """True once the time for the evaluation on held-out states is over."""
-        return self.time.now() - self.trained > self._verdict_seconds
-
-    def _late(self) -> bool:
-        """True once the diagnosis has taken twice the time of the evaluation on held-out states."""
-        return self.time.now() - self.trained > 2.0 * self._verdict_seconds
 
     @property
     def _verdict_seconds(self) -> float:
