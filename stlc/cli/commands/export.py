@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import PythonOption, RunArgument, RunsOption
+from stlc.cli.framework.options import (
+    PythonOption,
+    RunArgument,
+    RunsOption,
+    SetOption,
+    SystemOption,
+    parse_overrides,
+)
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
+from stlc.diagnostics import usage
 from stlc.escape import visible
 from stlc.foreign import driving
 
 if TYPE_CHECKING:
+    from stlc.export.monitor import ExportedMonitor
     from stlc.export.write import Exported
 
 
@@ -22,6 +32,7 @@ if TYPE_CHECKING:
     "stlc export latest --to onnx -o controller",
     "stlc export latest --to onnx --precision float64",
     "stlc export latest --to torch",
+    "stlc export specs/traffic.stl --to c -o monitor",
 )
 def export(
     run: RunArgument = "latest",
@@ -40,17 +51,35 @@ def export(
             show_default="float32",
         ),
     ] = None,
+    single: Annotated[
+        bool, typer.Option("--float", help="Numbers of a monitor in C: float, for targets without doubles.")
+    ] = False,
+    dt: Annotated[
+        str | None,
+        typer.Option("--dt", metavar="TIME", help="Time step of a monitor.", show_default="the system's"),
+    ] = None,
+    system: SystemOption = None,
+    set_: SetOption = None,
     python: PythonOption = False,
     runs: RunsOption = Path("runs"),
-) -> Answer[Exported]:
-    """Export a trained controller, monitor included.
+) -> Answer[Exported | ExportedMonitor]:
+    """Export a trained controller, monitor included, or the monitor of a specification.
 
     `torch` is a torch.export program that maps states to plans and their robustness. `c` is a C99 header with
     an example program. It depends only on libm, and includes the backup policy. `onnx` is a set of graphs for
     onnxruntime, which `stlc.runtime` runs without torch. It includes the backup policy, too. For random
     states, the results of every export are compared with those of the run. Files of an earlier export are
     replaced, but a different `main.c` or `Makefile` is kept.
+
+    A file `SPEC.stl` with `--to c` is exported without a run: the monitor of streams in C99, with an example that
+    reads CSV.
     """
+    if to == "c" and run.endswith((".stl", ".stlc")):
+        return _monitor(run, output or Path("export"), dt, system, parse_overrides(set_), single=single)
+    if single or dt or system or set_:
+        raise usage(
+            "`--float`, `--dt`, `--system` and `--set` belong to a monitor", "stlc export SPEC.stl --to c"
+        )
     from stlc.controller.training.run import Run
     from stlc.export.write import export as write
     from stlc.export.write import precision_of, target_of
@@ -83,5 +112,26 @@ def export(
             emit(visible(str(shown / name)))
         for name in done.kept:
             say(f"kept {visible(str(shown / name))}, which was there and differs")
+
+    return Answer(done, show)
+
+
+def _monitor(
+    spec: str, folder: Path, dt: str | None, system: str | None, overrides: Mapping[str, str], *, single: bool
+) -> Answer[ExportedMonitor]:
+    from stlc.cli.check.options import time_step
+    from stlc.export.monitor import export_monitor
+    from stlc.files import find_spec, read_source
+    from stlc.grammar.parse.parser import parse
+    from stlc.monitor.verdict import Monitor
+
+    step = time_step("--dt", dt)
+    parsed = parse(read_source(find_spec(spec)))
+    done = export_monitor(Monitor(parsed, step, system=system, overrides=overrides), folder, single=single)
+
+    def show() -> None:
+        for name in done.files:
+            emit(visible(str(folder / name)))
+        say(f"the state takes {done.bytes:,} bytes")
 
     return Answer(done, show)

@@ -31,7 +31,7 @@ RESULTS: dict[str, tuple[str, ...]] = {
         "stlc.monitor.explain.tree:Explanation",
         "stlc.controller.guard.coverage:Guarantee",
     ),
-    "export": ("stlc.export.write:Exported",),
+    "export": ("stlc.export.write:Exported", "stlc.export.monitor:ExportedMonitor"),
     "falsify": (
         "stlc.assurance.falsified:FalsifiedSystem",
         "stlc.assurance.falsified:ReplayedCounterexample",

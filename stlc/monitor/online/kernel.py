@@ -22,6 +22,8 @@ After = Literal["open", "growing", "ended", "clipped"]
 
 _STEPS: dict[After, int] = {"open": 1, "growing": 2, "ended": 3, "clipped": 4}
 
+_HEAD = "#define REAL double\n#define API\n"
+
 _MOST = 1 << 32
 """Greatest size of the state in bytes."""
 
@@ -63,7 +65,7 @@ class _Tables(ctypes.Structure):
 @cache
 def _transducers() -> ctypes.CDLL | None:
     """Library of the transducers of all monitors."""
-    library = native.load("#define PREDICATES\n" + "".join(runtime()))
+    library = native.load(_HEAD + "".join(runtime()))
     if library is not None:
         pointer, integer, flag = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
         library.stlc_size.restype = library.stlc_block.restype = library.stlc_news.restype = integer
@@ -121,11 +123,7 @@ class StreamKernel:
         """
         program = streams_of(rules, signals, cut=watching.cut)
         library = _transducers()
-        predicates = (
-            None
-            if library is None
-            else native.load(f"#define PREDICATES\n{runtime()[0]}{program.predicates}")
-        )
+        predicates = None if library is None else native.load(f"{_HEAD}{runtime()[0]}{program.predicates}")
         if library is None or predicates is None:
             return None
         try:

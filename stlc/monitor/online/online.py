@@ -310,8 +310,9 @@ class Online:
         self._needs = needs_of(compiled, [*rules, *compiled.assumptions])
         self.signals = tuple(need.column.name for need in self._needs)
         """Names of the signals, in the order of a row."""
-        asked = [self._ask(rule) for rule in rules]
-        asked += [self._ask(rule, once=True) for rule in compiled.assumptions]
+        self.asked = [self._ask(rule) for rule in rules]
+        """The requirements, and where they are evaluated."""
+        asked = self.asked + [self._ask(rule, once=True) for rule in compiled.assumptions]
         self._kernel, watched = self._watch(asked)
         self._watched, self._scope = watched[: len(rules)], watched[len(rules) :]
         self._recomputed = [each for each in watched if isinstance(each, Recomputed)]

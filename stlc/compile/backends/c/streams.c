@@ -556,6 +556,16 @@ static void decide_endless(monitor *m, int32_t r, const graph *g, const span *v)
 
 /* ---------------------------------------------------------------------------------------------- monitors */
 
+static void counted(verdicts *of, at t, span value, span deciding) {
+  of->last[0] = value;
+  of->last[1] = deciding;
+  of->sum.instants += 1;
+  of->sum.holds += deciding.lo >= of->slack;
+  of->sum.fails += deciding.hi < of->slack;
+  if (value.lo < of->sum.low) { of->sum.low = value.lo; of->sum.low_at = t; }
+  if (value.hi < of->sum.high) { of->sum.high = value.hi; of->sum.high_at = t; }
+}
+
 static void judged(monitor *m, int32_t r) {
   const rule *a = m->t->rules + r;
   const graph *values = m->t->graphs + a->values, *truths = m->t->graphs + a->truths;
@@ -589,18 +599,12 @@ static void judged(monitor *m, int32_t r) {
     if (truth) settle(m, r, root.node, there, there, truth);
   }
   if (t < of->begin) return;
-  of->last[0] = value;
-  of->last[1] = deciding;
-  of->sum.instants += 1;
-  of->sum.holds += deciding.lo >= of->slack;
-  of->sum.fails += deciding.hi < of->slack;
-  if (value.lo < of->sum.low) { of->sum.low = value.lo; of->sum.low_at = t; }
-  if (value.hi < of->sum.high) { of->sum.high = value.hi; of->sum.high_at = t; }
+  counted(of, t, value, deciding);
   if (!of->everywhere) of->over = 1;
 }
 
 /* Bytes of a state: of this structure, and of the arrays that follow it. */
-int64_t stlc_size(const tables *t) {
+API int64_t stlc_size(const tables *t) {
   return (int64_t)(sizeof(monitor) + sizeof(at) * (size_t)t->times + sizeof(gap) * (size_t)t->signals +
                    sizeof(verdicts) * (size_t)t->judged + sizeof(span) * (size_t)t->spans +
                    sizeof(real) * (size_t)t->signals * (size_t)(t->rows + 1) + sizeof(int32_t) * (size_t)t->ints +
@@ -608,7 +612,7 @@ int64_t stlc_size(const tables *t) {
 }
 
 /* Find the arrays of a state, which begins as zeros or is the copy of another. */
-void stlc_place(monitor *m, const tables *t) {
+API void stlc_place(monitor *m, const tables *t) {
   m->t = t;
   m->times = (at *)(m + 1);
   m->gaps = (gap *)(m->times + t->times);
@@ -620,7 +624,7 @@ void stlc_place(monitor *m, const tables *t) {
   m->truths = (unsigned char *)(m->ints + t->ints);
 }
 
-void stlc_init(monitor *m, int32_t r, int64_t start, int everywhere, int cut, real tolerance) {
+API void stlc_init(monitor *m, int32_t r, int64_t start, int everywhere, int cut, real tolerance) {
   verdicts *of = m->of + r;
   of->begin = of->sum.low_at = of->sum.high_at = start;
   of->everywhere = everywhere;
@@ -630,7 +634,7 @@ void stlc_init(monitor *m, int32_t r, int64_t start, int everywhere, int cut, re
 }
 
 /* Take a sample; return how many starts it decides. */
-int64_t stlc_step(monitor *m, const real *row) {
+API int64_t stlc_step(monitor *m, const real *row) {
   const at n = m->s.known++;
   int64_t decided = 0;
   for (int32_t i = 0; i < m->t->signals; ++i) {
@@ -649,39 +653,43 @@ int64_t stlc_step(monitor *m, const real *row) {
 }
 
 /* Take samples, with `pause` up to the first that decides a start; return how many starts they decide. */
-int64_t stlc_block(monitor *m, const real *rows, int64_t count, int pause, int64_t *taken) {
+API int64_t stlc_block(monitor *m, const real *rows, int64_t count, int pause, int64_t *taken) {
   int64_t decided = 0;
   for (*taken = 0; *taken < count && !(pause && decided); ++*taken) decided += stlc_step(m, rows + m->t->signals * *taken);
   return decided;
 }
 
-/* Number of starts of a requirement that the latest sample decided; these starts and their truths. */
-int64_t stlc_news(const monitor *m, int32_t r, int64_t *starts, int64_t *truths) {
+/* Start `i` of those of a requirement that the latest sample decided, and its truth. */
+static void stlc_one(const monitor *m, int32_t r, int32_t i, int64_t *start, int64_t *truth) {
+  const rule *a = m->t->rules + r;
   const verdicts *of = m->of + r;
-  for (int32_t i = 0; starts && i < of->waiting; ++i) {
-    starts[i] = m->s.known - m->ints[m->t->rules[r].news + (i & m->t->rules[r].news_mask)];
-    truths[i] = of->said ? of->said : truth_at(m, m->t->nodes + m->t->graphs[m->t->rules[r].truths].root, starts[i]);
-  }
-  return of->waiting;
+  *start = m->s.known - m->ints[a->news + (i & a->news_mask)];
+  *truth = of->said ? of->said : truth_at(m, m->t->nodes + m->t->graphs[a->truths].root, *start);
+}
+
+/* Number of starts of a requirement that the latest sample decided; these starts and their truths. */
+API int64_t stlc_news(const monitor *m, int32_t r, int64_t *starts, int64_t *truths) {
+  for (int32_t i = 0; starts && i < m->of[r].waiting; ++i) stlc_one(m, r, i, starts + i, truths + i);
+  return m->of[r].waiting;
 }
 
 /* Instants that are counted, that hold, that fail, and those of the least bounds; these bounds, those at the instant
    that was counted last, and those that decide it. */
-void stlc_tally(const monitor *m, int32_t r, int64_t *counts, double *bounds) {
+API void stlc_tally(const monitor *m, int32_t r, int64_t *counts, real *bounds) {
   const verdicts *of = m->of + r;
   counts[0] = of->sum.instants; counts[1] = of->sum.holds; counts[2] = of->sum.fails;
   counts[3] = of->sum.low_at; counts[4] = of->sum.high_at;
-  bounds[0] = (double)of->sum.low; bounds[1] = (double)of->sum.high;
-  for (int i = 0; i < 2; ++i) { bounds[2 + 2 * i] = (double)of->last[i].lo; bounds[3 + 2 * i] = (double)of->last[i].hi; }
+  bounds[0] = (real)of->sum.low; bounds[1] = (real)of->sum.high;
+  for (int i = 0; i < 2; ++i) { bounds[2 + 2 * i] = (real)of->last[i].lo; bounds[3 + 2 * i] = (real)of->last[i].hi; }
 }
 
 /* Number of samples at which a signal is unknown, the first and the last of them. */
-void stlc_gap(const monitor *m, int32_t i, int64_t *out) {
+API void stlc_gap(const monitor *m, int32_t i, int64_t *out) {
   out[0] = m->gaps[i].count; out[1] = m->gaps[i].first; out[2] = m->gaps[i].last;
 }
 
 /* Bounds at `count` starts from `start` on if steps of the kind `mode` follow: robustness, and what decides. Spoils the state. */
-void stlc_look(monitor *m, int32_t r, int mode, int clip, int64_t start, int64_t count, double *out) {
+API void stlc_look(monitor *m, int32_t r, int mode, int clip, int64_t start, int64_t count, real *out) {
   const rule *a = m->t->rules + r;
   const graph *values = m->t->graphs + a->values, *truths = m->t->graphs + a->truths;
   const at far = values->bits ? m->s.known - 1 + values->far : start + count - 1 + truths->lag;
@@ -692,7 +700,21 @@ void stlc_look(monitor *m, int32_t r, int mode, int clip, int64_t start, int64_t
     if (a->values != a->truths)
       value = valued(m->t, values, &m->s, n, mode, clip, m->of[r].begin, m->spans + a->own[clip], m->ints + a->own_ints[clip]);
     if (t < start || t >= start + count) continue;
-    out[4 * (t - start)] = (double)value.lo; out[4 * (t - start) + 1] = (double)value.hi;
-    out[4 * (t - start) + 2] = (double)deciding.lo; out[4 * (t - start) + 3] = (double)deciding.hi;
+    out[4 * (t - start)] = (real)value.lo; out[4 * (t - start) + 1] = (real)value.hi;
+    out[4 * (t - start) + 2] = (real)deciding.lo; out[4 * (t - start) + 3] = (real)deciding.hi;
+  }
+}
+
+/* End the trace: count the first start if its windows are incomplete. Spoils the state for more samples. */
+API void stlc_finish(monitor *m) {
+  for (int32_t r = 0; r < m->t->judged; ++r) {
+    verdicts *of = m->of + r;
+    real row[4];
+    span value, deciding;
+    if (of->sum.instants || of->begin >= m->s.known) continue;
+    stlc_look(m, r, of->cut ? CLIPPED : ENDED, of->cut, of->begin, 1, row);
+    value = spanned(row[0], row[1]);
+    deciding = spanned(row[2], row[3]);
+    counted(of, of->begin, value, deciding);
   }
 }

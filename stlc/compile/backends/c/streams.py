@@ -449,7 +449,7 @@ class Graph:
                 return None
             steps = getattr(leaf, "steps", 0)
             if leaf.name == ir.ELAPSED:
-                return "(double)t"
+                return "(real)t"
             column = self.signals[leaf.name]
             if steps < -(1 << 29):
                 return f"x->first[{column}]"
@@ -460,7 +460,7 @@ class Graph:
 
         reads = {place(leaf) for leaf in leaves(atom.num) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
         known = (
-            " && ".join(f"{text} == {text}" for text in sorted(filter(None, reads)) if text != "(double)t")
+            " && ".join(f"{text} == {text}" for text in sorted(filter(None, reads)) if text != "(real)t")
             or "1"
         )
         sides = []
@@ -534,15 +534,6 @@ class _Tables:
         self.sizes[part] += count
         return self.sizes[part] - count
 
-    def text(self) -> Lines:
-        """C declarations of the tables."""
-        lines = []
-        for kind, name in TABLES.items():
-            rows: list[Row] = getattr(self, name) or [(0,)]
-            text = ",\n".join("  " + (_row(row) if kind != "int32_t" else str(row[0])) for row in rows)
-            lines.append(f"static const {kind} {name}[] = {{\n{text}\n}};")
-        return lines
-
 
 TABLES = {
     "node": "nodes",
@@ -553,10 +544,6 @@ TABLES = {
     "rule": "rules",
 }
 """C type of a row -> name of the table."""
-
-
-def _row(row: Row | Any) -> str:
-    return "{" + ", ".join(_row(each) if isinstance(each, tuple) else str(each) for each in row) + "}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -629,7 +616,7 @@ def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> S
     text = [
         f"#define X(i, q) x->x[(i) * {_ring(rows)} + ((q) & {_ring(rows) - 1})]",
         *(line for body in bodies for line in body),
-        "PREDICATES void predicates(int32_t g, const samples *x, at n, int mode, int clip, span *v) {",
+        "API void predicates(int32_t g, const samples *x, at n, int mode, int clip, span *v) {",
         "  switch (g) {",
         *calls,
         "  default: return;",
@@ -651,7 +638,7 @@ HEAD = """
 #include <stddef.h>
 #include <stdint.h>
 
-typedef double real;
+typedef REAL real;
 typedef int64_t at;
 #define INF ((real)INFINITY)
 #define MIN(a, b) ((b) < (a) ? (b) : (a)) /* a where it is NaN */
@@ -659,8 +646,8 @@ typedef int64_t at;
 #define LEAST(a, b) ((b) < (a) || (b) != (b) ? (b) : (a)) /* NaN where either is */
 #define MOST(a, b) ((b) > (a) || (b) != (b) ? (b) : (a))
 
-static inline double floored_mod(double a, double b) {
-  const double r = fmod(a, b); /* exact, unlike a - b * floor(a / b) where a / b rounds up */
-  return r != 0.0 && (r < 0.0) != (b < 0.0) ? r + b : r;
+static inline real floored_mod(real a, real b) {
+  const real r = (real)fmod(a, b); /* exact, unlike a - b * floor(a / b) where a / b rounds up */
+  return r != 0 && (r < 0) != (b < 0) ? r + b : r;
 }
 """

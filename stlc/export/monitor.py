@@ -1,0 +1,168 @@
+"""Export of the monitor of a specification as C99, also valid C++17: a header, a source file, an example.
+
+The code is that of `Monitor.online` (`stlc.compile.backends.c.streams`). It allocates nothing, has no global
+variables, and needs libm alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any, ClassVar
+
+from stlc.compile.backends.c.streams import TABLES, Streams, runtime, streams_of
+from stlc.compile.backends.numbers import Untranslatable
+from stlc.diagnostics import Diagnostic, UsageError
+from stlc.escape import c_comment, c_string
+from stlc.files import place, write_atomic
+from stlc.monitor.online.online import How, Online
+from stlc.monitor.verdict import Monitor
+
+_LIBM = "|".join(
+    (
+        *("sqrt", "sin", "cos", "tan", "asin", "acos", "atan2", "atan", "sinh", "cosh", "tanh", "exp"),
+        *("log10", "log2", "log", "pow", "fabs", "floor", "ceil", "rint", "fmod", "hypot"),
+    )
+)
+_ROW, _RULE, _HEAD = 24, 136, 128
+"""Bytes of a gap, of the verdicts of a requirement and of the head of a state, at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedMonitor:
+    """Result of the export of a monitor.
+
+    Attributes:
+        spec: name of the specification.
+        target: the form of the export.
+        folder: folder of the written files.
+        files: names of the files.
+        bytes: size of the state, at most.
+    """
+
+    JSON: ClassVar = "spec target folder files bytes"
+
+    spec: str
+    target: str
+    folder: Path
+    files: tuple[str, ...]
+    bytes: int
+
+
+def export_monitor(monitor: Monitor, folder: Path, *, single: bool = False) -> ExportedMonitor:
+    """Write the monitor of a specification as C.
+
+    Args:
+        monitor: the monitor.
+        folder: destination; existing files of the same names are replaced.
+        single: whether all numbers are `float`, for targets without doubles.
+
+    Raises:
+        UsageError: U101, a requirement has no transducers.
+    """
+    online = monitor.online(How())
+    rules = [each.streamed(online.signals) for each in online.asked]
+    for asked, rule in zip(online.asked, rules, strict=True):
+        if rule is None:
+            why = "it has a `freeze`, or a window to an end inside of another"
+            message = f"`{asked.rule.name}` has no form as C: {why}"
+            raise UsageError(Diagnostic("U101", message, asked.rule.span))
+    try:
+        program = streams_of([rule for rule in rules if rule is not None], online.signals, cut=False)
+    except Untranslatable as error:
+        raise UsageError(Diagnostic("U101", f"this specification has no form as C: {error}")) from error
+    texts, size = _texts(online, program, single=single)
+    for name, text in texts.items():
+        write_atomic(place(folder, name), text)
+    return ExportedMonitor(monitor.spec.source.name, "c", folder, tuple(texts), size)
+
+
+def _texts(online: Online, program: Streams, *, single: bool) -> tuple[dict[str, str], int]:
+    """Names and texts of the files, and the size of the state in bytes."""
+    name = re.sub(r"\W", "_", online.compiled.name, flags=re.ASCII).lower() or "stlc"
+    name = f"{name}_monitor" if name[0].isalpha() else f"m{name}_monitor"
+    sizes, real = program.sizes, 4 if single else 8
+    size = _HEAD + 8 * sizes["times"] + _ROW * sizes["signals"] + _RULE * sizes["judged"]
+    size += 2 * real * sizes["spans"] + real * sizes["signals"] * (sizes["rows"] + 1)
+    size += 4 * sizes["ints"] + sizes["truths"] + 7
+    starts = [
+        f"  stlc_init(m, {i}, {each.begin}, {int(each.everywhere)}, 0, (real){each.tolerance!r});"
+        for i, each in enumerate(online.asked)
+    ]
+    dt = online.compiled.grid.dt
+    values = {
+        "NAME": name,
+        "UPPER": name.upper(),
+        "SPEC": c_comment(online.compiled.name),
+        "DT": "unknown" if dt is None else f"{float(dt):.17g} s",
+        "REAL": "float" if single else "double",
+        "SIGNALS": len(online.signals),
+        "REQUIREMENTS": len(online.asked),
+        "WORDS": size // 8,
+        "SIGNAL_NAMES": ", ".join(map(c_string, online.signals)) or '""',
+        "REQUIREMENT_NAMES": ", ".join(c_string(each.rule.name) for each in online.asked),
+        "ABOUT": "\n".join(_about(online)),
+        "STARTS": "\n".join(starts),
+        "TYPES": runtime()[0],
+        "TABLES": "\n".join(_table(kind, rows) for kind, rows in program.tables.items()),
+        "PREDICATES": _single(program.predicates) if single else program.predicates,
+        "FUNCTIONS": runtime()[1],
+        "SIZES": ", ".join(str(sizes[part]) for part in _SIZES),
+    }
+    if single:
+        values["TYPES"] = _single(str(values["TYPES"]))
+    folder = files("stlc.export") / "templates"
+    texts = {}
+    for file, template in (
+        (f"{name}.h", "monitor.h"),
+        (f"{name}.c", "monitor.c"),
+        ("main.c", "monitor_main.c"),
+    ):
+        texts[file] = _Text((folder / f"{template}.txt").read_text(encoding="utf-8")).substitute(values)
+    return texts, size
+
+
+_SIZES = ("signals", "rows", "judged", "spans", "times", "ints", "truths")
+
+
+class _Text(Template):
+    delimiter = "@"
+
+
+def _about(online: Online) -> list[str]:
+    """Lines of a comment about signals and requirements."""
+    lines = ["   Signals, in the order of a sample:"]
+    units = {column.name: column.unit for column in online.compiled.signature.columns}
+    for i, each in enumerate(online.signals):
+        lines.append(f"     {i}  {c_comment(each)} {c_comment(str(units.get(each, '')))}".rstrip())
+    lines.append("   Requirements:")
+    for i, each in enumerate(online.asked):
+        where = "at every sample" if each.everywhere else f"at sample {each.begin}"
+        lines.append(f"     {i}  {c_comment(each.rule.name)}: {where}, known after {each.lag} samples more")
+    return lines
+
+
+def _table(name: str, rows: Sequence[Any]) -> str:
+    kind = next(kind for kind, each in TABLES.items() if each == name)
+    found = [_braced(row) if kind != "int32_t" else str(row[0]) for row in rows] or [_blank(kind)]
+    return "\n".join([f"static const {kind} {name}_[] = {{", *(f"  {row}," for row in found), "};"])
+
+
+def _blank(kind: str) -> str:
+    counts = {"node": 20, "operand": 2, "entry": 6, "graph": 11}
+    return "0" if kind == "int32_t" else "{" + ", ".join("0" * counts[kind]) + "}"
+
+
+def _braced(row: Any) -> str:
+    return "{" + ", ".join(_braced(each) if isinstance(each, tuple) else str(each) for each in row) + "}"
+
+
+def _single(text: str) -> str:
+    """C text with the functions and literals of `float`."""
+    text = re.sub(rf"\b({_LIBM})\(", r"\1f(", text.replace("const double", "const float"))
+    text = re.sub(r"(0x[0-9a-f.]+p[+-]?\d+)\)", r"\1f)", text)
+    return re.sub(r"\b(\d+\.\d+)\b(?!f)", r"\1f", text)
