@@ -137,8 +137,8 @@ def _about(online: Online) -> list[str]:
     """Lines of a comment about signals and requirements."""
     lines = ["   Signals, in the order of a sample:"]
     units = {column.name: column.unit for column in online.compiled.signature.columns}
-    for i, each in enumerate(online.signals):
-        lines.append(f"     {i}  {c_comment(each)} {c_comment(str(units.get(each, '')))}".rstrip())
+    for i, name in enumerate(online.signals):
+        lines.append(f"     {i}  {c_comment(name)} {c_comment(str(units.get(name, '')))}".rstrip())
     lines.append("   Requirements:")
     for i, each in enumerate(online.asked):
         where = "at every sample" if each.everywhere else f"at sample {each.begin}"

@@ -71,8 +71,8 @@ def export(
     states, the results of every export are compared with those of the run. Files of an earlier export are
     replaced, but a different `main.c` or `Makefile` is kept.
 
-    A file `SPEC.stl` with `--to c` is exported without a run: the monitor of streams in C99, with an example that
-    reads CSV.
+    A file `SPEC.stl` with `--to c` is exported without a run: the monitor of streams in C99, with an example
+    that reads CSV.
     """
     if to == "c" and run.endswith((".stl", ".stlc")):
         return _monitor(run, output or Path("export"), dt, system, parse_overrides(set_), single=single)

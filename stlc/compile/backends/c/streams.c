@@ -387,9 +387,9 @@ static int chained(const monitor *m, int32_t r, const node *o, at t) {
   const int left = o->count == 2 ? truth_at(m, m->t->nodes + in[0].node, t) : yes;
   const int right = truth_at(m, m->t->nodes + in[o->count - 1].node, t);
   const int near = o->kind == UNTIL ? truth_at(m, o, t + 1) : t ? truth_at(m, o, t - 1) : no;
-  const int unseen = o->kind == UNTIL && t >= m->s.known && (m->of[r].cut || o->flags & ENDLESS);
+  const int late = o->kind == UNTIL && t >= m->s.known && (m->of[r].cut || o->flags & ENDLESS);
   if (left == no || (right == no && near == no)) return no;
-  return left == yes && ((right == yes && !unseen) || near == yes) ? yes : 0;
+  return left == yes && ((right == yes && !late) || near == yes) ? yes : 0;
 }
 
 /* Make the truth of a node known at those of some instants at which it is not. */
@@ -497,13 +497,17 @@ static void begin(monitor *m, int32_t r, const graph *g) {
     const int truth = root->kind == TRUTH ? root->lo : m->truths[root->truth + (n & root->truth_mask)];
     if (truth) decide(m, r, n, truth);
   }
-  for (int32_t i = g->first; i < g->first + g->count; ++i) /* what was told of instants that had no room yet */
-    for (int32_t j = 0; m->t->nodes[i].kind == JOIN && j < m->t->nodes[i].count; ++j) {
-      const int32_t p = m->t->operands[m->t->nodes[i].operands + j].node;
-      const int no = m->t->nodes[i].flags & DUAL ? YES : NO;
-      const at top = n + m->t->nodes[i].ahead, when = since_when(m, m->t->nodes + p, no);
-      if (m->t->nodes[p].ahead > m->t->nodes[i].ahead && when && top + 1 >= when) react(m, r, i, p, top, top, no);
+  for (int32_t i = g->first + g->count - 1; i >= g->first; --i) { /* what was known of instants without room or samples */
+    const node *o = m->t->nodes + i;
+    const int truth = unseen(m, r, o) && o->ahead ? m->truths[o->truth + (n & o->truth_mask)] : 0;
+    for (int32_t k = 0; k < o->reading && truth; ++k) react(m, r, m->t->readers[o->readers + k], i, n, n, truth);
+    for (int32_t j = 0; o->kind == JOIN && j < o->count; ++j) {
+      const int32_t p = m->t->operands[o->operands + j].node;
+      const int no = o->flags & DUAL ? YES : NO;
+      const at top = n + o->ahead, when = since_when(m, m->t->nodes + p, no);
+      if (m->t->nodes[p].ahead > o->ahead && when && top + 1 >= when) react(m, r, i, p, top, top, no);
     }
+  }
   for (int32_t i = g->first; i < g->first + g->count; ++i) {
     const node *o = m->t->nodes + i;
     const node *part = m->t->nodes + m->t->operands[o->operands].node;
@@ -519,8 +523,6 @@ static void begin(monitor *m, int32_t r, const graph *g) {
     } else if (o->kind == BEGUN) {
       if (!cut && n >= o->lo && truth_at(m, part, n - o->lo)) mark(m, r, i, n - o->lo, n - o->lo, truth_at(m, part, n - o->lo));
     } else if (o->kind == UNTIL) {
-      const int truth = truth_at(m, o, n);
-      for (int32_t k = 0; k < o->reading && truth && unseen(m, r, o); ++k) react(m, r, m->t->readers[o->readers + k], i, n, n, truth);
       if (cut || o->flags & ENDLESS) mark(m, r, i, n, n, 0);
     } else if (cut && o->kind == SHIFT && o->lo > 0) {
       const int weak = o->flags & WEAK ? NO : YES;
