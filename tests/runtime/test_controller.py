@@ -81,6 +81,29 @@ def test_every_benchmark_decides_as_the_guard(spec: str, system: str, tmp_path: 
     assert "backup" in driven(run, folder, "paper", agents=2 if few else 4, steps=2 if few else 6)
 
 
+@pytest.mark.parametrize("made", [lambda: exported("traffic", "car"), mission])
+def test_a_loop_of_ones_own_calls_both_alike(made: Any) -> None:
+    run, folder = made()
+    system, names = run.task.plain, run.task.plain.names
+    x = system.sample(1, seed=3, dtype=torch.float64)[0].numpy()
+    first = run.task.system.with_added(torch.from_numpy(x)[None], torch.Generator().manual_seed(0))[0]
+    added = {k: float(v) for k, v in zip(run.task.names, first, strict=True) if k not in names}
+    mine, theirs = Controller.load(folder, "none", parameters=added), run.guard("none")
+    high = float(system.control_high.abs().max())
+    for step in range(6):
+        state: Any = dict(zip(names, x, strict=True)) if step % 2 else x
+        found, wanted = mine(state), theirs(state)
+        assert found.shape == wanted.shape == (len(system.control_names),)
+        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-6 * high)
+        x = system.step(torch.from_numpy(x)[None], torch.from_numpy(wanted)[None])[0].numpy()
+    assert theirs(np.stack([x])).shape == (1, len(wanted))
+    theirs.reset()
+    assert theirs.decision is None
+    for bad in (np.full(len(x), np.nan), x[:-1], np.zeros((2, 2, len(x)))):
+        with pytest.raises(RunError, match="R107"):
+            theirs(bad)
+
+
 def test_promises_are_gone_on_with_as_the_guard_does() -> None:
     run, folder = mission()
     assert run.task.pending_goals.items
