@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from stlc.assurance.verification.tubes import tube
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner import PlanResult, plan
-    from stlc.controller.training.launch import train_here as train
     from stlc.controller.training.run import Run
     from stlc.diagnostics import SpecError, StlcError
     from stlc.dynamics.model.system import System
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from stlc.monitor.judgement import RequirementVerdict, Verdict
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
+    from stlc.view.trained import train
 
     def compile(spec: ast.Spec, system: System) -> Task:
         """Compile a specification for a system; see `_CallablePackage.__call__`.
@@ -77,7 +77,7 @@ _HOMES = {
     "Verdict": "stlc.monitor.judgement:Verdict",
     "check": "stlc.monitor.check:check",
     "plan": "stlc.controller.search.planner:plan",
-    "train": "stlc.controller.training.launch:train_here",
+    "train": "stlc.view.trained:train",
     "tube": "stlc.assurance.verification.tubes:tube",
 }
 

@@ -12,7 +12,7 @@ from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.methods.plan import planner_of
 from stlc.controller.search.planner import prepared
 from stlc.controller.training.config import ENGINE_VERSION, ResolvedConfig, TrainConfig, resolve_config
-from stlc.controller.training.loop import prepare, run
+from stlc.controller.training.loop import Watch, prepare, run
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.diagnostics import usage
 from stlc.dynamics.robots.functions import function_files
@@ -120,6 +120,7 @@ def train_here(
     steps: int | None = None,
     seed: int | None = None,
     method: str | None = None,
+    watch: Watch | None = None,
     **options: Any,
 ) -> Run:
     """Train a policy in a new folder below `runs/` and return the run.
@@ -132,6 +133,7 @@ def train_here(
         seed: seed of all random numbers; None: that of the system file.
         method: name of the method, such as `guided` (search and distil) or `gradient` (Meng and Fan 2023);
             None: that of the system file.
+        watch: functions that are called during the training.
         options: further fields of `stlc.controller.training.config.TrainConfig`, such as `held_out` or
             `drives`.
 
@@ -145,7 +147,7 @@ def train_here(
         raise usage("a training has at least 1 step, and its seed is at least 0")
     config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed, **options)
     prepared = prepare(task, config)
-    return run(prepared, open_folder(task, config)).run
+    return run(prepared, open_folder(task, config), watch).run
 
 
 def open_planner(task: Task, choice: PlannerChoice, *, seed: int, launch: Launch) -> RunDir:
