@@ -81,14 +81,13 @@ class LiveMonitor:
                 "plan_rho": None if decision is None else float(decision.rho[row]),
                 "policy_rho": None if decision is None else float(decision.policy_rho[row]),
                 "plan_safe": None if decision is None else bool(decision.safe[row]),
-                "margins": {name: _margin(found, row) for name, found in margins.items()},
+                "margins": {
+                    name: {
+                        "status": found.status(row),
+                        "low": float(found.low[row]),
+                        "high": float(found.high[row]),
+                        "violated": int(found.violated[row]),
+                    }
+                    for name, found in margins.items()
+                },
             }
-
-
-def _margin(found: Margin, row: int) -> dict[str, Any]:
-    return {
-        "status": found.status(row),
-        "low": float(found.low[row]),
-        "high": float(found.high[row]),
-        "violated": int(found.violated[row]),
-    }

@@ -39,7 +39,9 @@ def blamed(world: object, method: str, what: str) -> Iterator[None]:
     except StlcError:
         raise
     except (Exception, SystemExit) as error:
-        place = _raised_at(error, _file_of(world)) or _defined_at(world, method)
+        file = getattr(sys.modules.get(_class_of(world).__module__), "__file__", None) or ""
+        lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
+        place = (_line(file, lines[-1]) if lines and lines[-1] else None) or _defined_at(world, method)
         note = f"{type(error).__name__}: {error}"
         finding = Diagnostic("S207", f"the world cannot {what}: {error}", place, "here", note=(note,))
         raise SystemFileError(finding) from error
@@ -55,7 +57,9 @@ def states_of(world: object, method: str, given: object, size: tuple[int, int]) 
         SystemFileError: S207, `given` is not a tensor or has another shape.
     """
     if not isinstance(given, torch.Tensor):
-        raise wrong(world, method, f"gives {_article(given)}, not a tensor of shape {size}")
+        name = type(given).__name__
+        what = "nothing" if given is None else f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
+        raise wrong(world, method, f"gives {what}, not a tensor of shape {size}")
     if given.shape != size:
         raise wrong(world, method, f"gives states of shape {tuple(given.shape)}, not {size}")
     with blamed(world, method, "give states"):
@@ -110,27 +114,11 @@ def _shapes(scene: Mapping[str, NDArray[Any]]) -> dict[str, tuple[int, ...]]:
     return {name: value.shape for name, value in scene.items()}
 
 
-def _article(given: object) -> str:
-    name = type(given).__name__
-    return "nothing" if given is None else f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
-
-
 # ----------------------------------------------------------------------- source locations
 
 
 def _class_of(world: object) -> type:
     return world if isinstance(world, type) else type(world)
-
-
-def _file_of(world: object) -> str:
-    module = sys.modules.get(_class_of(world).__module__)
-    return getattr(module, "__file__", None) or ""
-
-
-def _raised_at(error: BaseException, file: str) -> Span | None:
-    """Location of the innermost line of `file` in the traceback of an error; None if there is none."""
-    lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
-    return _line(file, lines[-1]) if lines and lines[-1] else None
 
 
 def _defined_at(world: object, method: str) -> Span | None:

@@ -52,24 +52,16 @@ def with_margins(
     """
     if not any(margin.values()):
         return task
-    safe = {
-        rule.name: _tightened(rule, _amount(margin.get(rule.name, 0.0), ramp.get(rule.name)))
-        for rule in task.compiled.safety
-    }
+    safe: dict[str, CompiledRequirement] = {}
+    for rule in task.compiled.safety:
+        less: ir.Num = ir.Const(margin.get(rule.name, 0.0))
+        if (steps := ramp.get(rule.name)) is not None:
+            share = multiply(ir.Signal(ir.ELAPSED), ir.Const(1.0 / steps))
+            less = multiply(less, ir.Op("min", (share, ir.Const(1.0))))
+        formula, lowered = tightened(rule.formula, less), tightened(rule.lowered, less)
+        safe[rule.name] = replace(rule, formula=formula, lowered=lowered)
     rules = tuple(safe.get(rule.name, rule) for rule in task.rules)
     return Task(replace(task.compiled, requirements=rules), task.plain)
-
-
-def _amount(margin: float, steps: float | None) -> ir.Num:
-    """Margin at a sample of a plan; it grows for `steps` steps unless this is None."""
-    if steps is None:
-        return ir.Const(margin)
-    share = multiply(ir.Signal(ir.ELAPSED), ir.Const(1.0 / steps))
-    return multiply(ir.Const(margin), ir.Op("min", (share, ir.Const(1.0))))
-
-
-def _tightened(rule: CompiledRequirement, margin: ir.Num) -> CompiledRequirement:
-    return replace(rule, formula=tightened(rule.formula, margin), lowered=tightened(rule.lowered, margin))
 
 
 def tightened(formula: ir.Formula, margin: ir.Num) -> ir.Formula:
@@ -78,13 +70,11 @@ def tightened(formula: ir.Formula, margin: ir.Num) -> ir.Formula:
     If `margin` is a constant, so is the difference of the robustness of the formulas, for every trajectory.
     """
     if isinstance(formula, ir.Predicate):
-        less = add(formula.num, _signed(margin, -formula.sign))
-        return formula if formula.guard else replace(formula, num=less)
+        less: ir.Num = multiply(ir.Const(float(-formula.sign)), margin)
+        if isinstance(margin, ir.Const):
+            less = ir.Const(-formula.sign * margin.value)
+        return formula if formula.guard else replace(formula, num=add(formula.num, less))
     return map_children(formula, formulas=lambda part: tightened(part, margin))
-
-
-def _signed(num: ir.Num, sign: int) -> ir.Num:
-    return ir.Const(sign * num.value) if isinstance(num, ir.Const) else multiply(ir.Const(float(sign)), num)
 
 
 SHARE = 0.99
