@@ -77,6 +77,31 @@ class String:
     data: str = ""
 
 
+@dataclass
+class KeyValue:
+    """`diagnostic_msgs/KeyValue`."""
+
+    key: str = ""
+    value: str = ""
+
+
+@dataclass
+class DiagnosticStatus:
+    """`diagnostic_msgs/DiagnosticStatus`."""
+
+    level: bytes = b"\x00"
+    name: str = ""
+    message: str = ""
+    values: list[KeyValue] = field(default_factory=list)
+
+
+@dataclass
+class DiagnosticArray:
+    """`diagnostic_msgs/DiagnosticArray`."""
+
+    status: list[DiagnosticStatus] = field(default_factory=list)
+
+
 class Bus:
     """Topics, timers and simulated time, for all nodes of a process."""
 

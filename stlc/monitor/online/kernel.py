@@ -87,15 +87,11 @@ class StreamKernel:
         program: tables of the monitor.
         predicates: library of its predicates.
         watching: settings.
-
-    Attributes:
-        samples: number of samples received.
     """
 
     def __init__(
         self, library: ctypes.CDLL, program: Streams, predicates: ctypes.CDLL, watching: Watching
     ) -> None:
-        self.samples = 0
         self._library, self._watching, self._predicates = library, watching, predicates
         self._arrays = {name: np.array(_flat(rows) or [0], np.int32) for name, rows in program.tables.items()}
         places = {name: array.ctypes.data for name, array in self._arrays.items()}
@@ -113,6 +109,11 @@ class StreamKernel:
         self._arguments = (ctypes.c_void_p(self._at), ctypes.cast(self._row, ctypes.c_void_p))
         for rule, start in enumerate(watching.starts):
             library.stlc_init(self._at, rule, *start, watching.cut, watching.tolerance)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples received."""
+        return int(self._state[1:2].view(np.int64)[0])  # `s.known`, after a pointer
 
     @staticmethod
     def of(rules: Sequence[Rule], signals: Sequence[str], watching: Watching) -> StreamKernel | None:
@@ -134,7 +135,6 @@ class StreamKernel:
     def push(self, row: Any) -> int:
         """Take a sample, one number per signal; return how many starts it decides."""
         self._row[:] = row
-        self.samples += 1
         return self._step(*self._arguments)  # type: ignore[no-any-return]
 
     def push_block(self, rows: Floats, *, pause: bool = False) -> tuple[int, int]:
@@ -146,7 +146,6 @@ class StreamKernel:
         rows, taken = np.ascontiguousarray(rows, dtype=np.float64), ctypes.c_int64()
         place = ctypes.addressof(taken)
         decided = self._library.stlc_block(self._at, rows.ctypes.data, len(rows), pause, place)
-        self.samples += taken.value
         return decided, taken.value
 
     def news(self, rule: int) -> dict[int, Status]:

@@ -34,6 +34,7 @@ Sample: TypeAlias = Mapping[str, Any]
 """Signal -> number; a vector is a list of them."""
 
 _BEYOND_FLOATS = 1 << 1023
+_ROWS = frozenset((list, tuple))
 _LATE = 4096
 """Samples that are moved to the buffer of reasons at once."""
 
@@ -359,11 +360,11 @@ class Online:
         Raises:
             TraceError: E601, a signal is missing; E605, the sample is not one number per signal.
         """
-        row = self._row(sample) if isinstance(sample, Mapping) else sample
         try:
-            if self._plain:
-                return self._kernel.push(row)  # type: ignore[union-attr]
-            return self._pushed(row)
+            row: Any = sample
+            if type(sample) not in _ROWS and isinstance(sample, Mapping):
+                row = self._row(sample)
+            return self._kernel.push(row) if self._plain else self._pushed(row)  # type: ignore[union-attr]
         except (TypeError, ValueError, OverflowError):
             pass
         if isinstance(sample, Mapping):

@@ -1,0 +1,51 @@
+"""The monitor node runs without ROS, in simulated time: verdicts with causes on /diagnostics."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+import pytest
+from helpers.exported import ROOT
+
+from stlc import Monitor
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    monkeypatch.delitem(sys.modules, "ros2_monitor", raising=False)
+    monkeypatch.delitem(sys.modules, "ros2_standins", raising=False)
+    return __import__("ros2_monitor")
+
+
+def test_verdicts_come_on_diagnostics(example: ModuleType) -> None:
+    from ros2_standins import Odometry
+
+    monitor = Monitor(
+        "signal v [m/s]\nrequire slow: always v < 2 m/s\nrequire moves: eventually[0, 1 s] v > 0.5 m/s"
+    )
+    node = example.MonitorNode(monitor, 0.1, {"v": "/odom:twist.twist.linear.x"}, {"/odom": Odometry})
+    told = []
+    node.create_subscription(example.DiagnosticArray, "/diagnostics", told.append, 10)
+    odometry, speeds = node.create_publisher(Odometry, "/odom", 1), iter([0.0] * 5 + [1.0] * 5 + [3.0] * 100)
+
+    def measured() -> None:
+        message = Odometry()
+        message.twist.twist.linear.x = next(speeds)
+        odometry.publish(message)
+
+    node.create_timer(0.1, measured)
+    example.Node.bus.spin(2.0)
+    found = {status.name: status for array in told for status in array.status}
+    assert {name: status.level for name, status in found.items()} == {
+        "stlc: slow": b"\x02",
+        "stlc: moves": b"\x00",
+    }
+    assert "v = 3 m/s" in found["stlc: slow"].message
+    assert found["stlc: moves"].values[0].value == "0 s"
+
+
+def test_every_signal_needs_a_topic(example: ModuleType) -> None:
+    with pytest.raises(SystemExit, match="no topic for the signals v"):
+        example.MonitorNode(Monitor("signal v\nrequire r: v > 0"), 0.1, {}, {})
