@@ -17,6 +17,7 @@ RUN = "runs/small/0001-seed"
 _TRAIN = "train a.stl --system b.yaml --steps 6 --batch 8 --held-out 10 --no-pictures --name seed"
 _DRIVE = "simulate --backup --seeds 0 --steps 4 --agents 2 --no-pictures"
 _CERTIFY = "certify latest --drives 4 --steps 2 --agents 2"
+_FALSIFY = "falsify latest --agents 1 --steps 3 --simulations 8 --batch 4 --out found"
 
 COMMANDS = (
     *("runs show latest", "runs show latest --json", "runs list", "runs list --json", "runs diff latest 1"),
@@ -26,8 +27,11 @@ COMMANDS = (
         "simulate --seeds 0 --steps 2 --agents 2 --no-pictures",
         "train --resume latest --steps 6 --no-pictures",
     ),
+    *("report latest", "export latest --to c -o out"),
+    *("certify --verify {run}/eval/certificate.json", "certify --verify {run}/eval/certificate.json --json"),
+    *(_CERTIFY, _FALSIFY, "verify latest --budget 1s"),
 )
-"""Commands that read a run; simulation and resumption are repeated, as they read checkpoints."""
+"""Commands that read a run; those that read checkpoints are repeated."""
 
 
 @cache
@@ -107,6 +111,12 @@ _ODD = (
     0,
     1e308,
     10**30,
+    float("inf"),
+    float("-inf"),
+    float("nan"),
+    "inf",
+    2**63,
+    0.5,
     "",
     "x" * 300,
     "../../x",
