@@ -32,6 +32,11 @@ def bare(wheel, tmp_path_factory) -> Installed:
     return install(wheel, tmp_path_factory.mktemp("bare") / "env")
 
 
+@pytest.fixture(scope="module")
+def training(wheel, tmp_path_factory) -> Installed:
+    return install(wheel, tmp_path_factory.mktemp("training") / "env", "train")
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
@@ -124,8 +129,8 @@ THREE = (
 
 
 @pytest.mark.apart
-def test_the_three_commands_from_an_empty_folder(bare, folder):
-    train, simulate, check, doctor = bare.run(folder, *THREE)
+def test_the_three_commands_from_an_empty_folder(training, folder):
+    train, simulate, check, doctor = training.run(folder, *THREE)
     assert train.code == 0, train.err
     assert simulate.code == 0, simulate.err
     assert check.code in (0, 1, 4), check.err
@@ -266,7 +271,7 @@ def test_an_extra_of_the_library(extra, wheel, folder):
     without = ready.python(folder, PROGRAMS[extra])
     assert without.code == 1
     assert "is not installed" in without.err, without.err
-    with_it = install(wheel, folder / "env", extra).python(folder, PROGRAMS[extra])
+    with_it = install(wheel, folder / "env", extra, "train").python(folder, PROGRAMS[extra])
     assert with_it.code == 0, with_it.err
 
 
@@ -280,18 +285,19 @@ COMMANDS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("extra", COMMANDS)
-def test_an_extra_of_a_training(extra, wheel, bare, folder):
+def test_an_extra_of_a_training(extra, wheel, training, folder):
     lines = COMMANDS[extra]
-    without = bare.run(folder, *lines)[-1]
+    without = training.run(folder, *lines)[-1]
     assert without.code == 5, without
     assert f"stlc[{extra}]" in without.out + without.err
-    for said in install(wheel, folder / "env", extra).run(folder, *lines):
+    for said in install(wheel, folder / "env", extra, "train").run(folder, *lines):
         assert said.code == 0, said
 
 
 def test_every_extra_is_tried():
     extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
-    assert extras == {*QUICK, *PROGRAMS, *COMMANDS, "lsp", "peers", "cluster", "docs", "bench", "all", "dev"}
+    others = {"train", "lsp", "peers", "cluster", "docs", "bench", "all", "dev"}  # train: tests/test_light.py
+    assert extras == {*QUICK, *PROGRAMS, *COMMANDS} | others
 
 
 @pytest.mark.slow
@@ -299,7 +305,7 @@ def test_a_real_installation(wheel, folder):
     """Installation of the wheel by `pip install`, the base dependencies taken from the package index."""
     subprocess.run([sys.executable, "-m", "venv", "env"], check=True)
     pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt")]
-    subprocess.run([*pip, str(wheel)], check=True)
+    subprocess.run([*pip, f"{wheel}[train]"], check=True)
     train, simulate, check, _ = Installed(folder / "env").run(folder, *THREE)
     assert (train.code, simulate.code) == (0, 0)
     assert check.code in (0, 1, 4)
