@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from stlc.monitor.judgement import RequirementVerdict, Verdict
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
+    from stlc.view.plotted import plot
     from stlc.view.trained import train
 
     def compile(spec: ast.Spec, system: System) -> Task:
@@ -60,6 +61,7 @@ __all__ = [
     "load",
     "parse",
     "plan",
+    "plot",
     "train",
     "tube",
 ]
@@ -77,6 +79,7 @@ _HOMES = {
     "Verdict": "stlc.monitor.judgement:Verdict",
     "check": "stlc.monitor.check:check",
     "plan": "stlc.controller.search.planner:plan",
+    "plot": "stlc.view.plotted:plot",
     "train": "stlc.view.trained:train",
     "tube": "stlc.assurance.verification.tubes:tube",
 }

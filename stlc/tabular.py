@@ -9,17 +9,19 @@ from typing import Any
 from stlc.escape import html
 from stlc.extras import not_installed
 
+_RED = ' style="color:#c0261c"'
+
 
 def html_table(
     title: str, header: Sequence[str], rows: Sequence[Sequence[str]], marked: Sequence[bool]
 ) -> str:
     """Return a table as HTML for a notebook; all texts are escaped, and `marked` rows are red."""
-    left, red = ' style="text-align:left"', ' style="color:#c0261c"'
+    left = ' style="text-align:left"'
 
     def line(cells: Sequence[str], tag: str, style: str = "") -> str:
         return f"<tr{style}>{''.join(f'<{tag}{left}>{html(each)}</{tag}>' for each in cells)}</tr>"
 
-    lines = [line(row, "td", red if bad else "") for row, bad in zip(rows, marked, strict=True)]
+    lines = [line(row, "td", _RED if bad else "") for row, bad in zip(rows, marked, strict=True)]
     return f"<table><caption>{html(title)}</caption>{line(header, 'th')}{''.join(lines)}</table>"
 
 

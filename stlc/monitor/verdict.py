@@ -217,10 +217,7 @@ class Monitor:
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
         """Robustness of each requirement by name, without weight and scale; arguments as of `robustness`."""
-        ready = self._prepare(signals, ()).under(semantics_of(semantics))
-        shaped = ready.signals.like_given if at is None else ready.signals.at_one
-        rows = _rows(ready, end, at)
-        return {rule.name: shaped(row) for rule, row in zip(ready.rules, rows, strict=True)}
+        return robustness_signals(self._prepare(signals, ()).under(semantics_of(semantics)), end, at)
 
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
         """Least and greatest `robustness` over all continuations of the signals, in the same shape."""
@@ -320,6 +317,13 @@ def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequireme
     if not compiled.requirements:
         raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
     return chosen(compiled.requirements, names)
+
+
+def robustness_signals(ready: Prepared, end: Boundary = "strict", at: int | None = None) -> dict[str, Array]:
+    """Robustness of each requirement by name, at every sample or at one, in the shape of the signals."""
+    shaped = ready.signals.like_given if at is None else ready.signals.at_one
+    rows = zip(ready.rules, _rows(ready, end, at), strict=True)
+    return {rule.name: shaped(row) for rule, row in rows}
 
 
 def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:

@@ -16,10 +16,11 @@ from stlc.trace import Trace
 from stlc.view.contents import RunContents, untagged
 from stlc.view.deployment import WINDOWS
 from stlc.view.html import Child, Html, Section, classed, el, figure, join, table, with_code
+from stlc.view.plotted import picture_of
 from stlc.view.region_map import draw_map
 from stlc.view.run_animation import map_of_drives
-from stlc.view.signals import DECISIONS, POLICY, acted_in, choose_traces, draw_signals, left_out
-from stlc.view.verdicts import judged_at_start, margins_of, marks_of, monitor_of, trace_names, units_of
+from stlc.view.signals import DECISIONS, POLICY, acted_in, left_out
+from stlc.view.verdicts import judged_at_start, monitor_of, trace_names
 from stlc.view.words import count, share
 
 TITLE = "Recorded drives"
@@ -42,19 +43,15 @@ def recorded_section(contents: RunContents) -> Section | None:
     try:
         monitor = _monitor(contents, trace, drives=True)
         verdict = monitor.check(trace)
-        margins = margins_of(monitor, verdict, trace)
+        picture = picture_of(verdict, trace)
     except StlcError as error:
         return Section("driven", TITLE, el("p", f"The trace could not be judged: {_messages(error)}."))
     names = trace_names(trace)
-    causes = verdict.causes
-    robustness = np.atleast_1d(np.asarray(verdict.robustness, dtype=float))
-    choices = choose_traces(robustness, names, acted_in(trace))
-    picture = draw_signals(trace, margins, choices, units_of(verdict), marks_of(verdict, trace))
     body = join(
         el("p", _summary(verdict, "" if trace.meta.judge_text else " at every instant")),
         _verdict_table(verdict, names),
         figure(picture.data_uri(), picture.alt, _caption(trace, judged_at_start(verdict))),
-        causes_of(causes, names, monitor.spec),
+        causes_of(verdict.causes, names, monitor.spec),
         _windows_part(contents, trace, names),
     )
     return Section("driven", TITLE, body, picture)
@@ -69,7 +66,6 @@ def _windows_part(contents: RunContents, trace: Trace, names: list[str]) -> Html
         verdict = monitor.check(trace)
     except StlcError as error:
         return el("p", f"The planning windows could not be judged: {_messages(error)}.")
-    causes = verdict.causes
     return el(
         "details",
         el("summary", WINDOWS),
@@ -80,7 +76,7 @@ def _windows_part(contents: RunContents, trace: Trace, names: list[str]) -> Html
             ".",
         ),
         _verdict_table(verdict, names),
-        causes_of(causes, names, monitor.spec),
+        causes_of(verdict.causes, names, monitor.spec),
     )
 
 

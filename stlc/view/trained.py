@@ -33,8 +33,8 @@ def train(task: Task, *, progress: bool = True, **options: Any) -> Run:
         shown = bar.add_task(task.compiled.name, total=1.0, told="")
 
         def row(found: dict[str, Any]) -> None:
-            told = f"{found['accuracy']:.3f} of plans satisfy it" if "accuracy" in found else ""
-            bar.update(shown, completed=found.get("step", 0) / max(found.get("steps", 1), 1), told=told)
+            told = f"{found.get('accuracy', 0.0):.3f} of plans satisfy it"
+            bar.update(shown, completed=found["step"] / max(found["steps"], 1), told=told)
 
         watch = Watch(row=row, evaluating=lambda text: bar.update(shown, told=text))
         return train_here(task, watch=watch, **options)

@@ -19,7 +19,7 @@ from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.explain.report import violations
 from stlc.monitor.judgement import RequirementVerdict, Verdict
-from stlc.monitor.verdict import Monitor
+from stlc.monitor.verdict import Monitor, robustness_signals
 from stlc.source import Source
 from stlc.trace import Trace
 from stlc.view.signals import Deciding, Marks, Strip
@@ -57,14 +57,14 @@ def monitor_of(
     return Monitor(spec, system=system if outside else None, overrides=carried.overrides)
 
 
-def margins_of(monitor: Monitor, verdict: Verdict, trace: Trace) -> dict[str, Floats]:
+def margins_of(verdict: Verdict) -> dict[str, Floats]:
     """Robustness of each requirement at each sample, (traces, samples); NaN where undefined.
 
     A requirement is evaluated from each sample on. One that is judged once, over the whole trace, and demands
     something at all times (`always p`) has at each sample the robustness of what it demands there: its least
     value is that of the requirement. Another one that is judged once has the same value at every sample.
     """
-    found = monitor.requirement_robustness(trace)
+    found = robustness_signals(verdict.subject)
     rows = {judgement.name: np.atleast_2d(found[judgement.name]) for judgement in verdict}
     for judgement in _judged_once(verdict):
         whole = np.repeat(judgement.least[:, None], rows[judgement.name].shape[1], 1)
@@ -180,12 +180,10 @@ class SceneVerdicts:
 
     Attributes:
         trace: recorded traces of these agents.
-        monitor: monitor of the specification for drives; of that of the plans if the trace stores no other.
-        verdict: verdict of that monitor.
+        verdict: verdict by the specification for drives; by that of the plans if the trace stores no other.
     """
 
     trace: Trace
-    monitor: Monitor
     verdict: Verdict
 
     @property
@@ -208,8 +206,7 @@ def judge_agents(trace: Trace, agents: int, *, system: Source | None) -> SceneVe
     """
     data = {name: values[:agents] for name, values in trace.data.items()}
     first = replace(trace, data=data, extras={})
-    monitor = monitor_of(trace, system=system, drives=True)
-    return SceneVerdicts(first, monitor, monitor.check(first))
+    return SceneVerdicts(first, monitor_of(trace, system=system, drives=True).check(first))
 
 
 def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Strip:
@@ -219,7 +216,7 @@ def strip_of(judged: SceneVerdicts, decisions: NDArray[np.int64] | None) -> Stri
         judged: verdicts on the agents.
         decisions: source of each decision, (frames, agents); None if not recorded.
     """
-    rows = margins_of(judged.monitor, judged.verdict, judged.trace)
+    rows = margins_of(judged.verdict)
     margins = {name: least(rho) for name, rho in rows.items()}
     return Strip(judged.trace.times, margins, decisions, units_of(judged.verdict))
 

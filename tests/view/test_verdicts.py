@@ -51,7 +51,7 @@ def test_a_strip_is_red_where_what_is_demanded_at_all_times_fails(rows):
     meta = TraceMeta(spec_text=TEXT, judge_text=RULES, horizon=3, dt=0.5)
     trace = Trace(Signature((Column("x"),)), 0.5, {"x": np.array(rows)}, meta=meta)
     judged = judge_agents(trace, len(rows), system=Path("none.yaml"))
-    found = margins_of(judged.monitor, judged.verdict, trace)
+    found = margins_of(judged.verdict)
     np.testing.assert_allclose(found["low"], 2 - trace.data["x"])
     assert judged_at_start(judged.verdict) == ["ends"]
     for judgement in judged.verdict:
@@ -97,7 +97,7 @@ def test_what_is_judged_once_is_shown_as_it_was_judged():
     trace = Trace(Signature((Column("x"),)), 0.1, {"x": x}, meta=meta)
     monitor = monitor_of(trace)
     verdict = monitor.check(trace)
-    found = margins_of(monitor, verdict, trace)
+    found = margins_of(verdict)
     assert judged_at_start(verdict) == ["once_only", "clock"]
     np.testing.assert_allclose(found["plan"], [[1, -4, -4, -4, np.nan, np.nan], [7] * 4 + [np.nan] * 2])
     np.testing.assert_allclose(found["once_only"], [[1] * 6, [7] * 6])  # not -4: nobody asks at 0.1 s

@@ -77,7 +77,7 @@ def plot(
         picture = _map(monitor, _one(recorded, trace), reading.require or [], own=own)
     else:
         verdict = monitor.check(recorded, require=reading.require or [])
-        margins, units = margins_of(monitor, verdict, recorded), units_of(verdict)
+        margins, units = margins_of(verdict), units_of(verdict)
         choices = _choices(recorded, margins, trace, path.name)
         drawn = _as_declared(recorded, monitor.spec)
         marks = marks_of(verdict, drawn)

@@ -60,6 +60,3 @@ class GuardedLoop:
         self.decision, self._added = self.guard.decide(states, before), system.added_later(states)
         found: NDArray[np.float64] = system.commanded(states, self.decision.action).numpy()
         return found[0] if given.ndim == 1 else found
-
-    def __repr__(self) -> str:
-        return f"GuardedLoop({self.guard.kind.name} on {self.guard.task!r})"

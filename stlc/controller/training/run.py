@@ -91,16 +91,15 @@ class Run:
     def __repr__(self) -> str:
         name = f"{self.dir.path.parent.name}/{self.dir.name}"
         result = self.dir.record().get("result") or {}
-        share, count = result.get("accuracy"), result.get("held_out") or 0
-        told = self.dir.status if share is None else f"{share:.3f} of {count:,} held-out starts"
+        share = result.get("accuracy")
+        told = self.dir.status if share is None else f"{share:.3f} of {result['held_out']:,} held-out starts"
         return f"Run({name}: {told})"
 
-    def guard(self, name: str = GUARDS.default, *, seed: int = 0) -> GuardedLoop:
+    def guard(self, name: str = GUARDS.default) -> GuardedLoop:
         """Return a guard for a loop of one's own, which is called with a state at each step, in NumPy.
 
         Args:
             name: name of the guard, such as "paper" or "none".
-            seed: seed of the parameters of the specification, if it has any.
 
         Raises:
             UsageError: U101, there is no such guard, or the task lacks what it needs.
@@ -108,7 +107,7 @@ class Run:
         from stlc.controller.guard.guard import Guard
         from stlc.controller.guard.loop import GuardedLoop
 
-        return GuardedLoop(Guard(self.task, self.policy, name), seed)
+        return GuardedLoop(Guard(self.task, self.policy, name))
 
     @property
     def network(self) -> PlanProposer:

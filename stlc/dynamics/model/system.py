@@ -77,8 +77,8 @@ class System:
     @property
     def facts(self) -> str:
         """Name and size in words: `car: 7 states, 1 control, 25 steps of 0.1 s`."""
-        sizes = ((len(self.names), "state"), (len(self.control_names), "control"))
-        counts = ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for count, noun in sizes)
+        sizes = {"state": len(self.names), "control": len(self.control_names)}
+        counts = ", ".join(f"{count} {noun}{'s'[: count != 1]}" for noun, count in sizes.items())
         return f"{self.decl.name}: {counts}, {self.horizon} steps of {self.dt:g} s"
 
     def __repr__(self) -> str:

@@ -67,7 +67,7 @@ def test_what_is_violated_is_never_an_empty_panel(tmp_path, capsys):
     monitor = Monitor(PLANNED, dt=1, horizon=2)
     verdict = monitor.check(trace)
     assert verdict["low"].status == ["violated"]
-    found = margins_of(monitor, verdict, trace)
+    found = margins_of(verdict)
     demanded = [[-0.5, -0.4, -0.3, *[np.nan] * 3]]  # at each sample whose window is whole
     np.testing.assert_allclose(found["low"], demanded, atol=1e-9)
     np.testing.assert_allclose(found["plan"], [[1.5, 1.6, 1.7, 1.8, np.nan, np.nan]])
