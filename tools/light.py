@@ -21,7 +21,8 @@ WITHOUT_TORCH = (
     *("tests/cli/test_compile.py", "tests/cli/test_bad_input.py", "tests/monitor/facts", "tests/runtime"),
 )
 PORTABLE = (
-    *("tests/test_light.py", "tests/cli/check", "tests/cli/test_commands.py", "tests/lint/test_lint.py"),
+    *("tests/test_light.py", "tests/cli/check/test_check.py", "tests/cli/check/test_recordings.py"),
+    *("tests/cli/check/test_uncertain.py", "tests/cli/test_commands.py", "tests/lint/test_lint.py"),
     *("tests/plants/test_plant.py", "tests/cli/simulate/test_plant.py", "tests/grammar/test_format.py"),
     *("tests/assurance/test_plant_simulator.py", "tests/monitor/online/test_online.py"),
 )
