@@ -45,7 +45,7 @@ def install():
 
 def check(tests, path=""):
     """Run tests in the environment, with another folder on the path of every Python. Exits on failure."""
-    options = ["-q", "-n", "2", "--dist", "loadfile", "-p", "no:cacheprovider"]
+    options = ["-q", "-n", "2", "--dist", "loadfile", "-p", "no:cacheprovider", "-k", "not memory"]
     command = [str(PYTHON), "-m", "pytest", *options, *tests]
     variables = {**os.environ, "PYTHONPATH": path}
     if code := subprocess.call(command, cwd=str(environment.ROOT), env=variables):
