@@ -231,8 +231,10 @@ class Signals:
         return flat if self.shape or self.ops is not NUMPY else np.float64(flat)
 
 
-def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False) -> Signals:
-    """Convert the signals that requirements need to arrays (time, batch).
+def arrange(
+    given: Given | Trace, needs: Sequence[Need], *, plain: bool = False, stop: int | None = None
+) -> Signals:
+    """Convert the signals that requirements need to arrays (time, batch), or their first `stop` samples.
 
     NaN is an unknown value. NumPy arrays and lists become float64. Torch tensors keep dtype, device and
     gradients; if `plain`, they become NumPy arrays.
@@ -258,6 +260,8 @@ def arrange(given: Given | Trace, needs: Sequence[Need], *, plain: bool = False)
         found |= {key: found[key].detach().cpu().numpy() for key in tensors}
         tensors = []
     shape, samples = _common_shape(found, name)
+    if stop is not None and stop < samples:
+        found, samples = {key: x[..., :stop] if x.ndim else x for key, x in found.items()}, stop
     if tensors:
         from stlc.compile.backends.torch.ops import TORCH
 

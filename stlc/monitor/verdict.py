@@ -13,7 +13,7 @@ import numpy as np
 
 from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir.discretize import Grid, lacks
-from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.support import columns_of, farthest
 from stlc.compile.ir.traverse import numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.schedule.schedule import Boundary
@@ -206,7 +206,7 @@ class Monitor:
         Returns:
             An array of the shape of the signals; with `at`, of that shape without the time axis.
         """
-        return _least(self._prepare(signals, ()).under(semantics_of(semantics, smoothing)), end, at)
+        return _least(self._prepare(signals, (), at=at).under(semantics_of(semantics, smoothing)), end, at)
 
     def requirement_robustness(
         self,
@@ -217,11 +217,12 @@ class Monitor:
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
         """Robustness of each requirement by name, without weight and scale; arguments as of `robustness`."""
-        return robustness_signals(self._prepare(signals, ()).under(semantics_of(semantics)), end, at)
+        ready = self._prepare(signals, (), at=at).under(semantics_of(semantics))
+        return robustness_signals(ready, end, at)
 
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
         """Least and greatest `robustness` over all continuations of the signals, in the same shape."""
-        ready = self._prepare(signals, ())
+        ready = self._prepare(signals, (), at=at)
         return _least(ready, "lower", at), _least(ready, "upper", at)
 
     def online(
@@ -251,7 +252,9 @@ class Monitor:
         compiled = self._ready(recorded)
         return Online(compiled, _chosen(compiled, require), how)
 
-    def _prepare(self, subject: Subject, require: Sequence[str], *, plain: bool = False) -> Prepared:
+    def _prepare(
+        self, subject: Subject, require: Sequence[str], *, plain: bool = False, at: int | None = None
+    ) -> Prepared:
         given, recorded = subject, Times()
         if not isinstance(given, Trace):
             reading = reading_of(self.spec, read=self.reads(require))
@@ -272,7 +275,10 @@ class Monitor:
         key = (compiled.grid, tuple(rule.name for rule in rules), plain)
         if key not in self._needs:
             self._needs[key] = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
-        signals = arrange(given, self._needs[key], plain=plain)
+        stop = (
+            None if at is None or isinstance(given, Trace) else _read_until(rules, at, compiled.grid.horizon)
+        )
+        signals = arrange(given, self._needs[key], plain=plain, stop=stop)
         record = Record.of(signals.env, signals.ops, signals.cells)
         return Prepared(compiled, rules, signals, record, cause_of, facts_of)
 
@@ -310,6 +316,14 @@ class Monitor:
         if grid not in self._compiled:
             self._compiled[grid] = compile_resolved(self.resolved, grid, "check")
         return self._compiled[grid]
+
+
+def _read_until(rules: Sequence[CompiledRequirement], at: int, horizon: int | None) -> int | None:
+    """Number of samples that decide the value of requirements at sample `at`; None if all of them may."""
+    if at < 0 or any(rule.uses_end and window_of(rule, horizon) is None for rule in rules):
+        return None
+    later = [farthest(num).future for rule in rules for num in numbers(rule.formula)]
+    return at + 1 + max(rule.reach for rule in rules) + max(later, default=0) + (horizon or 0)
 
 
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:

@@ -533,3 +533,18 @@ def test_no_continuation_leaves_the_bounds(formula: str, semantics: str) -> None
         low, high = monitor.check(cut, semantics=semantics).requirements[0].margins
         assert (low[0] <= whole + 1e-9).all()
         assert (whole <= high[0] + 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    "formula",
+    ["always[0, 5 s] x > 0", "next(x > 0)", "always (x > -9)", "once x > 2", "always@[2 s, 9 s] x > -1"],
+)
+@pytest.mark.parametrize("at", [0, 20, 38])
+def test_a_value_at_one_sample_is_that_of_the_whole_signal(formula: str, at: int) -> None:
+    monitor = Monitor(f"signal x\nrequire r: {formula}", dt=1.0)
+    signals = {"x": np.random.default_rng(0).normal(size=40)}
+    for end in ("strict", "truncate"):
+        whole = monitor.robustness(signals, end=end)
+        np.testing.assert_array_equal(monitor.robustness(signals, end=end, at=at), whole[at])
+    low, high = monitor.bounds(signals)
+    assert monitor.bounds(signals, at=at) == (low[at], high[at])
