@@ -234,17 +234,17 @@ class Graph:
         for arg in node.args:
             self._skeleton(arg, later)
 
-    def _offsets(self, node: Node) -> list[tuple[int, int]]:
-        """Least and greatest instant, relative to now, at which a node reads each operand."""
+    def _earliest(self, node: Node) -> int:
+        """Least instant, relative to now, at which a node reads its operands."""
         match node.form:
-            case ir.Temporal(window=ir.Window(lo, hi)):
-                return [(lo, hi or 0)]
-            case ir.PastTemporal(window=ir.Window(lo, hi)):
-                return [(-(hi or 0), -lo)]
+            case ir.Temporal(window=window):
+                return window.lo
+            case ir.PastTemporal(window=window):
+                return -(window.hi or 0)
             case ir.Shift(steps) if not isinstance(node.form, Begun):
-                return [(steps, steps)]
+                return steps
             case _:
-                return [(0, 0)] * len(node.args)
+                return 0
 
     def _sizes(self) -> None:
         for node in self.nodes:
@@ -266,10 +266,9 @@ class Graph:
         self.nodes[self.root].age = self.lag
         for node in reversed(self.nodes):
             node.ahead = max(node.ahead, 0)
-            for arg, (first, _) in zip(node.args, self._offsets(node), strict=True):
-                part = self.nodes[arg]
+            for part in (self.nodes[arg] for arg in node.args):
                 part.ahead = max(part.ahead, node.ahead if isinstance(node.form, ir.BoolOp) else 0)
-                part.age = max(part.age, node.age - first)
+                part.age = max(part.age, node.age - self._earliest(node))
         for node in self.nodes:
             for arg in () if node.endless else node.args:
                 self._keep(arg, self._late(node, arg))
