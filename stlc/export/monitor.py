@@ -93,7 +93,7 @@ def _texts(online: Online, program: Streams, *, single: bool) -> tuple[dict[str,
         f"  stlc_init(m, {i}, {each.begin}, {int(each.everywhere)}, 0, (real){each.tolerance!r});"
         for i, each in enumerate(online.asked)
     ]
-    dt = online.compiled.grid.dt
+    dt, (types, functions) = online.compiled.grid.dt, runtime()
     values = {
         "NAME": name,
         "UPPER": name.upper(),
@@ -107,14 +107,12 @@ def _texts(online: Online, program: Streams, *, single: bool) -> tuple[dict[str,
         "REQUIREMENT_NAMES": ", ".join(c_string(each.rule.name) for each in online.asked),
         "ABOUT": "\n".join(_about(online)),
         "STARTS": "\n".join(starts),
-        "TYPES": runtime()[0],
+        "TYPES": _single(types) if single else types,
         "TABLES": "\n".join(_table(kind, rows) for kind, rows in program.tables.items()),
         "PREDICATES": _single(program.predicates) if single else program.predicates,
-        "FUNCTIONS": runtime()[1],
-        "SIZES": ", ".join(str(sizes[part]) for part in _SIZES),
+        "FUNCTIONS": functions,
+        "SIZES": ", ".join(map(str, sizes.values())),
     }
-    if single:
-        values["TYPES"] = _single(str(values["TYPES"]))
     folder = files("stlc.export") / "templates"
     texts = {}
     for file, template in (
@@ -124,9 +122,6 @@ def _texts(online: Online, program: Streams, *, single: bool) -> tuple[dict[str,
     ):
         texts[file] = _Text((folder / f"{template}.txt").read_text(encoding="utf-8")).substitute(values)
     return texts, size
-
-
-_SIZES = ("signals", "rows", "judged", "spans", "times", "ints", "truths")
 
 
 class _Text(Template):

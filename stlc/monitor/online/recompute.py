@@ -84,19 +84,17 @@ class RecomputeTracker:
 
     def live(self, starts: range) -> tuple[Floats, Floats]:
         """Least and greatest robustness over all continuations, (instants, traces) each."""
-        middle = min(max(self.settled, starts.start), starts.stop)
-        if self.ending == "open" or middle == starts.start:
-            record = Record.of(with_seen(self._signals), NUMPY)
-            low, high = growing_bounds(*self._bounds, record, self._shifted(starts), self.window)
-            return np.asarray(low), np.asarray(high)
-        record = Record.of(self._signals, NUMPY)
-        known = range(starts.start, middle)
-        parts = [cut_bounds(self.rule, record, self._shifted(known), self.horizon, "truncate")]
+        middle = starts.start if self.ending == "open" else min(max(self.settled, starts.start), starts.stop)
+        parts = []
+        if middle > starts.start:
+            record, known = Record.of(self._signals, NUMPY), self._shifted(range(starts.start, middle))
+            parts.append(cut_bounds(self.rule, record, known, self.horizon, "truncate"))
         if middle < starts.stop:
-            later = RecomputeTracker(self.rule, self.horizon, "open")
-            later._bounds = self._bounds
-            later.grow(self._signals, self._first, self.samples)
-            parts.append(later.live(range(middle, starts.stop)))
+            record, rest = (
+                Record.of(with_seen(self._signals), NUMPY),
+                self._shifted(range(middle, starts.stop)),
+            )
+            parts.append(growing_bounds(*self._bounds, record, rest, self.window))
         low, high = (np.concatenate(ends) for ends in zip(*parts, strict=True))
         return low, high
 
