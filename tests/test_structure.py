@@ -28,18 +28,18 @@ CIRCLES = {
 }
 IMPLEMENTATIONS = {
     "numbers of one step": 5,
-    "verdict on a requirement": 12,
-    "document with the fields of a record": 27,
-    "online evaluator": 11,
+    "verdict on a requirement": 9,
+    "document with the fields of a record": 8,
+    "online evaluator": 3,
     "arithmetic of bounds": 2,
     "choice among plans": 2,
     "rank of plans": 2,
-    "improvement of a plan": 8,
-    "name of a guard": 4,
-    "verdict by the tolerance": 74,
+    "improvement of a plan": 7,
+    "name of a guard": 2,
+    "verdict by the tolerance": 71,
     "until": 13,
     "smooth maximum of two": 3,
-    "overall robustness": 6,
+    "overall robustness": 5,
     "squash of a control": 2,
 }
 
