@@ -91,9 +91,9 @@ class Run:
     def __repr__(self) -> str:
         name = f"{self.dir.path.parent.name}/{self.dir.name}"
         result = self.dir.record().get("result") or {}
-        share, starts = result.get("accuracy"), result.get("held_out")
-        known = isinstance(share, float) and isinstance(starts, int)
-        told = f"{share:.3f} of {starts:,} held-out starts" if known else self.dir.status
+        told = self.dir.status
+        if {"accuracy", "held_out"} <= {*result}:
+            told = f"{result['accuracy']:.3f} of {result['held_out']:,} held-out starts"
         return f"Run({name}: {told})"
 
     def guard(self, name: str = GUARDS.default) -> GuardedLoop:
