@@ -16,8 +16,8 @@ OPTIONS: dict[str, str] = {
     "Guard": "backup guard time-limit margin known-feasible",
     "Budget": "budget evaluations simulations drives jobs cluster device threads stream",
     "Verdict": "at end semantics tolerance uncertain strict fail-under certify share confidence width shift",
-    "Output": "out record name json junit table robustness pictures window live windows log format precision "
-    "show places guarantee check diff fix watch sort force runs",
+    "Output": "out record name json junit table robustness pictures window live windows log format "
+    "precision float show places guarantee check diff fix watch sort force runs",
 }
 """Title of a group of options -> names of its options; an option of no group stands under "Options"."""
 
