@@ -91,7 +91,7 @@ class Run:
     def __repr__(self) -> str:
         name = f"{self.dir.path.parent.name}/{self.dir.name}"
         result = self.dir.record().get("result") or {}
-        told = self.dir.status
+        told: str = self.dir.status
         if {"accuracy", "held_out"} <= {*result}:
             told = f"{result['accuracy']:.3f} of {result['held_out']:,} held-out starts"
         return f"Run({name}: {told})"
