@@ -68,7 +68,7 @@ def test_an_fmu_is_simulated_falsified_and_certified(
     (last,) = campaign(Campaign(draws, Claim(0.3), seeds=tuple(range(20))))
     searcher.close()
     assert all(run.finding is None for run in runs)
-    held = [all(each.status == "satisfied" for each in run.requirements) for run in runs]
+    held = [all(each.verdict == "satisfied" for each in run.requirements) for run in runs]
     assert open_.found is None
     assert open_.simulations == 20
     assert found.found is not None

@@ -58,7 +58,7 @@ def check_stream(case: Case, monitor: Monitor) -> None:
     seen: dict[int, str] = {}
     before: dict[int, tuple[float, float]] = {}
     for k in range(case.samples):
-        decisions = pushed.push({name: values[k] for name, values in case.signals.items()})
+        pushed.push({name: values[k] for name, values in case.signals.items()})
         known = {name: values[: k + 1] for name, values in case.signals.items()}
         bounds = so_far(case, monitor, rule, known, everywhere=pushed.repeats("r"))
         now = {start: (low, high) for start, low, high in pushed.open_starts("r")}
@@ -69,7 +69,7 @@ def check_stream(case: Case, monitor: Monitor) -> None:
             assert least <= low + 1e-9, f"at {start} after {k + 1}\n{case}"
             assert high <= most + 1e-9, f"at {start} after {k + 1}\n{case}"
             before[start] = low, high
-        for decision in decisions:
+        for decision in pushed.verdicts():
             assert decision.start not in seen, case
             seen[decision.start] = decision.status
         for start, (low, high) in (bounds or now).items():

@@ -11,26 +11,12 @@ import pytest
 from proof.amounts import FULL, seeds
 from proof.streamed import TASTES, check_online, check_promise, check_stream, drawn
 
-from stlc.monitor.online import paced
-from stlc.monitor.online import trackers as tracking
-
 FORMER = tuple(replace(taste, bools=False) for taste in TASTES)
 """Of the cases that are known by their seed."""
 
 
 @pytest.mark.parametrize("numbers", seeds(FULL, 20))
 def test_samples_one_by_one(numbers: range) -> None:
-    assert sum(map(check_online, numbers)) > len(numbers) / 2
-
-
-@pytest.mark.parametrize("numbers", seeds(FULL, 12))
-def test_windows_that_are_lengthened_while_the_stream_goes_on(
-    numbers: range, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As those that are wider than a stream is long; judged after every sample all the same."""
-    for name, value in {"WIDE": 1, "_SHORT": 1, "_NARROW": 8, "_LATE": 1 << 30}.items():
-        monkeypatch.setattr(paced, name, value)
-    monkeypatch.setattr(tracking, "WIDE", 1)
     assert sum(map(check_online, numbers)) > len(numbers) / 2
 
 

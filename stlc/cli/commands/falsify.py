@@ -427,7 +427,9 @@ def _stored(path: Path) -> StoredCounterexample | StoredFinding:
         stored: StoredCounterexample | StoredFinding
         stored = read(StoredFinding if kind == findings.FORMAT else StoredCounterexample, found)
         if isinstance(stored, StoredCounterexample) and (
-            math.isnan(stored.margin) or Path(stored.trace).name != stored.trace or "\0" in stored.trace
+            math.isnan(stored.margin)
+            or Path(stored.trace).name != (stored.trace or None)
+            or "\0" in stored.trace
         ):
             raise ValueError("`margin` or `trace` is not what stlc writes")
         if stored.settings.seed > MOST_SEED:

@@ -122,7 +122,8 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     given = [each.replace(annotation=hints.get(name)) for name, each in signature.parameters.items()]
     signature = signature.replace(parameters=given)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
-    answers = str(signature.return_annotation).startswith("Answer[")
+    returned = signature.return_annotation  # a text, where the module postpones annotations
+    answers = get_origin(returned) is Answer or str(returned).startswith("Answer[")
     passed = "json" in signature.parameters
     if not groups and not answers:
         return function

@@ -76,7 +76,7 @@ class System:
 
     @property
     def facts(self) -> str:
-        """Name and size in words: `car: 7 states, 1 control, 25 steps of 0.1 s`."""
+        """Name and size in words, such as "car: 7 states, 1 control, 25 steps of 0.1 s"."""
         sizes = {"state": len(self.names), "control": len(self.control_names)}
         counts = ", ".join(f"{count} {noun}{'s'[: count != 1]}" for noun, count in sizes.items())
         return f"{self.decl.name}: {counts}, {self.horizon} steps of {self.dt:g} s"
