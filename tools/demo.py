@@ -14,7 +14,7 @@ STAGES = (
     ("train", [SPEC, "--system", SYSTEM, "--budget", "60s"], "a policy, in a minute", (0,)),
     ("simulate", ["--backup"], "200 drives without a guard, and with the backup policy", (0,)),
     ("check", ["trace.npz"], "the monitor judges the guarded drives", (0, 1, 4)),
-    ("report", ["latest"], "a page with the drives in motion", (0,)),
+    ("report", ["latest", "--python"], "a page with the drives in motion", (0,)),
 )
 
 
