@@ -36,3 +36,7 @@ def test_a_case_that_was_wrong_once(seed: int) -> None:
 @pytest.mark.parametrize("numbers", seeds(FULL, 20))
 def test_what_was_said_stays_true(numbers: range) -> None:
     assert sum(map(check_promise, numbers)) > len(numbers) / 2
+
+
+def test_samples_are_kept_until_their_verdict_is_told() -> None:
+    assert check_online(261)  # evaluated anew, at every start

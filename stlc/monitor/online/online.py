@@ -277,8 +277,9 @@ class Recomputed:
 
     @property
     def needs(self) -> int:
-        """The first sample that is still read."""
-        return self._values.samples if self.over else self._values.needs(self.tally.next)
+        """The first sample that is still read, by the verdicts of the latest sample, too."""
+        starts = [*self.news] if self.over else [self.tally.next, *self.news]
+        return min(map(self._values.needs, starts), default=self._values.samples)
 
     def live(self, starts: range) -> JudgedInstants:
         return self._judged(starts, RecomputeTracker.live)
