@@ -71,7 +71,7 @@ class Hardware:
 
 @dataclass(frozen=True, slots=True)
 class StoredDrives:
-    """What a training has stored of its drives, and of its rounds of falsification."""
+    """Stored results of a training: its drives, and its rounds of falsification."""
 
     share: float | None = None
     recommended: str | None = None

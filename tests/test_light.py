@@ -96,7 +96,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 def python(folder: Path, program: str, *arguments: str) -> str:
-    """What a program prints, where torch is not installed and the tree is."""
+    """Output of a program, where torch is not installed and the tree is."""
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{program}", *arguments],
         cwd=folder,

@@ -414,7 +414,7 @@ class InputFile:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a verdict was made from: the version, the files, and the options, name -> values."""
+    """Basis of a verdict: the version, the files, and the options, name -> values."""
 
     stlc: str
     trace: InputFile

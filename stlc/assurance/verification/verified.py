@@ -1,4 +1,4 @@
-"""What a verification proves and refutes, with what holds around random states."""
+"""Results of a verification: what is proved and refuted, also around random states."""
 
 from __future__ import annotations
 

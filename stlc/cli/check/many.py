@@ -88,7 +88,7 @@ class Outcome:
 
     @property
     def word(self) -> Literal["invalid", "not judged"]:
-        """Why there is no verdict."""
+        """Reason that there is no verdict."""
         return "not judged" if self.lost else "invalid"
 
     @property

@@ -1,4 +1,4 @@
-"""What a system file declares, in short."""
+"""Facts that a system file declares, in short."""
 
 from __future__ import annotations
 

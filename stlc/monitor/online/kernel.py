@@ -18,7 +18,7 @@ from stlc.monitor.online.tally import JudgedInstants, RequirementSummary
 from stlc.monitor.signals import Gap
 
 After = Literal["open", "growing", "ended", "clipped"]
-"""What follows the samples: others, where the end may cut windows to it, or all windows; or nothing."""
+"""Continuation after the samples: others, where the end may cut windows to it, or all windows; or nothing."""
 
 _STEPS: dict[After, int] = {"open": 1, "growing": 2, "ended": 3, "clipped": 4}
 

@@ -93,7 +93,7 @@ class Progression:
 
 @dataclass(frozen=True, slots=True)
 class _Residual:
-    """What is left of formulas after the sample `now`.
+    """Remainder of formulas after the sample `now`.
 
     Attributes:
         known: whether each formula, by identity, is met if the worst follows, or the best, (T + 1, 2).
