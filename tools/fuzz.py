@@ -4,10 +4,10 @@
 
 Runs `stlc` in process on random, mutated and malicious inputs (`tests/fuzzing/inputs.py`) and prints the
 outcomes. An input fails if `stlc` crashes (exit code 70, a traceback, a Python warning, a dead process),
-needs more than `--seconds` of processor time, or asks for more than `--memory` MB beyond what the program
-needs. Failing inputs are stored in `--keep`, with a README on how to run them again. With `--log` an
-interrupted run is resumed; `--kind csv --kind run` restricts the kinds of inputs. Formats whose library is
-not installed are skipped with a message. Exit code: 1 if anything failed.
+leaves a half-written file, needs more than `--seconds` of processor time, or asks for more than `--memory` MB
+beyond what the program needs. Failing inputs are stored in `--keep`, with a README on how to run them again.
+With `--log` an interrupted run is resumed; `--kind csv --kind run` restricts the kinds of inputs. Formats
+whose library is not installed are skipped with a message. Exit code: 1 if anything failed.
 """
 
 import argparse
@@ -19,8 +19,10 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import resource
 import shutil
+import stat
 import sys
 import tempfile
 import time
@@ -115,7 +117,7 @@ def run_one(plan, index, limits):
     with watch as wrong, stage("the command waits and", WAIT, real=True):
         code, text, noise = _call(given.arguments, limits, given.typed) if given.arguments else _read(limits)
     seconds = time.process_time() - started
-    fault = "; ".join(dict.fromkeys(wrong)) or _fault(code, text, noise)
+    fault = "; ".join(dict.fromkeys(wrong)) or _fault(code, text, noise) or _unfinished(given)
     if given.drives is not None and fuzz_hostile.SECRET in text:
         fault = "a secret is printed"
     if not fault and given.arguments and seconds > limits.seconds:
@@ -175,6 +177,21 @@ def _fault(code, text, noise):
     if code == MISSING and "R202" in text:
         return "out of memory"
     return f"a Python warning: {noise[0][:300]}" if noise else ""
+
+
+def _unfinished(given):
+    """Faults of files that a command left half-written: temporary ones, and JSON that cannot be read."""
+    for path in Path().rglob("*"):
+        if re.fullmatch(r"\..+\.[0-9a-f]{8}\..*", path.name):
+            return f"a temporary file is left: {path}"
+        if path.suffix == ".json" and stat.S_ISREG(path.lstat().st_mode) and path.as_posix() not in given.odd:
+            data = path.read_bytes()
+            try:
+                json.loads(data)
+            except ValueError:
+                if data != given.files.get(path.as_posix()):
+                    return f"half-written: {path}"
+    return ""
 
 
 def worker(plan, indices, limits, results):

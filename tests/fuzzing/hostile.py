@@ -90,7 +90,8 @@ class Hostile:
     Attributes:
         arguments: the command line.
         files: path -> content.
-        odd: path -> what lies there instead of a file: `link TARGET`, `fifo`, or `sparse BYTES`.
+        odd: path -> what lies there instead of a file: `link TARGET`, `hard TARGET`, `fifo`, `folder`, or
+            `sparse BYTES`.
         drives: whether the command may run Python of the run's own folder.
     """
 
@@ -239,7 +240,7 @@ def _huge(found: Hostile, rng: random.Random) -> None:
 
 
 def lay_odd(odd: dict[str, str]) -> None:
-    """Lay links, pipes and sparse files in the current folder, in place of what is there."""
+    """Lay links, pipes, folders and sparse files in the current folder, in place of what is there."""
     import shutil
 
     for name, what in odd.items():
@@ -256,8 +257,12 @@ def lay_odd(odd: dict[str, str]) -> None:
         match kind:
             case "link":
                 path.symlink_to(rest)
+            case "hard" if Path(rest).is_file():
+                path.hardlink_to(rest)
             case "fifo":
                 os.mkfifo(path)
+            case "folder":
+                path.mkdir()
             case "sparse":
                 path.touch()
                 os.truncate(path, int(rest))

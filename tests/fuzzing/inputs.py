@@ -35,7 +35,7 @@ class Input:
     typed: bytes = b""
     """The standard input."""
     odd: dict[str, str] = field(default_factory=dict)
-    """Links, pipes and sparse files in the folder; see `fuzzing.hostile`."""
+    """Links, pipes, folders and sparse files in the folder; see `fuzzing.hostile`."""
     drives: bool | None = None
     """True if the command may run Python of a run, if what it reads, writes and runs is watched."""
     missing: str = ""
@@ -248,8 +248,8 @@ def _stream(rng: random.Random) -> Input:
 
 def _run(rng: random.Random) -> Input:
     """The folder of a run."""
-    arguments, files = a_run(rng)
-    return Input("run", arguments, files)
+    arguments, files, odd = a_run(rng)
+    return Input("run", arguments, files, odd=odd)
 
 
 def _hostile(rng: random.Random) -> Input:

@@ -1,7 +1,8 @@
-"""Run folders with one or two damaged files: records, checkpoints, traces."""
+"""Run folders with damaged files: records, checkpoints, traces; links and folders in place of files."""
 
 import hashlib
 import json
+import os
 import random
 import subprocess
 import sys
@@ -58,18 +59,18 @@ def run_files() -> dict[str, bytes]:
 
 
 def _surroundings() -> dict[str, str]:
-    import os
-
     paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "OMP_NUM_THREADS": "1"}
 
 
-def a_run(rng: random.Random) -> tuple[list[str], dict[str, bytes]]:
-    """A command line and the damaged run folder that it reads."""
-    files = dict(run_files())
+def a_run(rng: random.Random) -> tuple[list[str], dict[str, bytes], dict[str, str]]:
+    """A command line, the damaged run folder that it reads, and what lies there instead of files."""
+    files, odd = dict(run_files()), {}
     for _ in range(rng.choice([1, 1, 1, 2])):
         name = rng.choice(sorted(files))
-        if name.endswith(".safetensors"):
+        if rng.random() < 0.15:
+            odd[name] = _instead(name, files, rng)
+        elif name.endswith(".safetensors"):
             files |= _with_weights(files, name, rng)
         elif name.endswith((".json", ".yaml", ".jsonl")) and rng.random() < 0.5:
             files[name] = said(files[name], rng)
@@ -79,7 +80,15 @@ def a_run(rng: random.Random) -> tuple[list[str], dict[str, bytes]]:
             damage = battered if name.endswith(".npz") or rng.random() < 0.3 else mutated
             files[name] = damage(files[name], rng)
     words = rng.choice(COMMANDS).format(run=RUN).split()
-    return words, {**files, "a.stl": TRAINED.encode()}
+    return words, {**files, "a.stl": TRAINED.encode()}, odd
+
+
+def _instead(name: str, files: dict[str, bytes], rng: random.Random) -> str:
+    """What lies in place of a file; see `fuzzing.hostile.lay_odd`."""
+    other = rng.choice(sorted({*files} - {name}))
+    links = (os.path.relpath(other, Path(name).parent), "nowhere", ".", Path(name).name, "/dev/zero")
+    others = (f"hard {other}", "fifo", "folder", "sparse 0", "sparse 60000000")
+    return rng.choice((*(f"link {target}" for target in links), *others))
 
 
 def _with_weights(files: dict[str, bytes], name: str, rng: random.Random) -> dict[str, bytes]:
