@@ -14,7 +14,6 @@ import platform
 import sys
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import rmtree
@@ -392,6 +391,8 @@ def _share(
     if threads < 2:
         queue.work(rows)
     else:
+        from concurrent.futures import ThreadPoolExecutor
+
         with ThreadPoolExecutor(threads) as pool:
             workers = [pool.submit(queue.work, rows) for _ in range(threads)]
             try:

@@ -7,7 +7,6 @@ import os
 import platform
 import subprocess
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,8 @@ def sha256(data: bytes | str) -> str:
 @cache
 def versions(*further: str) -> dict[str, str]:
     """Versions of Python and of the packages that results depend on, and of `further` ones, if installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
     found = {"python": platform.python_version()}
     for package in (*PACKAGES, *further):
         try:

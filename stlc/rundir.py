@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -541,7 +540,7 @@ def _marker(path: Path) -> Iterator[bool]:
 
 def _point(link: Path, target: str) -> None:
     """Make the symbolic link `link` point to `target`, atomically; no effect where links are not allowed."""
-    temporary = link.with_name(f".{link.name}.{secrets.token_hex(4)}")
+    temporary = link.with_name(f".{link.name}.{os.urandom(4).hex()}")
     try:
         temporary.symlink_to(target, target_is_directory=True)
     except (OSError, NotImplementedError):
@@ -582,6 +581,8 @@ _ANIMALS = """
 
 def draw_words() -> str:
     """Two random words, such as `quiet-heron`, independent of all seeds of an experiment."""
+    import secrets
+
     return f"{secrets.choice(_ADJECTIVES.split())}-{secrets.choice(_ANIMALS.split())}"
 
 

@@ -169,13 +169,15 @@ def _record(
     outcomes: Sequence[Outcome], assurance: Assessment | None
 ) -> Verdict | BoundedVerdict | JudgedFiles:
     """Result of the command: for one file its verdict, else all verdicts; with bounds, if there are any."""
-    from stlc.assurance.certificate import BoundedVerdict, JudgedFiles, Unjudged
+    only = outcomes[0].verdict if len(outcomes) == 1 else None
+    if only is not None and assurance is None:
+        return only
+    from stlc.assurance.certificate import BoundedVerdict, JudgedFiles
     from stlc.cli.check.many import overall
 
-    found = _entries(outcomes)
-    if len(found) > 1 or isinstance(found[0], Unjudged):
-        return JudgedFiles(overall(outcomes), tuple(found), assurance)
-    return found[0] if assurance is None else BoundedVerdict.of(found[0], assurance)
+    if only is None or assurance is None:
+        return JudgedFiles(overall(outcomes), tuple(_entries(outcomes)), assurance)
+    return BoundedVerdict.of(only, assurance)
 
 
 def _entries(outcomes: Sequence[Outcome]) -> list[Verdict | Unjudged]:

@@ -15,12 +15,11 @@ from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, JsonOption, parse_o
 from stlc.cli.framework.output import Answer, emit, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, usage
-from stlc.grammar.show.manual import CodeList, read_page
 from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
     from stlc.controller.guard.coverage import Chance, Guarantee
-    from stlc.grammar.show.manual import Page, RequirementInWords, SpecInWords
+    from stlc.grammar.show.manual import CodeList, Page, RequirementInWords, SpecInWords
     from stlc.monitor.explain.tree import Explanation
 
 _CODE = re.compile(r"[A-Za-z]\d{3}")
@@ -58,6 +57,8 @@ def explain(
     if guarantee:
         return _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_))
     if what is None:
+        from stlc.grammar.show.manual import CodeList
+
         return Answer(CodeList(dict(CODES)), lambda: emit(table(list(CODES.items()), indent="")))
     if _CODE.fullmatch(what):
         return _page(_code(what.upper()))
@@ -81,6 +82,8 @@ def _code(code: str) -> str:
 
 
 def _page(name: str) -> Answer[Page]:
+    from stlc.grammar.show.manual import read_page
+
     page = read_page(name)
     assert page is not None, f"{name} has no page"
     return Answer(page, lambda: emit("\n".join([page.title, "", *_plain_lines(page.text)]).rstrip()))

@@ -39,7 +39,6 @@ from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.jsontext import plain
 from stlc.registry import GUARDS, PLANNERS
-from stlc.units import time_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -290,6 +289,8 @@ def _longer(run: Run, steps: int) -> tuple[Diagnostic, ...]:
     seconds = steps * run.task.system.dt
     if not isinstance(judged, int | float) or seconds <= judged:
         return ()
+    from stlc.units import time_text
+
     lasts, known = time_text(seconds), time_text(judged)
     message = f"the simulation lasts {lasts}, and training validated the policy on missions of {known}"
     note = "the requirements have no end: beyond that time nothing is known but this simulation"

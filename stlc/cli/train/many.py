@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from stlc.cli.framework.output import Answer, emit, say, table
@@ -199,6 +198,8 @@ def _mean(records: Sequence[TrainedJob]) -> list[tuple[str, ...]]:
     finished = [record for record in records if record.get("accuracy") is not None]
     if len(finished) < 2:
         return []
+    from statistics import fmean
+
     accuracies = [record["accuracy"] for record in finished]
     spread = f"{min(accuracies):.4f} to {max(accuracies):.4f}"
     accuracy, feasible = fmean(accuracies), fmean(record["feasible"] for record in finished)

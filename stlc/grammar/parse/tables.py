@@ -13,7 +13,7 @@ import re
 import sys
 from functools import cache
 from hashlib import sha256
-from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import lark
@@ -42,7 +42,7 @@ def load_parser() -> lark.Lark:
 
 def grammar_text() -> str:
     """Return the text of `stl.lark` with the words of the language inserted."""
-    text = (files("stlc.grammar") / "stl.lark").read_text(encoding="utf-8")
+    text = Path(__file__).parents[1].joinpath("stl.lark").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: PATTERNS[match[1]], text)
 
 
