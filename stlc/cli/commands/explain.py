@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from stlc.monitor.explain.tree import Explanation
 
 _CODE = re.compile(r"[A-Za-z]\d{3}")
-_TOPICS = ("precedence",)
 
 
 @command(
@@ -56,14 +55,19 @@ def explain(
     """
     if guarantee:
         return _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_))
-    if what is None:
-        from stlc.grammar.show.manual import CodeList
+    from stlc.grammar.show.manual import CodeList, read_page
 
+    if what is None:
         return Answer(CodeList(dict(CODES)), lambda: emit(table(list(CODES.items()), indent="")))
     if _CODE.fullmatch(what):
-        return _page(_code(what.upper()))
-    if what in _TOPICS:
-        return _page(what)
+        what = what.upper()
+        if what not in CODES:
+            advice = did_you_mean(what, CODES, "stlc explain  lists the codes")
+            raise usage(f"there is no code `{what}`", *advice)
+    page = read_page(what) if what in CODES or what == "precedence" else None
+    if page is not None:
+        shown = "\n".join([page.title, "", *_plain_lines(page.text)]).rstrip()
+        return Answer(page, lambda: emit(shown))
     if what == STDIN or Path(what).suffix in SPEC_SUFFIXES:
         return _spec(what, reading.require or [])
     from stlc.cli.check.causes import explain_trace
@@ -72,21 +76,6 @@ def explain(
 
     trace = what if has_wildcard(what) else str(recorded_trace(what, reading.runs))
     return explain_trace(trace, reading.question(at=at), reading.runs, talk=not json)
-
-
-def _code(code: str) -> str:
-    if code not in CODES:
-        advice = did_you_mean(code, CODES, "stlc explain  lists the codes")
-        raise usage(f"there is no code `{code}`", *advice)
-    return code
-
-
-def _page(name: str) -> Answer[Page]:
-    from stlc.grammar.show.manual import read_page
-
-    page = read_page(name)
-    assert page is not None, f"{name} has no page"
-    return Answer(page, lambda: emit("\n".join([page.title, "", *_plain_lines(page.text)]).rstrip()))
 
 
 def _spec(name: str, wanted: list[str]) -> Answer[SpecInWords]:
