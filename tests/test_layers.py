@@ -54,7 +54,7 @@ HOMES = {
         "benchmarks",
     ),
     "safetensors": ("stlc.controller",),
-    "lark": ("stlc.grammar.parse",),
+    "lark": ("stlc.grammar.parse", "stlc.grammar.tables"),
     "rich": ("stlc.cli", "stlc.view"),
     "typer": ("stlc.cli", "benchmarks"),
     "click": (),

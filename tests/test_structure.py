@@ -24,7 +24,6 @@ CIRCLES = {
     ("dynamics/model", "dynamics/robots"),
     ("dynamics/model", "dynamics/scenarios"),
     ("dynamics/model", "dynamics/schema"),
-    ("grammar/errors", "grammar/parse"),
 }
 IMPLEMENTATIONS = {
     "numbers of one step": 5,

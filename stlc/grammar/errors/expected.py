@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar.errors.failure import ParseFailure
-from stlc.grammar.parse.builder import unit_advice
+from stlc.grammar.errors.units import unit_advice
 from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest

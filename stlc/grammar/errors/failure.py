@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from stlc.grammar.parse.tables import acceptable, parses
 from stlc.grammar.scan import Bracket, Lexeme, brackets, lexemes
+from stlc.grammar.tables import acceptable, parses
 from stlc.grammar.words import BINARY_TEMPORAL
 from stlc.source import Source, Span
 

@@ -23,7 +23,6 @@ from stlc.grammar.errors.foreign import definition_of_breach, number_over_window
 from stlc.grammar.errors.unicode import apart, named, replacement, unexpected_character
 from stlc.grammar.scan import Bracket, Lexeme, brackets, opens_interval
 from stlc.grammar.words import BINARY_TEMPORAL
-from stlc.source import Span
 
 Recogniser = Callable[[ParseFailure], Diagnostic | None]
 
@@ -38,17 +37,6 @@ def diagnose(piece: Piece, at: int) -> Diagnostic:
         if finding is not None:
             return finding
     return expected(failure)
-
-
-def too_deep(span: Span, limit: int) -> Diagnostic:
-    """Return the diagnostic E005: the text at `span` is nested more than `limit` levels deep."""
-    first_line = span.source.span(span.start, min(span.end, span.start + 40))
-    return Diagnostic(
-        "E005",
-        f"this is nested more than {limit} deep",
-        first_line,
-        help=("name its inner parts with `def`",),
-    )
 
 
 # ---------------------------------------------------------------- E001: characters

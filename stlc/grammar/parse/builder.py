@@ -17,18 +17,15 @@ from typing import Any, TypeAlias
 
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
-from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, SPACE, UNARY_TEMPORAL, UNIT_NAMES
-from stlc.registry import closest
+from stlc.grammar.errors.units import unit_advice
+from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, SPACE, UNARY_TEMPORAL
 from stlc.source import Source, Span
-from stlc.units import CELSIUS, PREFIXED, SYMBOLS, means_celsius, parse_unit
+from stlc.units import CELSIUS, means_celsius, parse_unit
 
 MAX_DIGITS = 400
 _UNIT_LENGTH = 60
 _LARGEST = Fraction(1.7976931348623157e308)
 _MANTISSA = re.compile(r"([^eE]*)(?:[eE]([+-]?\d+))?")
-_PREFIXES = "pnumkMG"
-_USUAL = tuple(prefix + unit for prefix in ("", *_PREFIXES) for unit in PREFIXED if prefix + unit in SYMBOLS)
-_UNPREFIXED = ("min", "h", "ft", "mph", "lb", "rpm", "deg", "degC", "kg")
 _LETTERS = re.compile(r"[A-Za-z]+")
 
 
@@ -109,31 +106,6 @@ def _bad_unit(leaf: TerminalToken, text: str, reason: str) -> Diagnostic:
     return Diagnostic(
         "E101", reason, leaf.span, help=advice, note=("a unit is a product of powers: [m/s^2], [1/s], [%]",)
     )
-
-
-def unit_advice(word: str) -> tuple[str, ...]:
-    """Return the advice about an unknown unit `word`: the units that may be meant; () if there are none.
-
-    A prefix is kept, since `mNm` is no advice for a misspelt `MNm`. Units that differ in case only are named
-    with their sizes.
-    """
-    if word == "T":
-        return ("`T` is the planning horizon; a tesla is `Wb/m^2`, a millitesla `mT`",)
-    if len(word) < 2 or word in SYMBOLS or means_celsius(word):
-        return ()
-    named = UNIT_NAMES.get(word.lower())
-    alike = [named] if named else [unit for unit in _USUAL if unit.casefold() == word.casefold()]
-    for prefix in "" if alike else _PREFIXES:
-        rest = word.removeprefix(prefix)
-        units = [unit for unit in PREFIXED if rest != word and unit[0].casefold() == rest[:1].casefold()]
-        near = closest(rest, units)
-        alike += [] if near is None or near == "T" else [prefix + near]
-    near = None if alike else closest(word, [*PREFIXED, *_UNPREFIXED])
-    alike = alike[:3] if near is None else [near]
-    if len(alike) < 2:
-        return tuple(f"did you mean `{unit}`?" for unit in alike)
-    sizes = (f"`{unit}` ({SYMBOLS[unit].scale:g} {SYMBOLS[unit].si})" for unit in alike)
-    return (f"did you mean {' or '.join(sizes)}?",)
 
 
 def number_of(context: BuildContext, leaf: TerminalToken) -> Fraction:

@@ -14,7 +14,6 @@ from typing import Any
 from lark import Token, Tree
 
 from stlc.diagnostics import Diagnostic
-from stlc.grammar.errors import hints
 from stlc.grammar.parse.builder import EXPRESSIONS, BuildContext, BuildRule, TerminalToken
 from stlc.grammar.parse.declarations import DECLARATIONS
 from stlc.grammar.scan import lexemes
@@ -151,5 +150,8 @@ def _depth(parts: Iterable[_Built], span: Span) -> int:
     """Return the nesting depth of a node with these parts. Raises PieceError (E005) if it is too deep."""
     depth = 1 + max((part.depth for part in parts), default=0)
     if depth > MAX_DEPTH:
-        raise PieceError(hints.too_deep(span, MAX_DEPTH))
+        first_line = span.source.span(span.start, min(span.end, span.start + 40))
+        advice = ("name its inner parts with `def`",)
+        message = f"this is nested more than {MAX_DEPTH} deep"
+        raise PieceError(Diagnostic("E005", message, first_line, help=advice))
     return depth

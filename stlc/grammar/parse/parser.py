@@ -1,7 +1,7 @@
 """Parser from text to syntax tree, based on Lark.
 
 A text is split before each declaration and the pieces are parsed separately, so that one run reports all
-independent errors. Only the modules of `stlc.grammar.parse` use Lark.
+independent errors. Only these modules and `stlc.grammar.tables` use Lark.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from lark import Tree, UnexpectedInput
 
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
-from stlc.grammar.errors import hints
 from stlc.grammar.errors.failure import Piece
+from stlc.grammar.errors.hints import diagnose
 from stlc.grammar.errors.unicode import unseen_characters
 from stlc.grammar.parse.builder import BuildContext
 from stlc.grammar.parse.declarations import Item, assemble
 from stlc.grammar.parse.fold import PieceError, fold
-from stlc.grammar.parse.tables import load_parser
 from stlc.grammar.scan import declaration_starts, lexemes
+from stlc.grammar.tables import load_parser
 from stlc.source import Source
 
 MAX_ERRORS = 20
@@ -110,7 +110,7 @@ def _build(piece: Piece, context: BuildContext) -> Any:
     try:
         tree = load_parser().parse(piece.text, start=piece.rule)
     except UnexpectedInput as error:
-        raise PieceError(hints.diagnose(piece, _offset(error, piece))) from None
+        raise PieceError(diagnose(piece, _offset(error, piece))) from None
     assert isinstance(tree, Tree)
     return fold(tree, context, piece.start)
 

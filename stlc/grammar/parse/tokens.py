@@ -14,8 +14,8 @@ from lark import Token as LarkToken
 from lark import Tree, UnexpectedInput
 
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.grammar.parse.tables import load_parser
 from stlc.grammar.scan import declaration_starts
+from stlc.grammar.tables import load_parser
 from stlc.source import Source
 
 _COMMENT = re.compile(r"(?:#|//)[^\n]*")

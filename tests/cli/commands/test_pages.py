@@ -19,8 +19,8 @@ from helpers.several import ENVIRONMENT, free_port
 from stlc.cli.framework.app import main
 from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
-from stlc.grammar.parse.tables import load_parser
 from stlc.grammar.show.manual import FOLDER, Example, Page, read_page
+from stlc.grammar.tables import load_parser
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from stlc.grammar.parse.tables import cache_name, grammar_text, load_parser
+from stlc.grammar.tables import cache_name, grammar_text, load_parser
 
-SPEC = (Path(__file__).parents[1] / "data" / "navigation.stl").read_text(encoding="utf-8")
+SPEC = (Path(__file__).parent / "data" / "navigation.stl").read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def test_tables_read_back_are_the_same_parser(folder, monkeypatch):
     built = fresh()
     (path,) = (folder / "stlc").iterdir()
     assert path.name == cache_name(grammar_text())
-    monkeypatch.setattr("stlc.grammar.parse.tables.build_parser", None)  # reading must not build
+    monkeypatch.setattr("stlc.grammar.tables.build_parser", None)  # reading must not build
     read = fresh()
     assert read is not built
     for text, rule in ((SPEC, "start"), ("always[0, 1] x -> y until z", "expr")):

@@ -1,0 +1,36 @@
+"""Advice about units that the language does not have."""
+
+from __future__ import annotations
+
+from stlc.grammar.words import UNIT_NAMES
+from stlc.registry import closest
+from stlc.units import PREFIXED, SYMBOLS, means_celsius
+
+_PREFIXES = "pnumkMG"
+_USUAL = tuple(prefix + unit for prefix in ("", *_PREFIXES) for unit in PREFIXED if prefix + unit in SYMBOLS)
+_UNPREFIXED = ("min", "h", "ft", "mph", "lb", "rpm", "deg", "degC", "kg")
+
+
+def unit_advice(word: str) -> tuple[str, ...]:
+    """Return the advice about an unknown unit `word`: the units that may be meant; () if there are none.
+
+    A prefix is kept, since `mNm` is no advice for a misspelt `MNm`. Units that differ in case only are named
+    with their sizes.
+    """
+    if word == "T":
+        return ("`T` is the planning horizon; a tesla is `Wb/m^2`, a millitesla `mT`",)
+    if len(word) < 2 or word in SYMBOLS or means_celsius(word):
+        return ()
+    named = UNIT_NAMES.get(word.lower())
+    alike = [named] if named else [unit for unit in _USUAL if unit.casefold() == word.casefold()]
+    for prefix in "" if alike else _PREFIXES:
+        rest = word.removeprefix(prefix)
+        units = [unit for unit in PREFIXED if rest != word and unit[0].casefold() == rest[:1].casefold()]
+        near = closest(rest, units)
+        alike += [] if near is None or near == "T" else [prefix + near]
+    near = None if alike else closest(word, [*PREFIXED, *_UNPREFIXED])
+    alike = alike[:3] if near is None else [near]
+    if len(alike) < 2:
+        return tuple(f"did you mean `{unit}`?" for unit in alike)
+    sizes = (f"`{unit}` ({SYMBOLS[unit].scale:g} {SYMBOLS[unit].si})" for unit in alike)
+    return (f"did you mean {' or '.join(sizes)}?",)
