@@ -23,7 +23,6 @@ CIRCLES = {
     ("dynamics/init", "dynamics/model"),
     ("dynamics/model", "dynamics/robots"),
     ("dynamics/model", "dynamics/scenarios"),
-    ("dynamics/model", "dynamics/schema"),
 }
 IMPLEMENTATIONS = {
     "numbers of one step": 5,

@@ -16,12 +16,12 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numbers, written
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import names_in
 from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor
 from stlc.controller.problem.task import TIE, Task
 from stlc.dynamics.declaration.learning import START
-from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.controls import EPS, raw_width
 from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
 from stlc.dynamics.model.step import ModelStep

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from stlc.compile.ir.algebra import names_in
 from stlc.diagnostics import SystemFileError, UsageError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import load_system_decl, parse_system
-from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
 from stlc.dynamics.scenarios.scenario import under

@@ -13,9 +13,9 @@ from helpers.sheets import computed
 from stlc.compile.backends.onnx import sheet as sheets
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import substitute
 from stlc.compile.semantics.switch import Hard
 from stlc.controller.problem.task import satisfied
-from stlc.dynamics.model.algebra import substitute
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep

@@ -19,10 +19,10 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import map_parts, substitute
 from stlc.compile.ir.traverse import nodes
 from stlc.dynamics.declaration.init import InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
-from stlc.dynamics.model.algebra import map_parts, substitute
 
 MOST_MODES = 1000
 """Most modes of a distribution."""

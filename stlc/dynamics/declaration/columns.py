@@ -14,8 +14,8 @@ from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Definition, Known, column_entries, constant_value, member_entries
 from stlc.compile.frontend.values import VectorValue
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import add, multiply
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, shared_draws, state_assigns
-from stlc.dynamics.model.algebra import add, multiply
 from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, ControlDecl, Names, Squash, component_names

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import add, multiply, names_in, total
 from stlc.compile.ir.traverse import map_leaves
 from stlc.dynamics.declaration.columns import (
     RANGE,
@@ -18,7 +19,6 @@ from stlc.dynamics.declaration.columns import (
 )
 from stlc.dynamics.declaration.motion import Assign, state_assigns
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
-from stlc.dynamics.model.algebra import add, multiply, names_in, total
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
 
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import add, multiply, substitute, total
 from stlc.dynamics.declaration.columns import RANGE, name_columns, read_ranges, unit_text
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
-from stlc.dynamics.model.algebra import add, multiply, substitute, total
 from stlc.dynamics.schema.expressions import SECOND
 from stlc.dynamics.schema.names import Context, base_name
 from stlc.dynamics.schema.reader import first_line

@@ -11,8 +11,8 @@ from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import names_in, substitute
 from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
-from stlc.dynamics.model.algebra import names_in, substitute
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, ControlDecl, each_number
 from stlc.dynamics.schema.record import (

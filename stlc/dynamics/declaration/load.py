@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import names_in
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.columns import (
     Clockwork,
@@ -56,7 +57,6 @@ from stlc.dynamics.declaration.motion import (
 )
 from stlc.dynamics.declaration.sampled import Sampled, in_order
 from stlc.dynamics.declaration.tables import TableDecl, TableKeys, read_tables
-from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.schema.names import Context, Names, base_name
 from stlc.dynamics.schema.reader import Reader, first_line
 from stlc.dynamics.schema.record import (

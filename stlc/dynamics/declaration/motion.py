@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import map_parts
 from stlc.compile.ir.functions import sampler_names
 from stlc.compile.ir.traverse import subexpressions
-from stlc.dynamics.model.algebra import map_parts
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context
 from stlc.dynamics.schema.reader import first_line

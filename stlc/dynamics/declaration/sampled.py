@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import add, names_in
 from stlc.dynamics.declaration.motion import Assign
-from stlc.dynamics.model.algebra import add, names_in
 from stlc.dynamics.schema.names import Context
 from stlc.signature import Column
 from stlc.source import Span

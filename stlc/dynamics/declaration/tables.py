@@ -10,8 +10,8 @@ from typing import Literal, TypeAlias, get_args
 
 from stlc.compile.frontend.scope import External
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import multiply, names_in, total
 from stlc.dynamics.declaration.columns import unit_text
-from stlc.dynamics.model.algebra import multiply, names_in, total
 from stlc.dynamics.schema.names import Context
 from stlc.dynamics.schema.reader import first_line
 from stlc.dynamics.schema.record import EXPRESSION, OF, key, raw, read, word

@@ -20,12 +20,12 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import map_parts
 from stlc.compile.ir.functions import sampler_names
 from stlc.compile.semantics.switch import Hard
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.init import FileDecl, GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
-from stlc.dynamics.model.algebra import map_parts
 from stlc.signature import Column
 from stlc.trace import read_recording
 from stlc.trace.enums import in_numbers, words_of

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.model.algebra import add, multiply, names_in, total
+from stlc.compile.ir.algebra import add, multiply, names_in, total
 
 Partials: TypeAlias = Callable[..., Sequence[ir.Num | None]]
 """The partial derivatives of a function, from its result and its arguments; None for 0."""

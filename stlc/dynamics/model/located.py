@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import Assignments, add, multiply, names_in, substitute
 from stlc.dynamics.declaration.motion import JumpDecl
-from stlc.dynamics.model.algebra import Assignments, add, multiply, names_in, substitute
 from stlc.dynamics.model.integrators._tableau import Method, Rate, State
 
 ROUNDS = 3

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.ir.algebra import names_in
 from stlc.compile.semantics.switch import Switch
-from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
 from stlc.dynamics.model.step import ModelStep
 

@@ -14,7 +14,7 @@ from functools import reduce
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.model.algebra import add, map_parts, multiply, names_in
+from stlc.compile.ir.algebra import add, map_parts, multiply, names_in
 from stlc.dynamics.model.step import ModelStep
 
 Lets: TypeAlias = Mapping[str, ir.Num]

@@ -16,6 +16,7 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import add, multiply, names_in, substitute
 from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
@@ -24,7 +25,6 @@ from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.init.samplers import Drawing, InitialStates, Rows
-from stlc.dynamics.model.algebra import add, multiply, names_in, substitute
 from stlc.dynamics.model.feedback import unstable
 from stlc.dynamics.model.mirror import Mirror
 from stlc.dynamics.model.rollout import Columns, Stepper

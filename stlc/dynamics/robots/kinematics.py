@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.model.algebra import Assignments
+from stlc.compile.ir.algebra import Assignments
 from stlc.files import MAX_BYTES, read_regular
 
 Doubles: TypeAlias = NDArray[np.float64]

@@ -16,12 +16,12 @@ from torch import Tensor
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import multiply, names_in
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.load import Motion, SystemKeys, motion_of, sections_of
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.init.samplers import Drawing, completed
-from stlc.dynamics.model.algebra import multiply, names_in
 from stlc.dynamics.model.system import System
 from stlc.dynamics.scenarios.uncertain import NumbersInUse, UncertainNumbers, uncertain_numbers
 from stlc.dynamics.schema.names import Names, NumberChanges, base_name, each_number

@@ -19,8 +19,8 @@ from stlc.compile.frontend.expressions import (
 from stlc.compile.frontend.scope import Entry, Scope
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import names_in
 from stlc.diagnostics import Diagnostic, StlcError
-from stlc.dynamics.model.algebra import names_in
 from stlc.dynamics.schema.reader import Reader, first_line
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode

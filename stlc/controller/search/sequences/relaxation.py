@@ -25,13 +25,13 @@ import numpy as np
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import names_in, substitute
 from stlc.compile.ir.normal_form import joined, negate, rejoined, terms
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.search.sequences.phases import levels
 from stlc.controller.search.sequences.residuals import YES, looks_ahead
-from stlc.dynamics.model.algebra import names_in, substitute
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.algebra import names_in
 from stlc.compile.ir.normal_form import joined, pieces, terms
 from stlc.compile.ir.support import columns, history, reach
 from stlc.compile.ir.traverse import nodes
@@ -32,7 +33,6 @@ from stlc.controller.search.sequences.phases import TAIL, UNSURE, Ask, Phase, Ph
 from stlc.controller.search.sequences.relaxation import Relaxation, RelaxedState, clauses_of, present
 from stlc.controller.search.sequences.residuals import NO, YES, Progression, looks_ahead
 from stlc.controller.search.starts import extremes
-from stlc.dynamics.model.algebra import names_in
 
 if TYPE_CHECKING:
     from numpy.random import Generator

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.model.algebra import add, multiply
+from stlc.compile.ir.algebra import add, multiply
 
 State: TypeAlias = Mapping[str, ir.Num]
 Rate: TypeAlias = Callable[[State], State]

@@ -14,7 +14,7 @@ from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.model.algebra import add, multiply
+from stlc.compile.ir.algebra import add, multiply
 from stlc.dynamics.model.derivative import derivative
 from stlc.dynamics.model.integrators._tableau import Rate, State
 
