@@ -21,7 +21,7 @@ from benchmarks.circles import PATTERNS, STEPS, TRIES, Draw, DrawnTask
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.dynamics.robots.kinematics import chain, position, read_urdf
+from stlc.dynamics.declaration.kinematics import chain, position, read_urdf
 from stlc.files import find_system
 
 Point: TypeAlias = tuple[float, ...]

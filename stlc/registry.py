@@ -315,6 +315,11 @@ PLANNERS: PackageRegistry[Any] = PackageRegistry(
 )
 """Planners, `stlc.controller.search.planner.Planner` each, named by `stlc plan --method`."""
 
+INTEGRATORS: PackageRegistry[Any] = PackageRegistry(
+    "integrator", "stlc.dynamics.model.integrators", "TABLEAU", default="euler"
+)
+"""Methods of numerical integration, `stlc.dynamics.model.integrators` each, of `time: {integrator: …}`."""
+
 SEMANTICS: PackageRegistry[Any] = PackageRegistry(
     "semantics", "stlc.compile.semantics.kinds", "SEMANTICS", default="exact"
 )

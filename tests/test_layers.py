@@ -91,7 +91,7 @@ HOMES = {
     "tensorboardX": ("stlc.controller.training.tensorboard",),
     "ray": ("stlc.controller.parallel.ray_cluster",),
     "rosbags": ("stlc.trace.formats.bag",),
-    "pytorch_kinematics": ("stlc.dynamics.robots.crosscheck",),
+    "pytorch_kinematics": ("stlc.dynamics.crosscheck",),
     "pickle": (),
     "marshal": (),
     "shelve": (),

@@ -19,9 +19,7 @@ CIRCLES = {
     ("controller/evaluation", "controller/training"),
     ("controller/methods", "controller/training"),
     ("dynamics/declaration", "dynamics/model"),
-    ("dynamics/declaration", "dynamics/robots"),
     ("dynamics/init", "dynamics/model"),
-    ("dynamics/model", "dynamics/robots"),
     ("dynamics/model", "dynamics/scenarios"),
 }
 IMPLEMENTATIONS = {

@@ -20,7 +20,7 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.training.checkpoint import FOLDER, POINTER, CheckpointHead
 from stlc.controller.training.run import CONFIG, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
-from stlc.dynamics.robots.functions import function_files
+from stlc.dynamics.functions import function_files
 from stlc.monitor.judgement import chosen
 from stlc.provenance import sha256
 from stlc.registry import GUARDS

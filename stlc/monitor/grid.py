@@ -94,7 +94,7 @@ def system_of(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) 
         UsageError: U102, there is no such file.
         SystemFileError: the file is invalid.
     """
-    from stlc.dynamics.robots.functions import load_functions
+    from stlc.dynamics.functions import load_functions
 
     times, decl = _declared(name, spec, overrides)
     return times, replace(decl.interface(), functions=load_functions(decl))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stlc.controller.sketch import DECIDED, NOTE, deciders
 from stlc.controller.stage import Ball, Stage
 from stlc.diagnostics import Diagnostic, MissingError
-from stlc.dynamics.robots.kinematics import read_urdf, robot_of
+from stlc.dynamics.declaration.kinematics import read_urdf, robot_of
 from stlc.extras import not_installed
 from stlc.view.scene import Scene
 

@@ -8,7 +8,7 @@ import pytest
 
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.load import load_system_decl
-from stlc.dynamics.robots.functions import function_files
+from stlc.dynamics.functions import function_files
 
 BASE = """\
 stlc: 1

@@ -16,11 +16,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import substitute
 from stlc.compile.semantics.switch import Hard
 from stlc.controller.problem.task import satisfied
-from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rolled
 from stlc.export.verify import previous_plan_agreement, same_verdicts
+from stlc.registry import INTEGRATORS
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 

@@ -15,9 +15,9 @@ from stlc.escape import visible
 
 if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
+    from stlc.dynamics.crosscheck import Comparison
     from stlc.dynamics.declaration.decl import SystemDecl
-    from stlc.dynamics.declaration.facts import ListedSystem, SystemFacts, SystemList
-    from stlc.dynamics.robots.crosscheck import Comparison
+    from stlc.dynamics.facts import ListedSystem, SystemFacts, SystemList
 
 _File = Annotated[
     str, typer.Argument(metavar="SYSTEM", help="As given, in systems/, in examples/, or installed.")
@@ -31,7 +31,7 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 def show(system: _File, set_: SetOption = None) -> Answer[SystemFacts]:
     """Show the declarations of a system file, from states to scenarios."""
     from stlc.dynamics.declaration.decl import describe as in_words
-    from stlc.dynamics.declaration.facts import SystemFacts
+    from stlc.dynamics.facts import SystemFacts
 
     decl = _load(system, parse_overrides(set_))
 
@@ -58,7 +58,7 @@ def check(
     dynamics that diverge, and conditions in the section `init` that reject nearly all states. Kinematics from
     a URDF are compared with pytorch-kinematics if that is installed.
     """
-    from stlc.dynamics.declaration.facts import DrivenSteps, SystemFacts
+    from stlc.dynamics.facts import DrivenSteps, SystemFacts
 
     decl = _load(system, parse_overrides(set_))
     warnings = _roll_out(decl, steps, seed) if steps else decl.warnings
@@ -82,7 +82,7 @@ def check(
 @subcommand(GROUP, "list", "stlc system list")
 def list_() -> Answer[SystemList]:
     """List the systems that are found by name."""
-    from stlc.dynamics.declaration.facts import SystemList
+    from stlc.dynamics.facts import SystemList
 
     found = list(_all_systems())
 
@@ -142,7 +142,7 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
     robots = [function for function in decl.functions if function.body is not None]
     if not robots:
         return []
-    from stlc.dynamics.robots.crosscheck import compared
+    from stlc.dynamics.crosscheck import compared
 
     return [compared(function) for function in robots]
 
@@ -150,8 +150,8 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
 def _all_systems() -> Iterator[ListedSystem]:
     """Yield a record of every system file in the search path: name, path, and description or first error."""
     from stlc.diagnostics import StlcError
-    from stlc.dynamics.declaration.facts import ListedSystem
     from stlc.dynamics.declaration.load import load_system_decl
+    from stlc.dynamics.facts import ListedSystem
     from stlc.files import SYSTEMS
 
     seen: set[str] = set()

@@ -48,7 +48,7 @@ RESULTS: dict[str, tuple[str, ...]] = {
     ),
     "simulate": (f"{_DOCUMENTS}:Simulation", "stlc.plants.judge:PlantSimulation"),
     "stlc": (),
-    "system": ("stlc.dynamics.declaration.facts:SystemList", "stlc.dynamics.declaration.facts:SystemFacts"),
+    "system": ("stlc.dynamics.facts:SystemList", "stlc.dynamics.facts:SystemFacts"),
     "train": (f"{_DOCUMENTS}:TrainedRun", f"{_DOCUMENTS}:TrainedRuns"),
     "verify": ("stlc.assurance.verification.verified:Verified",),
 }

@@ -15,7 +15,7 @@ from stlc.controller.training.config import ENGINE_VERSION, ResolvedConfig, Trai
 from stlc.controller.training.loop import Watch, prepare, run
 from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.diagnostics import usage
-from stlc.dynamics.robots.functions import function_files
+from stlc.dynamics.functions import function_files
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.registry import METHODS, PLANNERS
 from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, now, require_name

@@ -16,7 +16,6 @@ from stlc.compile.frontend.values import VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import add, multiply
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, shared_draws, state_assigns
-from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, ControlDecl, Names, Squash, component_names
 from stlc.dynamics.schema.reader import Reader
@@ -39,6 +38,7 @@ from stlc.dynamics.schema.record import (
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
+from stlc.registry import INTEGRATORS
 from stlc.signature import MAX_COMPONENTS, Column, Role
 from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
 

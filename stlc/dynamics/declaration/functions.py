@@ -10,7 +10,7 @@ from typing import Literal
 from stlc.compile.frontend.scope import External
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, SystemFileError
-from stlc.dynamics.robots.kinematics import chain, position, read_urdf
+from stlc.dynamics.declaration.kinematics import chain, position, read_urdf
 from stlc.dynamics.schema.names import Context
 from stlc.dynamics.schema.record import OF, TEXT, key, read, word
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node

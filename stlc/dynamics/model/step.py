@@ -9,9 +9,9 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import Assignments, add, multiply, names_in, substitute
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
-from stlc.dynamics.model.integrators import INTEGRATORS
 from stlc.dynamics.model.integrators._tableau import State
 from stlc.dynamics.model.located import LocatedJumps
+from stlc.registry import INTEGRATORS
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Comparison of the compiled forward kinematics with the package pytorch-kinematics.
 
-`stlc.dynamics.robots.kinematics` unrolls a chain of joints into a few operations; pytorch-kinematics
+`stlc.dynamics.declaration.kinematics` unrolls a chain of joints into a few operations; pytorch-kinematics
 multiplies batches of transforms. If that package is installed, `stlc system check` compares the two.
 """
 
@@ -21,7 +21,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.functions import FunctionDecl
-from stlc.dynamics.robots.kinematics import Doubles, read_urdf
+from stlc.dynamics.declaration.kinematics import Doubles, read_urdf
 
 LIBRARY = "pytorch-kinematics"
 POSITIONS = 256

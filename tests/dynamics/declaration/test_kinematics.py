@@ -16,8 +16,8 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SystemFileError
+from stlc.dynamics.declaration.kinematics import Joint, chain, position
 from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.robots.kinematics import Joint, chain, position
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

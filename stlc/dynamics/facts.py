@@ -11,7 +11,7 @@ from stlc.jsontext import Num
 from stlc.signature import Column
 
 if TYPE_CHECKING:
-    from stlc.dynamics.robots.crosscheck import Comparison
+    from stlc.dynamics.crosscheck import Comparison
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class SystemFacts:
         "name=decl.name doc=decl.doc path=decl.path dt horizon states controls=decl.controls "
         "inputs=decl.inputs constants jumps situations driven? kinematics?"
     )
-    NAMES: ClassVar = {"Comparison": "stlc.dynamics.robots.crosscheck"}
+    NAMES: ClassVar = {"Comparison": "stlc.dynamics.crosscheck"}
 
     decl: SystemDecl
     driven: DrivenSteps | None = None

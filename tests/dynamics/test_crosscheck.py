@@ -10,9 +10,9 @@ import pytest
 
 from stlc.cli.framework.app import main
 from stlc.diagnostics import SystemFileError
+from stlc.dynamics import crosscheck
 from stlc.dynamics.declaration.functions import FunctionDecl
-from stlc.dynamics.robots import crosscheck
-from stlc.dynamics.robots.kinematics import chain, position
+from stlc.dynamics.declaration.kinematics import chain, position
 
 ROBOT = """<robot name="crane">
   <link name="ground"/><link name="mast"/><link name="boom"/><link name="hook"/>

@@ -1,1 +1,0 @@
-"""Robots: URDF descriptions, kinematics, external functions."""
