@@ -33,7 +33,7 @@ from stlc.controller.training.run import Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
-from stlc.dynamics.scenarios.scenario import DISTURBED
+from stlc.dynamics.scenario import DISTURBED
 from stlc.jsontext import plain
 from stlc.provenance import sha256
 from stlc.registry import GUARDS

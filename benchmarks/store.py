@@ -13,7 +13,7 @@ from stlc.compile.frontend.modules import library_of
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.functions import function_files
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import SPECS, alone_in, find_system, read_source, write_atomic
 from stlc.grammar.parse.parser import parse
 from stlc.jsontext import dumps, plain

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from stlc.controller.search.planner import PlanResult, plan
     from stlc.controller.training.run import Run
     from stlc.diagnostics import SpecError, StlcError
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
     from stlc.grammar import ast
     from stlc.monitor.check import check
     from stlc.monitor.judgement import RequirementVerdict, Verdict
@@ -73,7 +73,7 @@ _HOMES = {
     "Run": "stlc.controller.training.run:Run",
     "SpecError": "stlc.diagnostics:SpecError",
     "StlcError": "stlc.diagnostics:StlcError",
-    "System": "stlc.dynamics.model.system:System",
+    "System": "stlc.dynamics.system:System",
     "Task": "stlc.controller.problem.task:Task",
     "Trace": "stlc.trace:Trace",
     "Verdict": "stlc.monitor.judgement:Verdict",

@@ -14,7 +14,7 @@ import pytest
 
 from stlc.cli.framework.render import render_text
 from stlc.diagnostics import StlcError
-from stlc.dynamics.declaration.load import parse_system
+from stlc.dynamics.load import parse_system
 from stlc.source import Source
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"

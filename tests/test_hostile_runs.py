@@ -19,8 +19,8 @@ from stlc import escape, native
 from stlc.cli.framework.app import main
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.declaration.load import load_system_decl
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import load_system_decl
+from stlc.dynamics.system import System
 from stlc.export.c_header import header, main_of
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

@@ -13,7 +13,7 @@ from helpers.doc_examples import BOUNDS, VALUE, Claim, Example, Recorded, codes,
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.grammar.format.format import format_text

@@ -11,7 +11,7 @@ import torch
 from helpers import paper
 from helpers.paper import Array
 
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 pytestmark = pytest.mark.apart
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stlc.compile.pipeline import compile_spec
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor

@@ -18,7 +18,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import save_config
 from stlc.diagnostics import PluginError, SystemFileError, UsageError
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.plants.declaration import load_plant_decl, plant_schema

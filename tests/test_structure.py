@@ -18,9 +18,6 @@ CIRCLES = {
     ("controller/deployment", "controller/guard"),
     ("controller/evaluation", "controller/training"),
     ("controller/methods", "controller/training"),
-    ("dynamics/declaration", "dynamics/model"),
-    ("dynamics/init", "dynamics/model"),
-    ("dynamics/model", "dynamics/scenarios"),
 }
 IMPLEMENTATIONS = {
     "numbers of one step": 5,

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from stlc.controller.world import ModelWorld
-from stlc.dynamics.declaration.load import load_system_decl, parse_system
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.load import load_system_decl, parse_system
+from stlc.dynamics.scenario import under
+from stlc.dynamics.system import System
 from stlc.source import Source
 
 PAGE = Path(__file__).resolve().parent.parent / "docs/systems.md"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from stlc.controller.problem.task import Task
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
 
 @dataclass(frozen=True, slots=True)

@@ -266,7 +266,7 @@ def _task_of(problem: Problem, seed: int) -> tuple[Task, Tensor]:
     """Return the random task of a seed, and its initial state, (1, n)."""
     import stlc
     from stlc.controller.problem.task import Task
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
     drawn, system = DRAWS[problem.spec](seed), System.load(_system(problem))
     x0 = torch.tensor([drawn.x0[: len(system.names)]], dtype=torch.float64)

@@ -25,7 +25,7 @@ from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
 from stlc.controller.search.planner import PlanResult
 from stlc.diagnostics import usage
-from stlc.dynamics.init.quantiles import InitialPoints
+from stlc.dynamics.quantiles import InitialPoints
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.values import Record
 from stlc.native import Adjoint, ObjectiveSlopes

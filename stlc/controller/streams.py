@@ -14,7 +14,7 @@ import torch
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from stlc.registry import closest
 if TYPE_CHECKING:
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.dynamics.declaration.deployment import WorldRef
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
 
 class World(Protocol):

@@ -26,7 +26,7 @@ from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.editor.symbols import Symbol, SymbolNames, names_of
 from stlc.files import find_system
 from stlc.grammar import ast

@@ -78,7 +78,7 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
 
 
 def _declared(name: str | Source, spec: ast.Spec, overrides: Mapping[str, str]) -> tuple[Times, SystemDecl]:
-    from stlc.dynamics.declaration.load import load_system_decl
+    from stlc.dynamics.load import load_system_decl
 
     found = name if isinstance(name, Source) else find_system(name, Path(spec.source.name))
     decl = load_system_decl(found, overrides)

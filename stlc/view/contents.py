@@ -11,8 +11,8 @@ from stlc.compile.ir.traverse import margin_unit
 from stlc.controller.training.run import read_library
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.load import load_system_decl
-from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.load import load_system_decl
+from stlc.dynamics.scenario import under
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor

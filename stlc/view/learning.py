@@ -17,7 +17,7 @@ import numpy as np
 from stlc.controller.guard.kind import named_guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.diagnostics import StlcError
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.escape import operand, shell
 from stlc.registry import GUARDS
 from stlc.rundir import SYSTEM, RunDir

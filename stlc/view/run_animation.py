@@ -156,8 +156,8 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
     Returns None if the scene was not recorded, or if its world (simulated environment) cannot be loaded.
     """
     from stlc.controller.world import world_type
-    from stlc.dynamics.declaration.load import load_system_decl
-    from stlc.dynamics.scenarios.scenario import under
+    from stlc.dynamics.load import load_system_decl
+    from stlc.dynamics.scenario import under
 
     trace_name, scene_name = (TRACE, SCENE) if guarded else UNGUARDED
     scene = _load_scene(run, scene_name)

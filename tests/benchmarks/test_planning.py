@@ -16,7 +16,7 @@ from benchmarks.table import text_of
 from benchmarks.tables.planning import COLUMNS, PROBLEMS, Problem, measured
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 pytestmark = pytest.mark.apart
 

@@ -10,7 +10,7 @@ import pytest
 
 from stlc.cli.framework.app import main
 from stlc.cli.framework.watch import watch
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir

@@ -12,7 +12,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import spec_hash, task_of_run
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 

@@ -12,9 +12,9 @@ from stlc.controller.guard.margins import MarginRequest, calibrated_margins, par
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.scenario import under
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -20,7 +20,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.samplers import GLIMPSES, POOL, ROUNDS, Draws, Missions, mission_steps
 from stlc.controller.world import ModelWorld
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source

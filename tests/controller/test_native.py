@@ -11,7 +11,7 @@ from stlc import native
 from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import guided_objective, loss
 from stlc.diagnostics import Notice
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

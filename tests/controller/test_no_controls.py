@@ -16,8 +16,8 @@ from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.loop import train
 from stlc.diagnostics import UsageError
-from stlc.dynamics.declaration.load import load_system_decl
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import load_system_decl
+from stlc.dynamics.system import System
 from stlc.rundir import RunDir
 
 SYSTEM = """

@@ -22,8 +22,8 @@ from stlc.compile.semantics.switch import Hard, Tanh
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.objective import VIOLATION, Objective, guided_objective, loss, paper_objective
 from stlc.diagnostics import SpecError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

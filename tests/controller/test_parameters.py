@@ -22,8 +22,8 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.controller.training.run import Run
 from stlc.diagnostics import StlcError, TraceError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source

@@ -17,9 +17,9 @@ from stlc.controller.guard.safe_prefix import prefix_robustness, robustness_unti
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.scenario import under
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

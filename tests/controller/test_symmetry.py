@@ -11,8 +11,8 @@ from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.controller.training.diagnose import check_mirror
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -8,7 +8,7 @@ import torch
 
 from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 F64 = torch.float64
 

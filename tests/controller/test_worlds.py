@@ -14,7 +14,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import RunError, SystemFileError
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

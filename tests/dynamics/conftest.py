@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.source import Source
 
 HEAD = "stlc: 1\nname: small\n"

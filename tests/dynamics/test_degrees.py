@@ -10,7 +10,7 @@ import torch
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.text import show_number
 from stlc.diagnostics import StlcError
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 Make = Callable[..., System]
 
@@ -105,7 +105,7 @@ def test_what_is_none_of_them(make: Make, before: str, after: str, words: str) -
 
 
 def test_a_share_of_a_temperature_is_not_wrong(make: Make) -> None:
-    from stlc.dynamics.scenarios.perturbed import perturbable
+    from stlc.dynamics.uncertainty.perturbed import perturbable
 
     found = perturbable(make(ROOM.format(unit="degC", **RATES)).decl)
     assert {each.text for each in found.numbers} == {"loss", "0.01 K/s", "5 K"}

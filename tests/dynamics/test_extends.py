@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from stlc.diagnostics import StlcError
-from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.functions import function_files
+from stlc.dynamics.load import load_system_decl
 
 BASE = """\
 stlc: 1

@@ -13,8 +13,8 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError, StlcError, SystemFileError, UsageError
-from stlc.dynamics.declaration.load import load_system_decl
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import load_system_decl
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source

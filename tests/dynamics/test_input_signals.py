@@ -15,8 +15,8 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.decl import describe
 from stlc.dynamics.declaration.inputs import InputDecl, drawn_numbers, signal_values
-from stlc.dynamics.init.samplers import Rows
-from stlc.dynamics.model.system import System
+from stlc.dynamics.model.samplers import Rows
+from stlc.dynamics.system import System
 
 Make = Callable[..., System]
 PLANT = (

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from stlc.compile.semantics.switch import Tanh
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 Make = Callable[..., System]
 

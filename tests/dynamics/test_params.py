@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from stlc.diagnostics import StlcError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.source import Source
 
 Make = Callable[..., System]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stlc.controller.problem.load import load_task
-from stlc.dynamics.init.quantiles import InitialPoints
+from stlc.dynamics.quantiles import InitialPoints
 
 ROOT = Path(__file__).resolve().parents[2]
 

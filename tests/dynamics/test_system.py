@@ -14,9 +14,9 @@ import torch
 from stlc.compile.semantics.switch import Tanh
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.decl import describe
-from stlc.dynamics.declaration.load import load_system_decl, parse_system
+from stlc.dynamics.load import load_system_decl, parse_system
 from stlc.dynamics.model.controls import raw_width, squash
-from stlc.dynamics.model.system import PROBED, System
+from stlc.dynamics.system import PROBED, System
 from stlc.source import Source
 
 Make = Callable[..., System]
@@ -179,7 +179,7 @@ def test_the_description_is_a_table(make: Make) -> None:
 
 def test_a_declaration_needs_no_torch() -> None:
     code = (
-        "import sys; from stlc.dynamics.declaration.load import load_system_decl;"
+        "import sys; from stlc.dynamics.load import load_system_decl;"
         "from stlc.dynamics.declaration.decl import describe;"
         "print(describe(load_system_decl('examples/car.yaml'))); assert 'torch' not in sys.modules"
     )

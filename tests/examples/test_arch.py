@@ -16,7 +16,7 @@ import stlc
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.inputs import signal_values
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 pytestmark = pytest.mark.apart
 

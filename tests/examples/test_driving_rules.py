@@ -16,7 +16,7 @@ from torch import Tensor
 
 import stlc
 from stlc.controller.world import world_type
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).parents[2]

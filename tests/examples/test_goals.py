@@ -11,7 +11,7 @@ import torch
 from test_paper_panda import flange
 
 from stlc.controller.world import world_type
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 PANDA = Path(__file__).parents[2] / "examples" / "panda.yaml"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stlc
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).parents[2]
@@ -128,7 +128,7 @@ def arm(goal: tuple[float, float, float], q: tuple[float, ...] = HOME, samples: 
 
 def flange(q: tuple[float, ...]) -> tuple[float, float, float]:
     from stlc.controller.world import world_type
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
     links = sys.modules[world_type(System.load(ROOT / "examples/panda.yaml").decl).__module__].links
     x, y, z = links(np.array([q]))[0, -1].tolist()

@@ -11,7 +11,7 @@ import torch
 from stlc.cli.framework.app import main
 from stlc.controller.problem.task import Task
 from stlc.dynamics.model.feedback import growth_of
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 

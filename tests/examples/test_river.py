@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from stlc.controller.world import world_type
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from stlc.controller.world import Choosing, world_type
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 ROVER = Path(__file__).parents[2] / "examples" / "rover.yaml"
 BOXES = ((0.0, 0.0, 3.0), (3.5, 7.0, 3.0), (7.0, 0.0, 3.0), (4.25, 4.25, 1.5))  # corner and size

@@ -17,7 +17,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.closed_loop import fresh_share
 from stlc.controller.problem.task import Task
 from stlc.controller.training.run import Run
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.lint.lint import lint

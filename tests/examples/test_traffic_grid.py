@@ -13,7 +13,7 @@ import torch
 from helpers.traffic_drivers import Driver, careful, reckless
 
 from stlc.controller.world import world_type
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 CAR = Path(__file__).parents[2] / "examples" / "car.yaml"
 STEPS = 150

@@ -97,7 +97,7 @@ def stage(name: str, limit: float, *, real: bool = False):
 
 @cache
 def _system():
-    from stlc.dynamics.declaration.load import parse_system
+    from stlc.dynamics.load import parse_system
     from stlc.source import Source
 
     return parse_system(Source("b.yaml", SYSTEM), Path("b.yaml"))

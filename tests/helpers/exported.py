@@ -17,7 +17,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.export.verify import BUILT
 from stlc.export.write import Exported, export
 from stlc.files import read_source

@@ -11,8 +11,8 @@ import torch
 from scipy.stats import ks_2samp
 
 from stlc.controller.problem.task import Task
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stlc.controller.problem.task import Task
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

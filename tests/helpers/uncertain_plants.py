@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.scenario import under
+from stlc.dynamics.system import System
 from stlc.source import Source
 
 SPEC = """\

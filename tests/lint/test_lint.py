@@ -9,7 +9,7 @@ import pytest
 
 from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import UsageError
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse

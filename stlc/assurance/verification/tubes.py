@@ -31,10 +31,10 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.controller.deployment.disturbance import ErrorSizes
 from stlc.diagnostics import usage
-from stlc.dynamics.init.samplers import Drawing
+from stlc.dynamics.model.samplers import Drawing
 from stlc.dynamics.model.schedule import blocks
 from stlc.dynamics.model.step import build_step, commands
-from stlc.dynamics.scenarios.perturbed import perturbable
+from stlc.dynamics.uncertainty.perturbed import perturbable
 
 if TYPE_CHECKING:
     from stlc.compile.augment.timers import Timer

@@ -120,7 +120,7 @@ def _compiled(
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose, compile_spec
     from stlc.diagnostics import usage
-    from stlc.dynamics.declaration.load import load_system_decl
+    from stlc.dynamics.load import load_system_decl
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parse.parser import parse
 

@@ -204,7 +204,7 @@ def _specification(folder: Path, name: str, from_: str | None) -> tuple[dict[Pat
 
     path, decl, reference = _path(folder, name, "specs", ".stl"), None, ""
     if from_ is not None:
-        from stlc.dynamics.declaration.load import load_system_decl
+        from stlc.dynamics.load import load_system_decl
         from stlc.files import find_system
 
         decl = load_system_decl(find_system(from_))

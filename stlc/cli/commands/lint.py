@@ -142,7 +142,7 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
         return None
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import Purpose
-    from stlc.dynamics.declaration.load import load_system_decl
+    from stlc.dynamics.load import load_system_decl
     from stlc.files import find_system
     from stlc.lint.lint import Surroundings
 

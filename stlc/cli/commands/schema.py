@@ -57,7 +57,7 @@ def load_schema(name: str) -> dict[str, Any]:
         raise usage(f"there is no schema `{name}`", *advice)
     command = wanted.partition("/")[0]
     if command == SYSTEM_FILE:
-        from stlc.dynamics.declaration.load import system_schema
+        from stlc.dynamics.declaration.sections import system_schema
 
         return {"$schema": _DIALECT, "title": wanted, **system_schema()}
     if command == PLANT_FILE:

@@ -372,7 +372,7 @@ def _several(run: Run, scenario: str | None) -> dict[str, ScenarioDecl]:
     The mapping is empty if `scenario`, the value of `--scenario`, is None or the name of a single scenario.
     Raises UsageError (U101) if the system declares none although all are asked for.
     """
-    from stlc.dynamics.scenarios.scenario import DISTURBED, find_scenario
+    from stlc.dynamics.scenario import DISTURBED, find_scenario
 
     decl = run.task.system.decl
     declared = {each.name: each for each in decl.scenarios}

@@ -104,7 +104,7 @@ def _counted(count: int, what: str) -> str:
 
 
 def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
-    from stlc.dynamics.declaration.load import load_system_decl
+    from stlc.dynamics.load import load_system_decl
     from stlc.files import find_system
 
     return load_system_decl(find_system(name), overrides)
@@ -118,8 +118,8 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
     """
     import torch
 
-    from stlc.dynamics.model.system import System
-    from stlc.dynamics.scenarios.perturbed import perturbable
+    from stlc.dynamics.system import System
+    from stlc.dynamics.uncertainty.perturbed import perturbable
 
     if decl.test.uncertain is not None:
         perturbable(decl)
@@ -150,8 +150,8 @@ def _kinematics(decl: SystemDecl) -> list[Comparison]:
 def _all_systems() -> Iterator[ListedSystem]:
     """Yield a record of every system file in the search path: name, path, and description or first error."""
     from stlc.diagnostics import StlcError
-    from stlc.dynamics.declaration.load import load_system_decl
     from stlc.dynamics.facts import ListedSystem
+    from stlc.dynamics.load import load_system_decl
     from stlc.files import SYSTEMS
 
     seen: set[str] = set()

@@ -15,8 +15,8 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
 from stlc.controller.streams import seeded
 from stlc.dynamics.declaration.deployment import ErrorsDecl, EventDecl
-from stlc.dynamics.init.samplers import Drawing, Rows
-from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
+from stlc.dynamics.model.samplers import Drawing, Rows
+from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
 from stlc.units import parse_unit
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.dynamics.declaration.motion import Assign
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
 SECOND = parse_unit("s")
 _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)

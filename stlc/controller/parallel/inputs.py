@@ -8,8 +8,8 @@ from pathlib import Path
 
 from stlc.compile.frontend.modules import Module, load_modules
 from stlc.diagnostics import StlcError
-from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.functions import function_files
+from stlc.dynamics.load import load_system_decl
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parse.parser import parse
 

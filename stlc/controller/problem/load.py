@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import scenario_constants
+from stlc.dynamics.scenario import scenario_constants
+from stlc.dynamics.system import System
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parse.parser import parse
 

@@ -39,7 +39,7 @@ from stlc.toolchain import compiler
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.compile.schedule.schedule import End
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.compile.schedule.schedule import End
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
     from stlc.grammar import ast
 
 HARD = Hard()

@@ -18,7 +18,7 @@ from stlc.compile.semantics.switch import Hard
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.training.objective import Objective, rolled, without_lost
 from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import PlanNetwork

@@ -14,9 +14,9 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint, weights
 from stlc.controller.training.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, PluginError, RunError
-from stlc.dynamics.declaration.load import load_system_decl
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import scenario_constants, under
+from stlc.dynamics.load import load_system_decl
+from stlc.dynamics.scenario import scenario_constants, under
+from stlc.dynamics.system import System
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.plugins import variable

@@ -23,9 +23,9 @@ from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import ModelWorld
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
+from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -23,7 +23,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.init import GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -20,7 +20,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.run import Run
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.export.programs import Deciding, Guarding
 from stlc.export.verify import answers
 from stlc.export.write import export

@@ -17,7 +17,7 @@ from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
 from stlc.cli.simulate.text import screen
 from stlc.controller.deployment.batched import Worlds
-from stlc.dynamics.scenarios.scenario import DISTURBED
+from stlc.dynamics.scenario import DISTURBED
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir
 from stlc.trace import load_trace

@@ -18,8 +18,8 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.signature import Column
 from stlc.source import Source

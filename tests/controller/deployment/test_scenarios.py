@@ -19,9 +19,9 @@ from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import standard, under
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.scenario import standard, under
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

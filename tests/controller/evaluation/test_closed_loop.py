@@ -29,7 +29,7 @@ from stlc.controller.training.config import DRIVES, HELD_OUT_SEED, TrainConfig, 
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.controller.training.run import Run
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.jsontext import plain

@@ -11,7 +11,7 @@ from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.search.feasibility import solvable
 from stlc.controller.training.config import HELD_OUT_SEED, TrainConfig, resolve_config
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.rundir import HELD_OUT, RunDir

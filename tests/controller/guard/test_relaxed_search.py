@@ -14,8 +14,8 @@ from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import RelaxedSearch, StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

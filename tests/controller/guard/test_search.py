@@ -11,7 +11,7 @@ from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

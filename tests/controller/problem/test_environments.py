@@ -9,7 +9,7 @@ from stlc.controller.problem.environments import SATISFIED, Environments, reward
 from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import find_system, read_source
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source

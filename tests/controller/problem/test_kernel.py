@@ -10,7 +10,7 @@ import torch
 from stlc import native
 from stlc.controller.problem.native import NativeJudge
 from stlc.controller.problem.task import PlanVerdicts, Task
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -15,8 +15,8 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import Hard, StraightThrough
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

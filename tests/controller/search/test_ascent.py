@@ -13,7 +13,7 @@ from torch import Tensor
 from stlc.controller.problem.task import Task
 from stlc.controller.search import ascent
 from stlc.controller.search.ascent import APART, KEPT, GradientAscent
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from tests.controller.guard.test_prefix_shooting import F64, failing

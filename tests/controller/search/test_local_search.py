@@ -10,7 +10,7 @@ from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
 from stlc.controller.search.local_search import Searcher, SearchResult
 from stlc.controller.training.samplers import CAPACITY, ReplayBuffer
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 
 @pytest.fixture(params=["native", "torch"])

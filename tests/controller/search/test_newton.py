@@ -17,7 +17,7 @@ from stlc.controller.search.descent import Descent
 from stlc.controller.search.newton import GaussNewton, _riccati, values_of
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.schedules import GoalScheduler
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 ROOT = Path(__file__).parents[3]
 UNSTABLE = """stlc: 1

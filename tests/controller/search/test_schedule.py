@@ -14,7 +14,7 @@ from stlc.compile.ir.normal_form import terms
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.schedules import GoalScheduler, tempo
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 ROOT = Path(__file__).parents[3]
 HEAD = """spec goals

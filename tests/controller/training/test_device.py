@@ -16,7 +16,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir

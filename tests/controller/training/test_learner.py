@@ -13,7 +13,7 @@ from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import EFFORTS, Trainer
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -15,7 +15,7 @@ from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes,
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.run import task_of_run
 from stlc.controller.training.samplers import POOL, Missions
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir
 from stlc.source import Source

@@ -21,7 +21,7 @@ from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
 from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import MissingError, RunError
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse
 from stlc.rundir import RunDir

@@ -7,7 +7,7 @@ import pytest
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

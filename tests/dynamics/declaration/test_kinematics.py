@@ -17,7 +17,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.kinematics import Joint, chain, position
-from stlc.dynamics.declaration.load import parse_system
+from stlc.dynamics.load import parse_system
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -19,7 +19,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.tables import TableDecl, body
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.units import Unit
 
 Make = Callable[..., System]

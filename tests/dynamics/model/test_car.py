@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.switch import Hard, StraightThrough, Tanh
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 DT, V_MAX, TOTAL, SHARP = 0.1, 10.0, 8.0, 500.0
 

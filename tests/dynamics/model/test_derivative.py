@@ -13,7 +13,7 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.dynamics.model.derivative import derivative
-from stlc.dynamics.model.system import HARD, System
+from stlc.dynamics.system import HARD, System
 
 Make = Callable[..., System]
 X, Y = ir.Signal("x"), ir.Signal("y")

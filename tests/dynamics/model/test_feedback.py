@@ -19,10 +19,10 @@ from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.declaration.load import load_system_decl
+from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.model.feedback import growth_of, linearised, riccati, unstable
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.scenario import truth, under
+from stlc.dynamics.scenario import truth, under
+from stlc.dynamics.system import System
 from stlc.export.write import export
 from stlc.grammar.parse.parser import parse
 from stlc.native import compiler

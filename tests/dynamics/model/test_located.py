@@ -12,7 +12,7 @@ import torch
 import stlc
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import StlcError
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 Make = Callable[..., System]
 BALL = """\

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stlc.compile.augment.timers import Timer, clock_of
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard, StraightThrough, Switch, Tanh
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 Make = Callable[..., System]
 SWITCHES = [Hard(), Tanh(20.0), StraightThrough(5.0)]

@@ -13,7 +13,7 @@ from helpers.emitted import sizes_of
 
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.dynamics.model.step import build_step
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 from stlc.native import Kernel, compiler, load
 
 Make = Callable[..., System]

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
-from stlc.dynamics.declaration.load import SystemKeys, system_schema
+from stlc.dynamics.declaration.sections import SystemKeys, system_schema
 from stlc.dynamics.schema.names import Context, Names
 from stlc.dynamics.schema.reader import Reader
 from stlc.dynamics.schema.record import FLAG, OF, integer, json_schema, key, keys_of, read, reference, word

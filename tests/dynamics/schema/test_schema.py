@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
-from stlc.dynamics.declaration.load import parse_system
-from stlc.dynamics.model.system import System
+from stlc.dynamics.load import parse_system
+from stlc.dynamics.system import System
 from stlc.source import Source
 from stlc.units import parse_unit
 from tests.dynamics.schema.test_schema_diagnostics import GOOD

@@ -9,7 +9,7 @@ from helpers.effort import refused
 
 from stlc.cli.framework.render import render_text
 from stlc.diagnostics import CODES, StlcError
-from stlc.dynamics.declaration.load import load_system_decl, parse_system
+from stlc.dynamics.load import load_system_decl, parse_system
 from stlc.source import Source
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "dynamics"

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
     Numbers = NDArray[np.float64]
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stlc.dynamics.declaration.motion import JumpDecl
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
     Numbers = NDArray[np.float64]
 

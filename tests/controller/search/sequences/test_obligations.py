@@ -15,7 +15,7 @@ from stlc.compile.ir.text import show_formula
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.sequences.obligations import Obligations
-from stlc.dynamics.model.system import System
+from stlc.dynamics.system import System
 
 ROOT = Path(__file__).parents[4]
 HEAD = "spec goals\nstate signal x, y [m]\n"

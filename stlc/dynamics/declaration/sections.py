@@ -1,4 +1,4 @@
-"""Loading of a system file as a declaration, without torch; all errors in the file are reported together."""
+"""The sections of a system file, read as one declaration, without torch; all errors are reported together."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import names_in
-from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
+from stlc.diagnostics import StlcError, SystemFileError
 from stlc.dynamics.declaration.columns import (
     Clockwork,
     ControlKeys,
@@ -130,30 +130,10 @@ def system_schema() -> Json:
     return {**found, "anyOf": [{"required": required}, {"required": [_EXTENDS]}]}
 
 
-def load_system_decl(path: Path | str | Source, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """Load the declaration of a system file.
-
-    Args:
-        path: path of the file, or its text.
-        overrides: new values by dotted key (`train.lr`), or by the name of a constant, parameter or top-level
-            field; any other name without a dot is ignored here, because it may belong to the specification.
-
-    Raises:
-        UsageError: the file does not exist.
-        SpecError: the file is not text.
-        SystemFileError: the file is invalid; carries all findings.
-    """
-    source = path if isinstance(path, Source) else read_source(path)
-    return parse_system(source, Path(source.name), overrides or {})
-
-
-def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | None = None) -> SystemDecl:
-    """Parse the text of a system file; relative paths in it start from the folder of `path`.
-
-    `overrides` gives new values of fields, by dotted key such as `train.lr`, and of constants and parameters.
-    """
+def read_system(source: Source, path: Path, overrides: MappingType[str, str]) -> SystemDecl:
+    """Read the text of a system file; its feedback is declared, not yet applied. See `stlc.dynamics.load`."""
     reader = Reader(source)
-    found, bases = _sections(source, overrides or {}, reader)
+    found, bases = _sections(source, overrides, reader)
     version = reader.integer(found.stlc, "`stlc`")
     if found.stlc is not None and version not in (None, VERSION):
         message, advice = f"schema version {version} is not known", f"this release reads `stlc: {VERSION}`"
@@ -162,21 +142,9 @@ def parse_system(source: Source, path: Path, overrides: MappingType[str, str] | 
     if plugin is not None and (plugin.size > 1 or (isinstance(plugin, Scalar) and not plugin.is_null)):
         message, label = f"{_PLUGIN} is not supported by this version", "not acted on, so it is refused"
         reader.report("E015", message, first_line(plugin.span), label=label)
-    decl = _declaration(found, reader, path, overrides or {})
+    decl = _declaration(found, reader, path, overrides)
     reader.close()
-    decl = replace(decl, bases=bases)
-    if decl.policy.feedback is None:
-        return decl
-    from stlc.dynamics.model.feedback import NoFeedbackError, closed
-
-    try:
-        return closed(decl, decl.policy.feedback)
-    except NoFeedbackError as error:
-        advice = "give a `gain`, another point of operation (`around`), or leave `feedback` out"
-        finding = Diagnostic(
-            "S205", f"no feedback can be had: {error}", decl.policy.feedback_span, help=(advice,)
-        )
-        raise SystemFileError(finding) from None
+    return replace(decl, bases=bases)
 
 
 def _sections(

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.dynamics.init.samplers import Rows
+from stlc.dynamics.model.samplers import Rows
 
 if TYPE_CHECKING:
-    from stlc.dynamics.model.system import System
+    from stlc.dynamics.system import System
 
 MOST_COORDINATES = 4096
 """Maximum number of random numbers that the draw of one initial state may use."""

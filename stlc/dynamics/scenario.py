@@ -15,7 +15,7 @@ from pathlib import Path
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.deployment import ErrorsDecl, ScenarioDecl
-from stlc.dynamics.declaration.load import load_system_decl, parse_system
+from stlc.dynamics.load import load_system_decl, parse_system
 from stlc.registry import closest
 from stlc.source import Source
 

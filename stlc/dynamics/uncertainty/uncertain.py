@@ -21,7 +21,7 @@ from typing import Any
 from stlc.compile.frontend.scope import Definition
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.load import SystemKeys, motion_of
+from stlc.dynamics.declaration.sections import SystemKeys, motion_of
 from stlc.dynamics.schema.names import Names, NumberChanges, base_name
 from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar, as_bool

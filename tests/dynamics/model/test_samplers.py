@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from stlc.diagnostics import SystemFileError
-from stlc.dynamics.init.samplers import Rows
-from stlc.dynamics.model.system import System
+from stlc.dynamics.model.samplers import Rows
+from stlc.dynamics.system import System
 
 Make = Callable[..., System]
 

@@ -10,13 +10,13 @@ import torch
 from stlc.compile.ir.algebra import names_in
 from stlc.diagnostics import SystemFileError, UsageError
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.load import load_system_decl, parse_system
-from stlc.dynamics.model.system import System
-from stlc.dynamics.scenarios.perturbed import PerturbedSystem, perturbable
-from stlc.dynamics.scenarios.scenario import under
+from stlc.dynamics.load import load_system_decl, parse_system
+from stlc.dynamics.scenario import under
+from stlc.dynamics.system import System
+from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
 from stlc.source import Source
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 SYSTEM = """\
 stlc: 1
 name: spring

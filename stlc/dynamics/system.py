@@ -22,15 +22,15 @@ from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.learning import START
-from stlc.dynamics.declaration.load import load_system_decl
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.functions import load_functions
-from stlc.dynamics.init.samplers import Drawing, InitialStates, Rows
+from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.model.feedback import unstable
 from stlc.dynamics.model.mirror import Mirror
 from stlc.dynamics.model.rollout import Columns, Stepper
+from stlc.dynamics.model.samplers import Drawing, InitialStates, Rows
 from stlc.dynamics.model.step import ModelStep, build_step, commands
-from stlc.dynamics.scenarios.scenario import truth, under
+from stlc.dynamics.scenario import truth, under
 from stlc.files import find_system
 from stlc.native import check_plans
 from stlc.source import Source

@@ -1,1 +1,0 @@
-"""Scenarios, and true systems that deviate from their model."""

@@ -1,0 +1,1 @@
+"""Deviations of a true system from its model."""
