@@ -164,6 +164,17 @@ class Compiled:
         """Greatest lookahead of a requirement, in steps."""
         return max((rule.reach for rule in self.requirements), default=0)
 
+    @property
+    def recorded(self) -> tuple[CompiledRequirement, ...]:
+        """Requirements in the form in which they are judged on a recorded trajectory.
+
+        The first sample of such a trajectory is the start of the mission. An absolute operator
+        (`always@[a, b]`) counts its interval from the start of the mission. In this form the interval counts
+        from the first sample, and the requirement is judged only once per trajectory. A requirement without
+        absolute operators is unchanged.
+        """
+        return tuple(_from_start(rule, self.grid) if rule.absolute else rule for rule in self.requirements)
+
 
 def compile_spec(
     spec: ast.Spec,
@@ -326,6 +337,12 @@ class _Stage:
         written = requirement.formula
         formula = from_first_sample(written) if absolute(written) else written
         return Augmented(formula, typed.Truth(written.span, True), None)
+
+
+def _from_start(rule: CompiledRequirement, grid: Grid) -> CompiledRequirement:
+    lowered = lower(from_first_sample(rule.typed.formula), grid, [])
+    formula = simplify(lowered)
+    return replace(rule, formula=formula, lowered=lowered, reach=reach(formula).future, windowed=False)
 
 
 def _remembered(timers: Iterable[Timer]) -> int:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.controller.evaluation.executed import whole_run_rule
 from stlc.controller.guard.candidates import SOURCES
 from stlc.monitor.online.margins import Margin, Margins
 
@@ -32,7 +31,7 @@ class LiveMonitor:
         self.task, self.setting = task, setting
         self.moment: SimulationStep | None = None
         self.counts: NDArray[np.int64] = np.zeros(len(SOURCES), dtype=np.int64)
-        self._margins = Margins([whole_run_rule(rule, task) for rule in task.rules], task.window)
+        self._margins = Margins(task.compiled.recorded, task.window)
 
     def push(self, moment: SimulationStep) -> None:
         """Append the next step of the deployment."""

@@ -10,12 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.ir.support import reach
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
 from stlc.controller.problem.task import satisfied
@@ -120,25 +116,10 @@ def executed_robustness(task: Task, recording: DeploymentRecording) -> dict[str,
     }
 
 
-def whole_run_rule(rule: CompiledRequirement, task: Task) -> CompiledRequirement:
-    """Return a requirement in the form in which it is judged on a recorded trajectory.
-
-    The first sample of such a trajectory is the start of the mission. An absolute operator (`always@[a, b]`)
-    counts its interval from the start of the mission. In the returned form the interval counts from the first
-    sample, and the requirement is judged only once per trajectory. A requirement without absolute operators
-    is returned unchanged.
-    """
-    if not rule.absolute:
-        return rule
-    lowered = lower(from_first_sample(rule.typed.formula), task.compiled.grid, [])
-    written = simplify(lowered)
-    return replace(rule, formula=written, lowered=lowered, reach=reach(written).future, windowed=False)
-
-
 def _margins_of_rules(task: Task, recording: DeploymentRecording) -> dict[str, Margins]:
     """Bounds on the robustness of each requirement at the start instants of `Executed`."""
     columns = _columns(task, recording)
-    return {rule.name: _margins(whole_run_rule(rule, task), columns, task.window) for rule in task.rules}
+    return {rule.name: _margins(rule, columns, task.window) for rule in task.compiled.recorded}
 
 
 def _columns(task: Task, recording: DeploymentRecording) -> dict[str, NDArray[np.float64]]:
@@ -154,8 +135,8 @@ def _decided(
     `fails`: requirement -> mask, (starts, rows). The first `MOST_TIMED` failing rows of each are determined.
     """
     columns, last, found = _columns(task, recording), recording.steps, {}
-    for rule in task.rules:
-        failing, written = fails[rule.name], whole_run_rule(rule, task)
+    for rule, written in zip(task.rules, task.compiled.recorded, strict=True):
+        failing = fails[rule.name]
         rows = np.flatnonzero(failing.any(0))[:MOST_TIMED]
         samples = found[rule.name] = np.full(failing.shape[1], np.nan)
         starts = failing[:, rows].argmax(0) if len(rows) else rows
