@@ -14,7 +14,6 @@ NODES = 463637
 CROSSINGS = 6.81
 CIRCLES = {
     ("compile/backends", "compile/semantics"),
-    ("controller/deployment", "controller/guard"),
     ("controller/evaluation", "controller/training"),
     ("controller/methods", "controller/training"),
 }

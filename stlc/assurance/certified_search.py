@@ -24,8 +24,8 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, best, finite, rank
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
-from stlc.controller.streams import seeded
 from stlc.diagnostics import usage
+from stlc.dynamics.model.samplers import seeded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
+
+from stlc.dynamics.model.samplers import seeded
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -43,12 +44,3 @@ class Streams:
         """Initial states from the training distribution, `count` per agent: (agents, count, n) float64."""
         drawn = [system.sample(count, generator=own, dtype=torch.float64) for own in self.own]
         return torch.stack(drawn)
-
-
-def seeded(base: int, key: int) -> torch.Generator:
-    """Generator derived from the seed `base` and the number `key`.
-
-    The random numbers for different keys are independent.
-    """
-    seed = np.random.SeedSequence(base, spawn_key=(key,)).generate_state(1, np.uint64)
-    return torch.Generator().manual_seed(int(seed[0] >> np.uint64(1)))

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.controller.deployment.disturbance import Events
 from stlc.controller.sketch import DECIDED, Scene, deciders
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
+from stlc.dynamics.uncertainty.disturbance import Events
 from stlc.foreign import module_at
 from stlc.registry import closest
 

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from stlc.assurance.certified_search import Certifier
-from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.guard.candidates import POLICY, Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
@@ -19,6 +18,7 @@ from stlc.diagnostics import UsageError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
+from stlc.dynamics.uncertainty.disturbance import Disturbance
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

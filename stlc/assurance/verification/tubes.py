@@ -29,11 +29,11 @@ from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
-from stlc.controller.deployment.disturbance import ErrorSizes
 from stlc.diagnostics import usage
 from stlc.dynamics.model.samplers import Drawing
 from stlc.dynamics.model.schedule import blocks
 from stlc.dynamics.model.step import build_step, commands
+from stlc.dynamics.uncertainty.disturbance import ErrorSizes
 from stlc.dynamics.uncertainty.perturbed import perturbable
 
 if TYPE_CHECKING:

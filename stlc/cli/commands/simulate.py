@@ -476,9 +476,9 @@ def _save(
     `found` maps each kind of guard to its results. The trace of the last kind is saved as the main trace.
     `planners` maps a planner beside the policy to its results, of which no trace is saved.
     """
-    from stlc.controller.deployment.disturbance import errors_of
     from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded
     from stlc.controller.evaluation.deployment import as_json
+    from stlc.dynamics.uncertainty.disturbance import errors_of
     from stlc.rundir import SCENE, SIMULATION
 
     last = list(found.values())[-1]

@@ -23,10 +23,10 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import add, multiply
 from stlc.compile.ir.traverse import map_children
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.deployment.disturbance import Disturbance
 from stlc.controller.problem.task import Task
-from stlc.controller.streams import seeded
 from stlc.diagnostics import Diagnostic, UsageError
+from stlc.dynamics.model.samplers import seeded
+from stlc.dynamics.uncertainty.disturbance import Disturbance
 from stlc.registry import GUARDS, closest
 
 if TYPE_CHECKING:

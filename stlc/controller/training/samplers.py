@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, ClassVar, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc.controller.deployment.disturbance import Events
 from stlc.controller.problem.task import satisfied
+from stlc.dynamics.uncertainty.disturbance import Events
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -510,3 +510,12 @@ def _values(column: Column, arrays: Mapping[str, np.ndarray], recording: Recordi
     change = conversion(recording.name, column, stored.unit)
     numbers = values.astype(np.float64).ravel()
     return numbers if change is None else change(numbers)
+
+
+def seeded(base: int, key: int) -> torch.Generator:
+    """Generator derived from the seed `base` and the number `key`.
+
+    The random numbers for different keys are independent.
+    """
+    seed = np.random.SeedSequence(base, spawn_key=(key,)).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(seed[0] >> np.uint64(1)))

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from stlc.assurance.verification.tubes import DEVIATIONS, TubeModel, tube
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.controller.deployment.disturbance import Disturbance, ErrorSizes
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.model.samplers import Drawing
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
+from stlc.dynamics.uncertainty.disturbance import Disturbance, ErrorSizes
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.deployment.disturbance import Disturbance, errors_of
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.guard import Guard
@@ -22,6 +21,7 @@ from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import standard, under
 from stlc.dynamics.system import System
+from stlc.dynamics.uncertainty.disturbance import Disturbance, errors_of
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source
 

@@ -13,9 +13,8 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
-from stlc.controller.streams import seeded
 from stlc.dynamics.declaration.deployment import ErrorsDecl, EventDecl
-from stlc.dynamics.model.samplers import Drawing, Rows
+from stlc.dynamics.model.samplers import Drawing, Rows, seeded
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
 from stlc.units import parse_unit
 
