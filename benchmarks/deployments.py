@@ -28,8 +28,8 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kind import GuardKind, compared_guards
 from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.margins import AUTO, MarginRequest, parse_margins
+from stlc.controller.run.run import Run
 from stlc.controller.search.feasibility import viable
-from stlc.controller.training.run import Run
 from stlc.controller.world import world_type
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl

@@ -31,8 +31,8 @@ from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.search.planner import PLANNING_VERSION, PlanBudget, planner_named
-from stlc.controller.training.run import Run
 from stlc.diagnostics import UsageError
 from stlc.jsontext import plain
 from stlc.provenance import sha256

@@ -20,10 +20,10 @@ from benchmarks.training import benchmark_order, judged_states, pack, unpack
 from stlc.cli.framework.output import say
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.run.config import HELD_OUT_SEED
+from stlc.controller.run.run import Run
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
-from stlc.controller.training.config import HELD_OUT_SEED
-from stlc.controller.training.run import Run
 from stlc.diagnostics import StlcError, UsageError
 
 if TYPE_CHECKING:

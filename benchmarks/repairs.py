@@ -22,10 +22,10 @@ from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.search.ascent import SEED, GradientAscent
 from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.search.local_search import Searcher
-from stlc.controller.training.run import Run
 
 SHORT, LONG = 2000, 32_000
 """Number of plans that a short and a long local search evaluate for each of two initial guesses."""

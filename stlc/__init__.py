@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from stlc.assurance.verification.tubes import tube
     from stlc.controller.problem.task import Task
+    from stlc.controller.run.run import Run
     from stlc.controller.search.planner import PlanResult, plan
-    from stlc.controller.training.run import Run
     from stlc.diagnostics import SpecError, StlcError
     from stlc.dynamics.system import System
     from stlc.grammar import ast
@@ -70,7 +70,7 @@ _HOMES = {
     "Monitor": "stlc.monitor.verdict:Monitor",
     "PlanResult": "stlc.controller.search.planner:PlanResult",
     "RequirementVerdict": "stlc.monitor.judgement:RequirementVerdict",
-    "Run": "stlc.controller.training.run:Run",
+    "Run": "stlc.controller.run.run:Run",
     "SpecError": "stlc.diagnostics:SpecError",
     "StlcError": "stlc.diagnostics:StlcError",
     "System": "stlc.dynamics.system:System",

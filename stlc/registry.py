@@ -296,10 +296,10 @@ METHODS: PackageRegistry[Any] = PackageRegistry(
     "METHOD",
     default="guided",
     group="stlc.methods",
-    accepts="stlc.controller.methods:Method",
+    accepts="stlc.controller.training.method:Method",
     moved={name: f"benchmarks/methods/{name}.py" for name in ("mbpo", "pets", "ppo", "sac")},
 )
-"""Training methods (`stlc.controller.methods.Method`) of `--method` and `train: {method: …}`."""
+"""Training methods (`stlc.controller.training.method.Method`) of `--method` and `train: {method: …}`."""
 
 PLANNERS: PackageRegistry[Any] = PackageRegistry(
     "planner",

@@ -14,9 +14,9 @@ from stlc import Run, System
 from stlc.cli.framework.app import PROGRAM, main
 from stlc.controller.guard.stages import STAGES
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import save_config
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import save_config
 from stlc.diagnostics import PluginError, SystemFileError, UsageError
 from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source

@@ -14,8 +14,6 @@ NODES = 463637
 CROSSINGS = 6.81
 CIRCLES = {
     ("compile/backends", "compile/semantics"),
-    ("controller/evaluation", "controller/training"),
-    ("controller/methods", "controller/training"),
 }
 IMPLEMENTATIONS = {
     "numbers of one step": 5,

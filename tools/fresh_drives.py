@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from stlc.controller.evaluation.closed_loop import closed_loop, fresh_share
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 
 
 def main() -> None:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Self, get_args
 import torch
 from torch import Tensor
 
-from stlc.controller.methods import Learner
 from stlc.controller.options import bounded
 from stlc.controller.policies.policy import ActorNetwork, ClosedLoopActor, Policy
 from stlc.controller.problem.environments import Reward, observe
 from stlc.controller.problem.native import NativeStep
-from stlc.controller.training.config import ResolvedConfig
+from stlc.controller.run.config import ResolvedConfig
+from stlc.controller.training.method import Learner
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from benchmarks.methods._actor import ActorConfig, optimizer_tensors, restore_optimizer
 from benchmarks.methods._ensemble import Ensemble, Fit, Predictor, optimizer_of, train_ensemble
-from stlc.controller.methods import Learner
 from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward, reward_at_end
-from stlc.controller.training.checkpoint import below
+from stlc.controller.run.checkpoint import below
+from stlc.controller.training.method import Learner
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:

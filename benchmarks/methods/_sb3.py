@@ -31,7 +31,7 @@ from benchmarks.methods._actor import (
 from benchmarks.methods._sac import SacActor, SacConfig
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
-from stlc.controller.training.checkpoint import below
+from stlc.controller.run.checkpoint import below
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from benchmarks.methods._actor import optimizer_tensors, restore_optimizer
 from benchmarks.methods._ensemble import BatchedMlp
-from stlc.controller.training.checkpoint import below
+from stlc.controller.run.checkpoint import below
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

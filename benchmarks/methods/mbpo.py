@@ -24,16 +24,17 @@ from torch import Tensor
 from benchmarks.methods._actor import ActorPolicy, finite_weights
 from benchmarks.methods._imagined import ModelConfig, ModelLearner, final_reward, step_rewards
 from benchmarks.methods._soft_actor_critic import BOUND, SacOptions, SoftActorCritic, TransitionBatch
-from stlc.controller.methods import Method
 from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers
+from stlc.controller.run.run import load_weights
 from stlc.controller.training.config import base_config
-from stlc.controller.training.run import load_weights
+from stlc.controller.training.method import Method
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.controller.run.config import ResolvedConfig
+    from stlc.controller.training.config import TrainConfig
     from stlc.rundir import RunDir
 
 BATCH, RATE, HIDDEN = 256, 1e-3, (128, 128)

@@ -27,16 +27,17 @@ from benchmarks.methods._imagined import (
     final_reward,
     step_rewards,
 )
-from stlc.controller.methods import Method
 from stlc.controller.options import bounded
 from stlc.controller.policies.policy import Policy
+from stlc.controller.run.run import load_weights
 from stlc.controller.training.config import base_config
-from stlc.controller.training.run import load_weights
+from stlc.controller.training.method import Method
 
 if TYPE_CHECKING:
     from stlc.controller.problem.environments import Reward
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.controller.run.config import ResolvedConfig
+    from stlc.controller.training.config import TrainConfig
     from stlc.rundir import RunDir
 
 ROWS = 20_000

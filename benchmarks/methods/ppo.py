@@ -24,21 +24,22 @@ from benchmarks.methods._actor import (
     optimizer_tensors,
     restore_optimizer,
 )
-from stlc.controller.methods import Method
 from stlc.controller.options import bounded
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import ActorNetwork, DenseLayers
 from stlc.controller.problem.environments import Environments, Reward
-from stlc.controller.training.checkpoint import below
+from stlc.controller.run.checkpoint import below
+from stlc.controller.run.run import load_weights
 from stlc.controller.training.config import base_config
-from stlc.controller.training.run import load_weights
+from stlc.controller.training.method import Method
 from stlc.dynamics.model.controls import raw_width, squash
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.controller.run.config import ResolvedConfig
+    from stlc.controller.training.config import TrainConfig
     from stlc.rundir import RunDir
 
 VALUE = 0.5

@@ -13,15 +13,16 @@ import torch
 
 from benchmarks.methods._actor import ActorPolicy
 from benchmarks.methods._sac import SacActor, SacConfig
-from stlc.controller.methods import Learner, Method
+from stlc.controller.run.run import load_weights
 from stlc.controller.training.config import base_config
-from stlc.controller.training.run import load_weights
+from stlc.controller.training.method import Learner, Method
 from stlc.extras import explained
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.ddp import Ranks
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.controller.run.config import ResolvedConfig
+    from stlc.controller.training.config import TrainConfig
     from stlc.rundir import RunDir
 
 BATCH, RATE = 256, 3e-4

@@ -28,7 +28,7 @@ from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.simulator import Setting
 from stlc.controller.evaluation.rules import rules_of
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.registry import GUARDS
 from stlc.rundir import RunDir
 

@@ -23,8 +23,8 @@ from stlc.assurance.drive_search import DRIVE_SEARCH_VERSION, search_drives
 from stlc.assurance.drive_simulator import DriveSimulator
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.batched import Setting
+from stlc.controller.run.run import Run
 from stlc.controller.training.failures import FAILURES_VERSION
-from stlc.controller.training.run import Run
 from stlc.registry import GUARDS
 from stlc.rundir import RunDir
 

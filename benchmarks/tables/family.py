@@ -28,7 +28,7 @@ from benchmarks.training import (
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.controller.evaluation.held_out import score
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 
 BUDGETS = (60.0,)
 TEXT = f"""\

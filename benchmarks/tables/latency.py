@@ -27,7 +27,7 @@ from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.diagnostics import UsageError
 from stlc.registry import GUARDS
 

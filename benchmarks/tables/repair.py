@@ -18,7 +18,7 @@ from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import one_thread
 from stlc.cli.framework.options import SeedsOption, parse_seeds
 from stlc.cli.framework.program import command
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 
 TEXT = """## Repair of a plan
 

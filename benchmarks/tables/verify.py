@@ -25,8 +25,8 @@ from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import LocalProcesses
+from stlc.controller.run.run import Run
 from stlc.controller.training.budget import clock_of
-from stlc.controller.training.run import Run
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 

@@ -24,7 +24,7 @@ from benchmarks.options import Output, chosen
 from benchmarks.store import Result, ResultStore
 from benchmarks.table import WIDTH, Columns, Table, listed, provenance
 from stlc.cli.framework.program import command
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.registry import GUARDS
 
 TEXT = """\

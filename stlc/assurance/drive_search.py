@@ -19,8 +19,8 @@ from stlc.assurance.search_space import Point, SearchSpace
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, SimulationStep, Watch
+from stlc.controller.run.run import Run
 from stlc.controller.training.failures import SearchRound
-from stlc.controller.training.run import Run
 from stlc.native import Stop, never
 from stlc.registry import GUARDS
 

@@ -22,7 +22,7 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.world import world_type
 
 if TYPE_CHECKING:
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
     from stlc.monitor.judgement import Verdict
     from stlc.trace import Trace
 

@@ -17,8 +17,8 @@ from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.guard import Guard
-from stlc.controller.training.checkpoint import FOLDER, POINTER, CheckpointHead
-from stlc.controller.training.run import CONFIG, declaration_of_run, spec_hash, system_hash
+from stlc.controller.run.checkpoint import FOLDER, POINTER, CheckpointHead
+from stlc.controller.run.run import CONFIG, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.functions import function_files
 from stlc.monitor.judgement import chosen
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.deployment.simulator import DeploymentRecording, Watch
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
     from stlc.dynamics.declaration.decl import SystemDecl
 
 ROWS = 1000

@@ -14,7 +14,7 @@ import torch
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, Value
 from stlc.controller.guard import candidates as backup
-from stlc.controller.training.run import spec_hash, system_hash
+from stlc.controller.run.run import spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.extras import needed
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from stlc.compile.backends.onnx.sheet import GraphNode, OnnxGraph
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
 
 
 # ----------------------------------------------------------------------------------------------- files

@@ -38,7 +38,7 @@ from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 
 if TYPE_CHECKING:
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
 
 Target: TypeAlias = Literal["torch", "c", "onnx"]
 TARGETS: tuple[Target, ...] = get_args(Target)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from stlc.compile.ir.traverse import margin_unit
-from stlc.controller.training.run import read_library
+from stlc.controller.run.run import read_library
 from stlc.diagnostics import StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl

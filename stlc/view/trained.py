@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.training.launch import train_here
 from stlc.controller.training.loop import Watch
-from stlc.controller.training.run import Run
 
 
 def train(task: Task, *, progress: bool = True, **options: Any) -> Run:

@@ -17,7 +17,7 @@ from stlc.assurance.search_space import SearchSpace
 from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.native import never
 
 TRAIN = "train specs/cart.stl --steps 1 --batch 16 --held-out 10 --drives 0 --no-pictures -q"

@@ -21,9 +21,9 @@ from stlc.controller.evaluation.rules import Rules, rules_of
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import Run
 from stlc.controller.world import ModelWorld, independent_agents
 from stlc.dynamics.system import System
 from stlc.files import read_source

@@ -19,10 +19,10 @@ from benchmarks.tables.family import COLUMNS, FAMILIES, Family, Row, section
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place
 from stlc.controller.problem.task import Task, satisfied
-from stlc.controller.training.config import HELD_OUT_SEED
+from stlc.controller.run.config import HELD_OUT_SEED
+from stlc.controller.run.run import Run
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
-from stlc.controller.training.run import Run
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
 from stlc.rundir import every_run

@@ -44,10 +44,10 @@ from stlc.cli.framework.app import main
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.controller.problem.task import satisfied
-from stlc.controller.training.config import HELD_OUT_SEED
+from stlc.controller.run.config import HELD_OUT_SEED
+from stlc.controller.run.run import Run
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import Watch, train
-from stlc.controller.training.run import Run
 from stlc.registry import METHODS
 from stlc.rundir import every_run
 

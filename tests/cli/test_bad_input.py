@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stlc.cli.framework.app import main
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.rundir import RunDir
 
 CART = """

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import spec_hash, task_of_run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import spec_hash, task_of_run
 from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

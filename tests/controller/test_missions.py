@@ -15,10 +15,10 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, 
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
-from stlc.controller.problem.task import PlanVerdicts, Task
+from stlc.controller.problem.task import ROUNDS, PlanVerdicts, Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
-from stlc.controller.training.samplers import GLIMPSES, POOL, ROUNDS, Draws, Missions, mission_steps
+from stlc.controller.training.samplers import GLIMPSES, POOL, Draws, Missions
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
@@ -69,9 +69,9 @@ def task(system: System) -> Task:
 
 def test_missions_without_end_are_driven_for_several_rounds(system: System) -> None:
     ending = task_of("state signal x [m]\nrequire a: always@[2 s, 4 s] once[0, 2 s] x > 1 m", system)
-    assert mission_steps(ending) == 40 + ending.horizon
+    assert ending.mission_steps == 40 + ending.horizon
     task = task_of("state signal x [m]\nrequire a: always@[2 s, end] once[0, 2 s] x > 1 m", system)
-    assert mission_steps(task) == 20 + ROUNDS * 21
+    assert task.mission_steps == 20 + ROUNDS * 21
 
 
 def steered(task: Task, x: Tensor) -> Tensor:

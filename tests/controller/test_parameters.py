@@ -17,10 +17,10 @@ from stlc.controller.evaluation.archive import save_trace_of
 from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.problem.native import NativeJudge
 from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
-from stlc.controller.training.run import Run
 from stlc.diagnostics import StlcError, TraceError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System

@@ -16,7 +16,7 @@ from stlc.cli.framework.app import main
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.closed_loop import fresh_share
 from stlc.controller.problem.task import Task
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

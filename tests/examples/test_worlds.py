@@ -17,9 +17,9 @@ from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.evaluation.metrics import METRICS
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import Run
 from stlc.controller.world import Choosing, world_type
 from stlc.dynamics.system import System
 from stlc.files import read_source

@@ -21,9 +21,9 @@ from stlc.cli.framework.app import main
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import Run
 from stlc.diagnostics import RunError, UsageError
 from stlc.export.programs import without_deprecations
 from stlc.export.verify import Answer, agreement, answers

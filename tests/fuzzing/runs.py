@@ -173,7 +173,7 @@ def prepare() -> list[str]:
     except ModuleNotFoundError as error:
         return [f"run ({error.name} is not installed)"]
     for name in (
-        "stlc.controller.training.run",
+        "stlc.controller.run.run",
         "stlc.controller.deployment.simulator",
         "stlc.controller.training.loop",
     ):

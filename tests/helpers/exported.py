@@ -14,9 +14,9 @@ import torch
 from stlc import native
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import Run
 from stlc.dynamics.system import System
 from stlc.export.verify import BUILT
 from stlc.export.write import Exported, export

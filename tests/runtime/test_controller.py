@@ -22,7 +22,7 @@ from helpers.exported import ROOT, exported, mission, run_of
 
 from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.guard import Guard
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.diagnostics import MissingError, RunError, StlcError, UsageError
 from stlc.export.write import export
 from stlc.runtime import Controller

@@ -43,7 +43,7 @@ class PolicySource:
 
     def load(self) -> ProposedPlans:
         """Load the plans of the policy."""
-        from stlc.controller.training.run import Run
+        from stlc.controller.run.run import Run
 
         opened = Run.open(self.run)
         return ProposedPlans(opened.task, opened.policy)

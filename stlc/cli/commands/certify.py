@@ -233,7 +233,7 @@ class _Chosen:
         from stlc.controller.deployment.simulator import Setting
         from stlc.controller.evaluation.rules import rules_of
         from stlc.controller.guard.margins import parse_margins
-        from stlc.controller.training.run import Run
+        from stlc.controller.run.run import Run
 
         how = self.how
         mode = GUARDS.get(how.guard).name

@@ -127,7 +127,7 @@ def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[Gua
     of constants.
     """
     from stlc.controller.guard.coverage import guarantee
-    from stlc.controller.training.run import task_of_run
+    from stlc.controller.run.run import task_of_run
     from stlc.rundir import RunDir
 
     folder = RunDir.open(run, runs)

@@ -80,7 +80,7 @@ def export(
         raise usage(
             "`--float`, `--dt`, `--system` and `--set` belong to a monitor", "stlc export SPEC.stl --to c"
         )
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
     from stlc.export.write import export as write
     from stlc.export.write import precision_of, target_of
 

@@ -214,7 +214,7 @@ class _Target:
             return ModelSimulator.load(self.name, self.system, overrides)
         from stlc.assurance.drive_simulator import DriveSimulator
         from stlc.controller.deployment.batched import Setting
-        from stlc.controller.training.run import Run
+        from stlc.controller.run.run import Run
 
         if self.system is not None:
             raise usage(

@@ -27,9 +27,9 @@ from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
     from stlc.assurance.verification.planned import Plans, PlanTubes
+    from stlc.controller.planning.policy import PlannerChoice
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner import PlanResult
-    from stlc.controller.training.config import PlannerChoice
 
 
 @command(

@@ -152,7 +152,8 @@ def train(
         with one_voice():
             session = _resume(RunDir.open(resume, runs), total, more, device, logger)
             return session.conclude(pictures=pictures)
-    from stlc.controller.training.config import DRIVES, HELD_OUT, TrainConfig
+    from stlc.controller.run.config import DRIVES, HELD_OUT
+    from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
 
     config = TrainConfig(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.deployment.simulator import DeploymentRecording, Setting
     from stlc.controller.evaluation.rules import Rules
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
     from stlc.trace import Trace
 
 

@@ -39,14 +39,14 @@ from stlc.controller.evaluation.rules import (
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kind import compared_guards
-from stlc.controller.training.config import DRIVES
+from stlc.controller.run.config import DRIVES
 from stlc.controller.world import world_type
 from stlc.diagnostics import StlcError
 from stlc.jsontext import Num
 from stlc.registry import GUARDS
 
 if TYPE_CHECKING:
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
 
 SEED = 1 << 40
 """Seed of the first closed-loop runs; those of `simulate` begin at 0."""

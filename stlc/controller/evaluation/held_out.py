@@ -13,10 +13,9 @@ import torch
 
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import satisfied
+from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.search.feasibility import solve
 from stlc.controller.search.planner import PlanBudget, plan
-from stlc.controller.training.config import HELD_OUT, HELD_OUT_SEED
-from stlc.controller.training.samplers import mission_steps
 from stlc.files import write_atomic
 from stlc.native import never
 
@@ -148,7 +147,7 @@ def score(
     return Score(
         accuracy=accuracy,
         interval=wilson(accuracy, n),
-        endless=None if task.compiled.recurring is None else mission_steps(task) * task.system.dt,
+        endless=None if task.compiled.recurring is None else task.mission_steps * task.system.dt,
         requirements={rule.name: float(share) for rule, share in zip(task.rules, shares, strict=True)},
         feasible=(int(known.sum()) + assumed) / n,
         states=states,

@@ -11,7 +11,8 @@ from stlc.controller.training.objective import paper_objective
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig, TrainConfig
+    from stlc.controller.run.config import ResolvedConfig
+    from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.learner import Trainer
     from stlc.controller.training.objective import Objective
 

@@ -6,16 +6,14 @@ import json
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from stlc.controller.methods import Method
-from stlc.controller.planning.policy import PlannerPolicy
-from stlc.controller.search.planner import PlanBudget, Planner, planner_named
-from stlc.controller.training.config import PlannerChoice, ResolvedConfig, base_config
-from stlc.diagnostics import Diagnostic, RunError, usage
+from stlc.controller.planning.policy import PlannerChoice, PlannerPolicy, planner_of, planner_policy
+from stlc.controller.run.config import ResolvedConfig
+from stlc.controller.training.config import base_config
+from stlc.controller.training.method import Method
+from stlc.diagnostics import Diagnostic, RunError
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import TrainConfig
     from stlc.rundir import RunDir
@@ -73,26 +71,6 @@ class PlanMethod(Method):
             raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
         choice = PlannerChoice(config.planner, given, config.seconds, config.evaluations or None)
         return planner_policy(task, choice, seed=config.seed)
-
-
-def planner_policy(task: Task, choice: PlannerChoice, *, seed: int = 0) -> PlannerPolicy:
-    """Return the planner `choice` as a policy for `task`. Raises UsageError (U101), see `planner_of`."""
-    budget = PlanBudget(choice.seconds, choice.evaluations)
-    return PlannerPolicy(task, planner_of(choice.name, choice.options), budget, seed=seed)
-
-
-def planner_of(name: str, options: Mapping[str, str]) -> Planner:
-    """Return the planner `name` with its options, for planning in closed loop.
-
-    Raises:
-        UsageError: U101, there is no such planner or option; or `name` is `policy`, the planner that takes
-            the plans of a trained policy. In closed loop, simulate the run of this policy instead.
-    """
-    if name == "policy":
-        raise usage(
-            "planner `policy` takes the plans of a trained run", "simulate that run: stlc simulate RUN"
-        )
-    return planner_named(name, **options)
 
 
 METHOD = PlanMethod()

@@ -11,14 +11,34 @@ from torch import Tensor
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.policies.policy import Policy
 from stlc.controller.search.planner import PlanBudget, Planner, PlanSearch, Solver, planner_named, prepared
+from stlc.diagnostics import usage
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from stlc.controller.problem.task import PlanVerdicts, Task
 
 SHORT = 64
 """Number of plans judged in the search for a plan that continues a prefix."""
 FIRST = 50
 """Budgets of a decision that the first plan of a mission may take: it is made before the mission begins."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerChoice:
+    """A planner for closed-loop planning, with its options.
+
+    Attributes:
+        name: name in `stlc.registry.PLANNERS`.
+        options: options of the planner, name -> text.
+        seconds: processor time for each plan, in seconds.
+        evaluations: maximum number of candidate plans that are judged to find a plan; None for no limit.
+    """
+
+    name: str
+    options: Mapping[str, str]
+    seconds: float
+    evaluations: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,3 +127,23 @@ class PlannerPolicy(Policy):
                     search.offer(rows, search.start)
             solver(search)
         return search
+
+
+def planner_policy(task: Task, choice: PlannerChoice, *, seed: int = 0) -> PlannerPolicy:
+    """Return the planner `choice` as a policy for `task`. Raises UsageError (U101), see `planner_of`."""
+    budget = PlanBudget(choice.seconds, choice.evaluations)
+    return PlannerPolicy(task, planner_of(choice.name, choice.options), budget, seed=seed)
+
+
+def planner_of(name: str, options: Mapping[str, str]) -> Planner:
+    """Return the planner `name` with its options, for planning in closed loop.
+
+    Raises:
+        UsageError: U101, there is no such planner or option; or `name` is `policy`, the planner that takes
+            the plans of a trained policy. In closed loop, simulate the run of this policy instead.
+    """
+    if name == "policy":
+        raise usage(
+            "planner `policy` takes the plans of a trained run", "simulate that run: stlc simulate RUN"
+        )
+    return planner_named(name, **options)

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from stlc.grammar import ast
 
 HARD = Hard()
+ROUNDS = 5
+"""Number of periods for which a mission with requirements that recur forever is simulated."""
 MOST_MISSED, UNSAFE = 1e9, 1e6
 """Greatest shortfall of a requirement that counts, and what an unsafe plan is worth less than a safe one."""
 LONGEST = 500
@@ -198,6 +200,24 @@ class Task:
         """
         kinds = [timer.kind for timer in self.compiled.timers]
         return kinds.index("clock") - len(kinds) if "clock" in kinds else None
+
+    @property
+    def mission_steps(self) -> int:
+        """Number of steps for which a mission is simulated.
+
+        If no requirement refers to times since the start of the mission, a mission takes four horizons.
+        Otherwise let t be the last time to which a requirement refers. The mission ends one horizon after t.
+        If requirements recur forever, it ends `ROUNDS` periods after t instead. Here a period is taken as at
+        least one horizon.
+        """
+        named, recurring = self.compiled.mission, self.compiled.recurring
+        if self.compiled.grid.end is not None:
+            return self.compiled.grid.end
+        if named is None:
+            return self.horizon * 4
+        if recurring is None:
+            return named + self.horizon
+        return named + ROUNDS * max(self.horizon, recurring)
 
     @property
     def rules(self) -> tuple[CompiledRequirement, ...]:

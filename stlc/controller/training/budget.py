@@ -16,16 +16,14 @@ import time
 from collections import deque
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from stlc.native import cores
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-
-Clock = Literal["wall", "processor"]
-"""Clock of a budget: wall time, or processor time as on an idle machine."""
+    from stlc.controller.run.config import Clock
 
 PROVISIONAL = 10_000
 """Planned number of steps before the first steps have been timed."""

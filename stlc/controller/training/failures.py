@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from stlc.controller.training.run import Run
+    from stlc.controller.run.run import Run
     from stlc.native import Stop
 
 FAILURES_VERSION = 3

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from stlc.controller.evaluation.closed_loop import ClosedLoop, closed_loop
 from stlc.controller.evaluation.held_out import Score, score, silent
+from stlc.controller.run.run import Run
 from stlc.controller.training.budget import simulation_reserve, verdict_reserve
 from stlc.controller.training.conflict import conflict, refuted
-from stlc.controller.training.run import Run
 from stlc.jsontext import plain
 
 if TYPE_CHECKING:
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
+    from stlc.controller.run.config import ResolvedConfig
     from stlc.controller.training.budget import TimeBudget
-    from stlc.controller.training.config import ResolvedConfig
-    from stlc.controller.training.run import RunWriter
+    from stlc.controller.training.writer import RunWriter
     from stlc.diagnostics import Diagnostic
 
 VERDICT_OVER = 0.04

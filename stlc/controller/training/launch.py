@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
-from stlc.controller.methods.plan import planner_of
+from stlc.controller.planning.policy import planner_of
+from stlc.controller.run.config import ResolvedConfig
+from stlc.controller.run.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.controller.search.planner import prepared
-from stlc.controller.training.config import ENGINE_VERSION, ResolvedConfig, TrainConfig, resolve_config
+from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import Watch, prepare, run
-from stlc.controller.training.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.diagnostics import usage
 from stlc.dynamics.functions import function_files
 from stlc.provenance import git_state, hardware, sha256, versions
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from stlc.controller.planning.policy import PlannerChoice
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import PlannerChoice
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,19 +19,19 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.controller.methods import Learner, Method, Validation
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import rank, satisfied
+from stlc.controller.run.checkpoint import below
+from stlc.controller.run.run import load_weights
 from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import TAILS, THOROUGH, Search, Searcher, SearchResult, remainders
 from stlc.controller.search.planner import PlanBudget, plan
-from stlc.controller.training.checkpoint import below
 from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.failures import FailureBank
+from stlc.controller.training.method import Learner, Method, Validation
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.objective import loss
-from stlc.controller.training.run import load_weights
 from stlc.controller.training.samplers import Draws, FixedSet, Missions, ReplayBuffer, Supply
 from stlc.native import never
 from stlc.registry import METHODS
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import ResolvedConfig
+    from stlc.controller.run.config import ResolvedConfig
     from stlc.controller.training.objective import Objective
     from stlc.diagnostics import StlcError
     from stlc.native import Stop

@@ -16,14 +16,16 @@ import torch
 from stlc.controller.evaluation.held_out import silent
 from stlc.controller.parallel.ddp import ALONE, Ranks, find_device
 from stlc.controller.problem.load import require_controls
+from stlc.controller.run.checkpoint import Checkpoint, load_checkpoint, never_saved, restoring
+from stlc.controller.run.config import ResolvedConfig
+from stlc.controller.run.run import Run, load_config, spec_hash, system_hash, task_of_run
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
-from stlc.controller.training.checkpoint import Checkpoint, load_checkpoint, never_saved, restoring
-from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.conflict import refuted
 from stlc.controller.training.diagnose import check_mirror
 from stlc.controller.training.failures import SHARE
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
-from stlc.controller.training.run import Run, RunWriter, load_config, spec_hash, system_hash, task_of_run
+from stlc.controller.training.writer import RunWriter
 from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, usage
 from stlc.native import never
 from stlc.registry import METHODS
@@ -32,9 +34,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from contextlib import AbstractContextManager
 
-    from stlc.controller.methods import Learner, Method, Validation
     from stlc.controller.problem.task import Task
     from stlc.controller.training.failures import FailureBank, FailureSearch
+    from stlc.controller.training.method import Learner, Method, Validation
     from stlc.rundir import RunDir
 
 DEFAULT_BUDGET = 60.0

@@ -121,8 +121,6 @@ GLIMPSES = 4
 """Number of states returned per leg of a mission (a leg is the part of a plan that is followed)."""
 STARTS = 0.1
 """Number of initial states added to the visited states, as a share of the number of visited states."""
-ROUNDS = 5
-"""Number of periods for which a mission with requirements that recur forever is simulated."""
 GIVE_UP = 0.3
 """Probability that a mission ends after a leg whose plan fails."""
 
@@ -181,7 +179,7 @@ class Missions(Supply):
         seen = seen[self.task.alive(seen)]
         failing = ~satisfied(judged.rho)
         given_up = failing & (self._rand(len(failing)) < GIVE_UP)
-        ended = (self.age > mission_steps(self.task)) | ~self.task.alive(self.pool) | given_up
+        ended = (self.age > self.task.mission_steps) | ~self.task.alive(self.pool) | given_up
         place = ended.nonzero()[:, 0]
         self.pool[place], self.age[place] = self._starts(len(place)), 0.0
         starts = self._starts(max(int(STARTS * len(seen)), 1))
@@ -234,24 +232,6 @@ class Missions(Supply):
 
     def _order(self, n: int) -> Tensor:
         return torch.randperm(n, generator=self.generator).to(self.device)
-
-
-def mission_steps(task: Task) -> int:
-    """Number of steps for which a mission is simulated.
-
-    If no requirement refers to times since the start of the mission, a mission takes four horizons. Otherwise
-    let t be the last time to which a requirement refers. The mission ends one horizon after t. If
-    requirements recur forever, it ends `ROUNDS` periods after t instead. Here a period is taken as at least
-    one horizon.
-    """
-    named, recurring = task.compiled.mission, task.compiled.recurring
-    if task.compiled.grid.end is not None:
-        return task.compiled.grid.end
-    if named is None:
-        return task.horizon * 4
-    if recurring is None:
-        return named + task.horizon
-    return named + ROUNDS * max(task.horizon, recurring)
 
 
 CAPACITY = 20_000

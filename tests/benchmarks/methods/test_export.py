@@ -17,9 +17,9 @@ from stlc import native
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import ActorNetwork
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import Run
 from stlc.dynamics.system import System
 from stlc.export.programs import Deciding, Guarding
 from stlc.export.verify import answers

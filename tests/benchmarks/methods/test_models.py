@@ -20,7 +20,8 @@ from stlc.cli.framework.app import main
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.environments import Environments, Reward
 from stlc.controller.problem.task import Task
-from stlc.controller.training.config import ResolvedConfig, TrainConfig, resolve_config
+from stlc.controller.run.config import ResolvedConfig
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.diagnostics import UsageError
 from stlc.registry import METHODS
 

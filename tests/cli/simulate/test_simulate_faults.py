@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from stlc.cli.framework.app import main
-from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
-from stlc.controller.training.run import spec_hash, system_hash
+from stlc.controller.run.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.run.run import spec_hash, system_hash
 from stlc.rundir import RunDir
 from stlc.trace import load_trace
 

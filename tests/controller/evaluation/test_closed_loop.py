@@ -24,11 +24,12 @@ from stlc.controller.evaluation.closed_loop import (
 )
 from stlc.controller.policies.policy import BestOfKPolicy
 from stlc.controller.problem.task import Task
+from stlc.controller.run.config import DRIVES, HELD_OUT_SEED
+from stlc.controller.run.run import Run
 from stlc.controller.training.budget import simulation_reserve
-from stlc.controller.training.config import DRIVES, HELD_OUT_SEED, TrainConfig, resolve_config
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
-from stlc.controller.training.run import Run
 from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

@@ -26,8 +26,8 @@ from stlc.controller.evaluation.stats import MeanInterval, student
 from stlc.controller.guard.guard import Guard, GuardDecision
 from stlc.controller.policies.policy import BestOfKPolicy, Policy
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run
 from stlc.controller.search.feasibility import solvable
-from stlc.controller.training.run import Run
 from stlc.diagnostics import MissingError, RunError, SystemFileError
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import RunDir

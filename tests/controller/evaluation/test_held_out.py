@@ -9,8 +9,9 @@ import torch
 from stlc.controller.evaluation.held_out import save_states, score
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.run.config import HELD_OUT_SEED
 from stlc.controller.search.feasibility import solvable
-from stlc.controller.training.config import HELD_OUT_SEED, TrainConfig, resolve_config
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parse.parser import parse

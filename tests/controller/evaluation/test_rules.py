@@ -16,10 +16,10 @@ from stlc.controller.evaluation.causes import Lost
 from stlc.controller.evaluation.executed import Executed
 from stlc.controller.evaluation.rules import Rules, judge_runs, judge_runs_by_plans, rules_of, runs_json
 from stlc.controller.problem.task import Task
+from stlc.controller.run.run import Run, task_of_run
 from stlc.controller.search.local_search import SearchResult
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
-from stlc.controller.training.run import Run, task_of_run
 from stlc.diagnostics import RunError, SpecError, SystemFileError
 from stlc.dynamics.system import System
 from stlc.files import read_source

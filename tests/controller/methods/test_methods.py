@@ -14,11 +14,12 @@ from stlc import Run, System
 from stlc.cli.framework.app import main
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
+from stlc.controller.planning.policy import PlannerChoice
 from stlc.controller.policies.policy import ModelRollout
 from stlc.controller.problem.task import Task
-from stlc.controller.training.config import PlannerChoice, TrainConfig, resolve_config
+from stlc.controller.run.run import load_config, save_config
+from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder, open_planner
-from stlc.controller.training.run import load_config, save_config
 from stlc.diagnostics import RunError, SystemFileError, UsageError
 from stlc.registry import METHODS
 from stlc.rundir import RunDir
@@ -28,7 +29,7 @@ SPEC, CAR = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
 
 COASTING = '''"""Coasting: the least force at every step, a planner that learns nothing."""
 
-from stlc.controller.methods import Method
+from stlc.controller.training.method import Method
 from stlc.controller.policies.policy import ModelRollout
 
 
@@ -45,11 +46,11 @@ CLIMBING = '''"""Climbing: one action a step, the state times a gain that is lea
 from dataclasses import dataclass
 
 import torch
-from stlc.controller.methods import Learner, Method
+from stlc.controller.training.method import Learner, Method
 from stlc.controller.policies.policy import ModelRollout
-from stlc.controller.training.checkpoint import load_checkpoint
-from stlc.controller.training.config import ResolvedConfig
-from stlc.controller.training.run import spec_hash, trained_on
+from stlc.controller.run.checkpoint import load_checkpoint
+from stlc.controller.run.config import ResolvedConfig
+from stlc.controller.run.run import spec_hash, trained_on
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from stlc.controller.parallel.inputs import input_files
 from stlc.controller.parallel.jobs import Job, JobResult, core_shares
 from stlc.controller.parallel.ray_jobs import RayExecutor, TrainingCall, claimed, received, trained
 from stlc.controller.parallel.workers import CallFiles, LostCall
-from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.run.checkpoint import load_checkpoint, save_checkpoint
 from stlc.diagnostics import RunError
 from stlc.rundir import RunDir, every_run
 

@@ -19,6 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.controller.problem.task import Task
+from stlc.controller.run.checkpoint import load_checkpoint
+from stlc.controller.run.run import spec_hash, system_hash
 from stlc.controller.training.budget import (
     PROVISIONAL,
     Pace,
@@ -27,11 +29,9 @@ from stlc.controller.training.budget import (
     clock_of,
     verdict_reserve,
 )
-from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import Watch, resume, train
-from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import UsageError
 from stlc.rundir import RunDir, every_run
 

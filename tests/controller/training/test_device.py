@@ -13,7 +13,7 @@ import torch
 from helpers.elsewhere import AWAY, Elsewhere, Far
 
 from stlc.controller.problem.task import Task
-from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint
+from stlc.controller.run.checkpoint import load_checkpoint, save_checkpoint
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.dynamics.system import System

@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from stlc.controller.problem.task import Task
+from stlc.controller.run.checkpoint import load_checkpoint
+from stlc.controller.run.run import Run, spec_hash, system_hash
 from stlc.controller.training import loop
 from stlc.controller.training.budget import StepSchedule
-from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.failures import MIXED, MOMENTS, POINTS, SHARE, FailureBank, SearchRound
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
-from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import UsageError
 from stlc.native import Stop
 from stlc.registry import METHODS

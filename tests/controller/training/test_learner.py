@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stlc.controller.methods import Validation
 from stlc.controller.problem.task import Task
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import EFFORTS, Trainer
+from stlc.controller.training.method import Validation
 from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source

@@ -10,10 +10,10 @@ import torch
 
 from stlc.cli.framework.app import main
 from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.controller.run.run import task_of_run
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes, _finite_mean
 from stlc.controller.training.mission_plans import mission_plans
-from stlc.controller.training.run import task_of_run
 from stlc.controller.training.samplers import POOL, Missions
 from stlc.dynamics.system import System
 from stlc.grammar.parse.parser import parse

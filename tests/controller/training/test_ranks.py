@@ -17,13 +17,13 @@ from torch import nn
 
 from stlc.controller.parallel.ddp import ALONE, Ranks, expected, joined
 from stlc.controller.problem.task import Task
-from stlc.controller.training.checkpoint import load_checkpoint
+from stlc.controller.run.checkpoint import load_checkpoint
+from stlc.controller.run.run import spec_hash, system_hash
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
-from stlc.controller.training.run import spec_hash, system_hash
 from stlc.diagnostics import MissingError, StlcError, UsageError
 from stlc.rundir import RunDir, every_run
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from stlc.controller.training.checkpoint import load_checkpoint
-from stlc.controller.training.run import spec_hash, system_hash
+from stlc.controller.run.checkpoint import load_checkpoint
+from stlc.controller.run.run import spec_hash, system_hash
 from stlc.rundir import RunDir, every_run
 
 ROOT = Path(__file__).parents[3]

@@ -13,13 +13,13 @@ import torch
 
 from stlc.controller.evaluation.held_out import score, wilson
 from stlc.controller.problem.task import Task
+from stlc.controller.run.checkpoint import load_checkpoint
+from stlc.controller.run.run import Run, spec_hash, system_hash
 from stlc.controller.search.local_search import SearchResult
-from stlc.controller.training.checkpoint import load_checkpoint
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
-from stlc.controller.training.run import Run, spec_hash, system_hash
 from stlc.diagnostics import MissingError, RunError
 from stlc.dynamics.system import System
 from stlc.files import read_source

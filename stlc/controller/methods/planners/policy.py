@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stlc.controller.training.run import Run
+from stlc.controller.run.run import Run
 from stlc.diagnostics import usage
 
 if TYPE_CHECKING:

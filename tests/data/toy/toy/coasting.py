@@ -1,7 +1,7 @@
 """Method `coasting`: the least force at every step; nothing is learnt."""
 
-from stlc.controller.methods import Method
 from stlc.controller.policies.policy import ModelRollout
+from stlc.controller.training.method import Method
 
 
 class Coasting(Method):

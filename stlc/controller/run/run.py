@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from torch import nn
 
 from stlc.compile.frontend.modules import file_of
-from stlc.controller.evaluation.held_out import save_states
 from stlc.controller.problem.task import Task
-from stlc.controller.training.checkpoint import load_checkpoint, save_checkpoint, weights
-from stlc.controller.training.config import ResolvedConfig, checked_config
+from stlc.controller.run.checkpoint import load_checkpoint, weights
+from stlc.controller.run.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, PluginError, RunError
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.scenario import scenario_constants, under
@@ -22,7 +21,7 @@ from stlc.grammar.parse.parser import parse
 from stlc.plugins import variable
 from stlc.provenance import sha256
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
-from stlc.rundir import HELD_OUT, RUNS, SPEC, SYSTEM, RunDir
+from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,12 +29,10 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from stlc.controller.evaluation.held_out import Score
     from stlc.controller.guard.loop import GuardedLoop
     from stlc.controller.policies.policy import PlanProposer, Policy
     from stlc.controller.problem.task import PlanVerdicts
     from stlc.dynamics.declaration.decl import SystemDecl
-    from stlc.rundir import Status
 
 LIB = "lib"
 INDEX = "index.json"
@@ -127,62 +124,6 @@ class Run:
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
         """Plans of the policy from states (B, n), and their verdicts."""
         return self.policy.plan_judged(x0)
-
-
-@dataclass(frozen=True, slots=True)
-class RunWriter:
-    """Writer of a run's folder during training. If several ranks (processes) train, only the first writes.
-
-    Attributes:
-        folder: folder of the run.
-        writes: whether this process writes.
-    """
-
-    folder: RunDir
-    writes: bool = True
-
-    def config(self, config: ResolvedConfig) -> None:
-        """Write the resolved options of the run."""
-        if self.writes:
-            save_config(self.folder, config)
-
-    def note(self, facts: Mapping[str, object]) -> None:
-        """Add facts to `run.json`."""
-        if self.writes:
-            self.folder.update(facts)
-
-    def before(self, step: int) -> None:
-        """Remove the rows of validations at step `step` and later from `train.jsonl`.
-
-        A resumed training makes these steps again.
-        """
-        if self.writes:
-            self.folder.keep_rows(lambda row: row.get("step", 0) < step)
-
-    def row(self, row: Mapping[str, Any]) -> None:
-        """Append a row to `train.jsonl`."""
-        if self.writes:
-            self.folder.append_row(row)
-
-    def checkpoint(self, tensors: Mapping[str, Tensor], facts: Mapping[str, object], *, step: int) -> None:
-        """Write a checkpoint at a step.
-
-        Raises:
-            MissingError: R201, the checkpoint cannot be written; the last good one stays.
-        """
-        if self.writes:
-            hashes = {"spec_hash": spec_hash(self.folder), "system_hash": system_hash(self.folder)}
-            save_checkpoint(self.folder, tensors, {**facts, **hashes}, step=step)
-
-    def held_out(self, task: Task, score: Score) -> None:
-        """Save the held-out states and their verdicts."""
-        if self.writes:
-            save_states(self.folder.place(HELD_OUT), task, score)
-
-    def close(self, status: Status, result: object = None) -> None:
-        """Write the final status of the run and its result into `run.json`."""
-        if self.writes:
-            self.folder.finish(status, result)
 
 
 def task_of_run(

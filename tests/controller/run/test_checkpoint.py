@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from stlc import rundir
-from stlc.controller.training.checkpoint import (
+from stlc.controller.run.checkpoint import (
     load_checkpoint,
     never_saved,
     restoring,
     save_checkpoint,
 )
-from stlc.controller.training.run import load_config
+from stlc.controller.run.run import load_config
 from stlc.diagnostics import MissingError, PluginError, RunError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
