@@ -306,7 +306,7 @@ MEANINGS = (
         written("_ >= -TOLERANCE", "_ < -TOLERANCE", "_.ge(_, -TOLERANCE)"),
     ),
     Meaning("until", "compile/backends/array/windows.py", defined(r"\w*until\w*", "compile/backends/")),
-    Meaning("smooth maximum of two", "compile/backends/array/namespace.py", written("_.log1p(_.exp(_))")),
+    Meaning("smooth maximum of two", "compile/namespace.py", written("_.log1p(_.exp(_))")),
     Meaning("overall robustness", "compile/semantics/tolerance.py", written("weighed(_, _, _)")),
     Meaning("squash of a control", "dynamics/model/controls.py", defined("squash(ed)?")),
 )

@@ -11,8 +11,8 @@ from typing import Any, final
 
 import numpy as np
 
-from stlc.compile.backends.array.namespace import Array
 from stlc.compile.frontend.interface import InterfaceFunction
+from stlc.compile.namespace import Array
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.functions import FunctionDecl

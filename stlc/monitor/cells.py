@@ -25,11 +25,11 @@ from stlc.compile.analysis.holes import holes_in, without_holes
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.namespace import Array
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import leaves, map_children, nodes
+from stlc.compile.namespace import Array
 
 Floats: TypeAlias = NDArray[np.float64]
 Over: TypeAlias = Literal["all", "some", "point", "edge"]

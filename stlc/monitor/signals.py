@@ -17,12 +17,12 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.tags import BETWEEN, age_of
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns as columns_of
 from stlc.compile.ir.traverse import numbers, subexpressions
+from stlc.compile.namespace import Array, Ops
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.escape import shell, visible

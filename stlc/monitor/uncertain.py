@@ -16,9 +16,9 @@ import numpy as np
 
 from stlc.compile.backends.array.interval import EPSILON, Floats, Intervals, magnitudes, mul, widened
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.namespace import Array
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import numbers, subexpressions
+from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.grammar import ast

@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.backends.array.namespace import FloatConstants, Ops, Sliding
+from stlc.compile.namespace import FloatConstants, Ops, Sliding
 from stlc.compile.schedule.schedule import Pick
 
 ROUNDING = 1e-3
@@ -141,7 +141,7 @@ def _each(*functions: Any) -> list[Any]:
 
 @final
 class CasadiOps(FloatConstants):
-    """Implementation of `stlc.compile.backends.array.namespace.Ops` for CasADi expressions."""
+    """Implementation of `stlc.compile.namespace.Ops` for CasADi expressions."""
 
     name = "casadi"
 

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from benchmarks.methods.planners._casadi import CASADI, GREAT, SymbolicColumn
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.text import show_number
 from stlc.compile.ir.traverse import leaves, nodes, numbers, subexpressions
+from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 
 STEPS = ("floor", "ceil", "round", "sign", "mod")

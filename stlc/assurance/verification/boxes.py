@@ -16,11 +16,11 @@ import numpy as np
 
 from stlc.assurance.verification.forms import FORMS, Bools, Floats, Forms, spread
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import map_parts, substitute
 from stlc.compile.ir.traverse import nodes
+from stlc.compile.namespace import Array, Ops
 from stlc.dynamics.declaration.init import InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
 

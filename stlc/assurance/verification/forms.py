@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.interval import Belief, Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
-from stlc.compile.backends.array.namespace import FloatConstants, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.namespace import FloatConstants, Ops
 
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -172,7 +172,7 @@ def _combined(a: Floats, b: Floats) -> Floats:
 
 @final
 class FormOps(FloatConstants):
-    """The part of `stlc.compile.backends.array.namespace.Ops` that one step of a system needs.
+    """The part of `stlc.compile.namespace.Ops` that one step of a system needs.
 
     Other operations are computed on the range of the form, and their results share no symbols.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Protocol, TypeAlias
 
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.namespace import Array, Ops
 from stlc.compile.schedule.schedule import Pick
 
 Parts: TypeAlias = tuple[Array, ...]

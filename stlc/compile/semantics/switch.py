@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, final
 
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.namespace import Array, Ops
 
 
 class Switch(Protocol):

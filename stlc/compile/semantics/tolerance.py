@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 if TYPE_CHECKING:
-    from stlc.compile.backends.array.namespace import Array, Ops
+    from stlc.compile.namespace import Array, Ops
 
 A = TypeVar("A")
 End: TypeAlias = Literal["open", "strict", "truncate"]

@@ -18,7 +18,7 @@ from stlc.compile.semantics.switch import Hard
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from stlc.compile.backends.array.namespace import Ops
+    from stlc.compile.namespace import Ops
     from stlc.dynamics.declaration.motion import Assign
     from stlc.dynamics.schema.names import ControlDecl
 

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import map_parts
 from stlc.compile.ir.functions import sampler_names
+from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.switch import Hard
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.init import FileDecl, GridDecl, InitDecl, Situation

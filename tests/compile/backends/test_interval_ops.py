@@ -28,13 +28,13 @@ from stlc.compile.backends.array.interval import (
     mul,
 )
 from stlc.compile.backends.array.interval_ops import INTERVALS, IntervalOps, _anything
-from stlc.compile.backends.array.namespace import Ops, Sliding
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.lowering.lower import lower
 from stlc.compile.lowering.simplify import simplify
+from stlc.compile.namespace import Ops, Sliding
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 from stlc.compile.semantics.switch import StraightThrough, Tanh
 from stlc.diagnostics import UsageError

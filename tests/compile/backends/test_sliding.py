@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.compile.backends.array import kernel
-from stlc.compile.backends.array.namespace import Sliding
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.backends.torch.extrema import small_extrema, small_until
 from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick
 from stlc.compile.semantics.semantics import Exact
 

@@ -8,9 +8,9 @@ from functools import reduce
 import pytest
 import torch
 
-from stlc.compile.backends.array.namespace import Sliding
 from stlc.compile.backends.torch.extrema import _Choice, _Reduction, by_kernel, choice, reduction
 from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick
 from stlc.native import compiler
 

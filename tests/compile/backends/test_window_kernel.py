@@ -12,10 +12,10 @@ from torch import Tensor
 
 from stlc import native
 from stlc.compile.backends.array import kernel
-from stlc.compile.backends.array.namespace import Sliding
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.backends.torch.extrema import by_kernel
 from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick
 from stlc.compile.semantics.semantics import Exact
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.compile.backends.array.graph import robustness_signal
-from stlc.compile.backends.array.namespace import Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import typed
 from stlc.compile.lowering.lower import lower
+from stlc.compile.namespace import Ops
 from stlc.compile.semantics.semantics import (
     SEMANTICS,
     ArithmeticGeometricMean,

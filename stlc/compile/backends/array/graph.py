@@ -14,12 +14,12 @@ from typing import Protocol
 
 import numpy as np
 
-from stlc.compile.backends.array.namespace import Array, Ops
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.steps import ArrayPlan, all_values, array_plan
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
+from stlc.compile.namespace import Array, Ops
 from stlc.compile.schedule.schedule import Boundary, End, IndexRange, TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import weighed

@@ -47,10 +47,10 @@ from stlc.compile.backends.array.interval import (
     widened,
     within,
 )
-from stlc.compile.backends.array.namespace import FloatConstants, Ops, Sliding
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.namespace import FloatConstants, Ops, Sliding
 from stlc.compile.schedule.schedule import Pick
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.diagnostics import Diagnostic, UsageError
@@ -75,7 +75,7 @@ _WINDOWS = Windows(Exact(), NUMPY)
 
 @final
 class IntervalOps(FloatConstants):
-    """Implementation of `stlc.compile.backends.array.namespace.Ops` for `Intervals`, without gradients."""
+    """Implementation of `stlc.compile.namespace.Ops` for `Intervals`, without gradients."""
 
     name = "intervals"
 

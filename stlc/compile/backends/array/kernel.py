@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias, final, get_args
 
 from stlc import native
-from stlc.compile.backends.array.namespace import Sliding
+from stlc.compile.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick
 
 Direction: TypeAlias = Literal["values", "pull", "push"]

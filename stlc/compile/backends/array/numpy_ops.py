@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.backends.array.kernel import Strided, window_kernel
-from stlc.compile.backends.array.namespace import Array, FloatConstants, Mask, Ops, Sliding
 from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.namespace import Array, FloatConstants, Mask, Ops, Sliding
 from stlc.compile.schedule.schedule import Pick
 
 _WIDE = 8
@@ -28,7 +28,7 @@ _LARGE_KERNEL = 1 << 16
 
 @final
 class NumpyOps(FloatConstants):
-    """Implementation of `stlc.compile.backends.array.namespace.Ops` for NumPy arrays, without gradients."""
+    """Implementation of `stlc.compile.namespace.Ops` for NumPy arrays, without gradients."""
 
     name = "numpy"
 

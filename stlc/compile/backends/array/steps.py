@@ -17,9 +17,9 @@ import numpy as np
 
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.frozen import Freezer
-from stlc.compile.backends.array.namespace import Array
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir import nodes as ir
+from stlc.compile.namespace import Array
 from stlc.compile.schedule.schedule import (
     PICKS,
     IndexRange,

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import final
 
-from stlc.compile.backends.array.namespace import Array, Ops, Sliding
+from stlc.compile.namespace import Array, Ops, Sliding
 from stlc.compile.schedule.schedule import Pick, dual, neutral
 from stlc.compile.semantics.protocol import Parts, Semantics
 

@@ -13,12 +13,12 @@ from typing import Self, TypeAlias, cast, final
 
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.namespace import Ops, Sliding
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import BATCH, Kind, Value, joined
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
+from stlc.compile.namespace import Ops, Sliding
 from stlc.compile.schedule.schedule import Pick, spanning
 
 Number: TypeAlias = Value | float
@@ -47,7 +47,7 @@ def _comparison(op: str) -> Callable[[OnnxOps, Number, Number], Value]:
 
 @final
 class OnnxOps:
-    """Implementation of `stlc.compile.backends.array.namespace.Ops` for symbolic arrays.
+    """Implementation of `stlc.compile.namespace.Ops` for symbolic arrays.
 
     If an operand of min or max is NaN, so is the result.
     """

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from stlc.compile.backends.array.kernel import Direction, Strided, WindowKernel, window_kernel
-from stlc.compile.backends.array.namespace import Sliding
+from stlc.compile.namespace import Sliding
 from stlc.compile.schedule.schedule import Pick, dual, neutral
 
 _LARGE = 1 << 12

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.compile.backends.array.namespace import Mask, Ops, Sliding
 from stlc.compile.backends.torch.extrema import (
     by_kernel,
     choice,
@@ -25,6 +24,7 @@ from stlc.compile.backends.torch.extrema import (
 )
 from stlc.compile.backends.torch.guarded import lerp, sifted
 from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.namespace import Mask, Ops, Sliding
 from stlc.compile.schedule.schedule import Pick
 
 
@@ -125,7 +125,7 @@ def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
 
 @final
 class TorchOps:
-    """Implementation of `stlc.compile.backends.array.namespace.Ops` for torch tensors.
+    """Implementation of `stlc.compile.namespace.Ops` for torch tensors.
 
     Results keep dtype and device. Operands are `(time, batch)`, or of any shapes that broadcast. Reductions
     over time give `(1, batch)`.

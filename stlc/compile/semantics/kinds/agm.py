@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import final
 
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.kinds._mean import Mean
 
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import final
 
-from stlc.compile.backends.array.namespace import Array, Ops
+from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.kinds._mean import Mean
 
 
