@@ -18,10 +18,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stlc.assurance.verification.tubes import TubeModel
+from stlc.assurance.verification.tubes import Tube, TubeModel
 from stlc.compile.ir.support import columns
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.candidates import POLICY, REPAIRED, Candidates, best, finite, rank
+from stlc.controller.guard.candidates import (
+    POLICY,
+    REPAIRED,
+    Candidates,
+    RobustnessMargins,
+    best,
+    finite,
+    rank,
+)
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
 from stlc.diagnostics import usage
@@ -30,8 +38,6 @@ from stlc.dynamics.model.samplers import seeded
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from stlc.assurance.verification.tubes import Tube
-    from stlc.controller.guard.candidates import RobustnessMargins
     from stlc.controller.guard.kind import GuardInputs, GuardKind
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task

@@ -21,14 +21,13 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parse.parser import parse
 from stlc.monitor.judgement import chosen
-from stlc.plants.declaration import load_plant_decl
+from stlc.plants.declaration import PlantDecl, load_plant_decl
 from stlc.provenance import sha256
 
 if TYPE_CHECKING:
     from stlc.assurance.model_simulator import ModelSimulator
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.grammar import ast
-    from stlc.plants.declaration import PlantDecl
     from stlc.plants.judge import JudgedRun, PlantJudge
     from stlc.plants.plant import PlantFinding
 

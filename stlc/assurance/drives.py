@@ -13,12 +13,12 @@ from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.guard import Guard
 from stlc.controller.run.checkpoint import FOLDER, POINTER, CheckpointHead
-from stlc.controller.run.run import CONFIG, declaration_of_run, spec_hash, system_hash
+from stlc.controller.run.run import CONFIG, Run, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.functions import function_files
 from stlc.monitor.judgement import chosen
@@ -29,9 +29,7 @@ from stlc.rundir import MOST_ARRAYS, RunDir
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from stlc.controller.deployment.simulator import DeploymentRecording, Watch
     from stlc.controller.problem.task import Task
-    from stlc.controller.run.run import Run
     from stlc.dynamics.declaration.decl import SystemDecl
 
 ROWS = 1000

@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING, assert_never
 
 import torch
 
-from stlc.compile.backends.c.emit import CHECK, HEAD, forward_blocks, passes, state_index
+from stlc.compile.backends.c.emit import CHECK, HEAD, Motion, forward_blocks, passes, state_index
 from stlc.compile.backends.c.numbers import NumberWriter, literal
 from stlc.compile.backends.c.parts import declared, in_parts
-from stlc.compile.backends.c.plan import plan_of
+from stlc.compile.backends.c.plan import Plan, plan_of
 from stlc.compile.backends.numbers import Leaf, Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import nodes
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
-from stlc.controller.policies.policy import ClosedLoopActor
+from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.native import motion_of
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
@@ -48,10 +48,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.compile.augment.timers import Timer
-    from stlc.compile.backends.c.emit import Motion
-    from stlc.compile.backends.c.plan import Plan
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.policies.policy import PlanProposer
     from stlc.dynamics.schema.names import ControlDecl
     from stlc.signature import Column
 

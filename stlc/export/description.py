@@ -8,15 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from stlc.compile.ir import nodes as ir
 from stlc.controller.problem.pending_goals import HELD
-from stlc.controller.problem.task import GOALS, GUIDANCE, SHORTFALL
+from stlc.controller.problem.task import GOALS, GUIDANCE, SHORTFALL, Task
 from stlc.dynamics.declaration.learning import START
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import Task
 
 REDUCED, MARGIN = ir.Signal("#reduced"), ir.Signal("#margin")
 

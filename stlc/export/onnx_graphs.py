@@ -7,7 +7,7 @@ previous plans.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
@@ -19,7 +19,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import names_in
 from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
-from stlc.controller.policies.policy import ClosedLoopActor
+from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.task import TIE, Task
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.controls import EPS, raw_width
@@ -35,12 +35,9 @@ from stlc.export.description import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from torch import Tensor
 
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.policies.policy import PlanProposer
     from stlc.dynamics.schema.names import ControlDecl
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, Value
+from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, GraphNode, OnnxGraph, Value
 from stlc.controller.guard import candidates as backup
-from stlc.controller.run.run import spec_hash, system_hash
+from stlc.controller.run.run import Run, spec_hash, system_hash
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.extras import needed
@@ -25,13 +25,9 @@ from stlc.runtime.facts import CONTINUE, DECIDE, FACTS, FALL, FOLLOW, FORMAT, JU
 from stlc.version import __version__
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from onnx import GraphProto, NodeProto, ValueInfoProto
 
-    from stlc.compile.backends.onnx.sheet import GraphNode, OnnxGraph
     from stlc.controller.problem.task import Task
-    from stlc.controller.run.run import Run
 
 
 # ----------------------------------------------------------------------------------------------- files

@@ -16,17 +16,15 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.search import StagedSearch
-from stlc.controller.problem.task import rank
+from stlc.controller.problem.task import Task, rank
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import without_deprecations
 from stlc.registry import GUARDS
 from stlc.runtime.backup import search
-from stlc.runtime.graphs import joined
+from stlc.runtime.graphs import Graphs, JudgedPlans, joined
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Task
-    from stlc.runtime.graphs import Graphs, JudgedPlans
 
 
 @dataclass(frozen=True, slots=True)

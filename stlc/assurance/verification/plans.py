@@ -15,12 +15,11 @@ from stlc.assurance.verification.network import UNIT, PlanBounds
 from stlc.assurance.verification.subject import History, Indices, VerificationSubject
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import children
-from stlc.controller.policies.policy import BestOfKPolicy
+from stlc.controller.policies.policy import BestOfKPolicy, Policy
 from stlc.diagnostics import usage
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
-    from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.dynamics.declaration.decl import SystemDecl
 

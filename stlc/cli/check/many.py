@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,8 +18,6 @@ from stlc.escape import operand, visible
 from stlc.files import find_trace, require_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from stlc.controller.parallel.workers import LostCall
     from stlc.monitor.check import Question
     from stlc.monitor.facts.fact import Fact

@@ -16,13 +16,12 @@ from stlc.cli.framework.output import Answer, emit, emit_json, say, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, SpecError, SystemFileError, UsageError, usage
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
-from stlc.source import Span
+from stlc.source import Source, Span
 from stlc.version import __version__
 
 if TYPE_CHECKING:
     from stlc.cli.framework.documents import LintedFiles
     from stlc.lint.lint import Selection, Surroundings
-    from stlc.source import Source
 
 Format = Literal["text", "json", "github", "sarif"]
 

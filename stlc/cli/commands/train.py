@@ -6,7 +6,7 @@ import io
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -38,8 +38,6 @@ from stlc.registry import METHODS
 from stlc.rundir import RUNS, RunDir
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from stlc.cli.framework.documents import TrainedRun, TrainedRuns
     from stlc.cli.train.session import Session
     from stlc.controller.problem.task import Task

@@ -17,7 +17,7 @@ from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
 from stlc.jsontext import plain
-from stlc.rundir import LATEST, RUNS
+from stlc.rundir import LATEST, RUNS, RunDir, Status
 from stlc.stopping import age, leaving
 from stlc.view.learning import Commands, learning_of_run
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from stlc.cli.framework.documents import TrainedRun
     from stlc.controller.training.tensorboard import Opener, TensorBoardLogger
-    from stlc.rundir import RunDir, Status
 
 BESIDE = 10.0
 """Seconds of a command beyond its budget."""

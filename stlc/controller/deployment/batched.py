@@ -19,13 +19,12 @@ from stlc.controller.deployment.tape import Tape
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
 from stlc.controller.guard.candidates import Limits, RobustnessMargins
 from stlc.controller.search.feasibility import solvable, viable
-from stlc.controller.world import Charting, Choosing, Redrawing
+from stlc.controller.world import Charting, Choosing, Redrawing, WorldType
 from stlc.diagnostics import Diagnostic, RunError, SystemFileError
 from stlc.dynamics.uncertainty.disturbance import Disturbance
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.controller.world import WorldType
     from stlc.dynamics.declaration.deployment import Starts, TestDecl
 
 

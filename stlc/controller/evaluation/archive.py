@@ -14,7 +14,7 @@ from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.planning.traces import meta_of, trace_along
 from stlc.files import atomic_path
 from stlc.rundir import TRACE, UNGUARDED
-from stlc.trace import save_trace
+from stlc.trace import Trace, save_trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording, Setting
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.run.run import Run
-    from stlc.trace import Trace
 
 
 def trace_of(run: Run, recording: DeploymentRecording, setting: Setting, rules: Rules | None = None) -> Trace:

@@ -14,15 +14,13 @@ import numpy as np
 import torch
 
 from stlc.controller.evaluation.executed import model_consistent
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.search.feasibility import safety_task, solve
-from stlc.native import never
+from stlc.native import Stop, never
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.evaluation.rules import Broken
-    from stlc.controller.problem.task import Task
-    from stlc.native import Stop
 
 Cause: TypeAlias = Literal["start", "told", "later", "missed", "near", "rules"]
 """Cause of a failed drive.

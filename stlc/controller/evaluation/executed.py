@@ -14,14 +14,13 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.search.feasibility import viable as search_safe
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.compile.schedule.schedule import Boundary
     from stlc.controller.deployment.simulator import DeploymentRecording
-    from stlc.controller.problem.task import Task
 
 MOST_TIMED = 200
 """Maximum number of trajectories for which the time of a violation is determined, per requirement."""

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.search.feasibility import solve
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.files import write_atomic
-from stlc.native import never
+from stlc.native import Stop, never
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Task
-    from stlc.native import Stop
 
 CEILING_TRIES = 8000
 """Plans tried for a held-out state before it counts as infeasible."""

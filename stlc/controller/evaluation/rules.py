@@ -17,8 +17,8 @@ import numpy as np
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
 from stlc.controller.evaluation.causes import Lost, losses
-from stlc.controller.evaluation.executed import MOST_TIMED
-from stlc.controller.run.run import INDEX, read_library, save_library
+from stlc.controller.evaluation.executed import MOST_TIMED, Executed
+from stlc.controller.run.run import INDEX, Run, read_library, save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stlc.controller.deployment.simulator import DeploymentRecording
-    from stlc.controller.evaluation.executed import Executed
     from stlc.controller.problem.task import Task
-    from stlc.controller.run.run import Run
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.dynamics.declaration.deployment import JudgeRef
     from stlc.monitor.judgement import Verdict

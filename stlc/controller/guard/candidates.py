@@ -5,7 +5,7 @@ A guard judges each plan of the policy at run time. If it rejects a plan, it cho
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from time import perf_counter
@@ -19,8 +19,6 @@ from stlc.controller.problem.rows import Rows
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from stlc.controller.problem.task import Task
 
 RobustnessMargins: TypeAlias = Mapping[str, float]

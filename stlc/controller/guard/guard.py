@@ -15,13 +15,12 @@ from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.problem.rows import Rows
-from stlc.controller.problem.task import rank
+from stlc.controller.problem.task import PlanVerdicts, Task, rank
 from stlc.registry import GUARDS
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import PlanVerdicts, Task
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.guard.candidates import RobustnessMargins
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import Task
 
 
 def with_margins(

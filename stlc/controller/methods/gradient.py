@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from stlc.controller.training.config import base_config
-from stlc.controller.training.learner import NetworkMethod
-from stlc.controller.training.objective import paper_objective
+from stlc.controller.training.config import TrainConfig, base_config
+from stlc.controller.training.learner import NetworkMethod, Trainer
+from stlc.controller.training.objective import Objective, paper_objective
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
     from stlc.controller.run.config import ResolvedConfig
-    from stlc.controller.training.config import TrainConfig
-    from stlc.controller.training.learner import Trainer
-    from stlc.controller.training.objective import Objective
 
 
 class Gradient(NetworkMethod):

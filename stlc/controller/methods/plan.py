@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 from stlc.controller.planning.policy import PlannerChoice, PlannerPolicy, planner_of, planner_policy
 from stlc.controller.run.config import ResolvedConfig
-from stlc.controller.training.config import base_config
+from stlc.controller.training.config import TrainConfig, base_config
 from stlc.controller.training.method import Method
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.config import TrainConfig
     from stlc.rundir import RunDir
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import StlcError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from stlc.controller.problem.task import Task
 
 STRUCTURED = ("schedule", "milp")
 """Planners that use the structure of a specification, for which a local search finds no plan."""

@@ -19,13 +19,12 @@ import torch
 from torch import Tensor, nn
 
 from stlc.controller.problem.environments import observe
-from stlc.controller.problem.task import PlanVerdicts, rank, satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task, rank, satisfied
 from stlc.dynamics.model.controls import raw_width, squash, unsquash
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from stlc.controller.problem.task import Task
     from stlc.dynamics.model.mirror import Mirror
     from stlc.dynamics.schema.names import ControlDecl
 

@@ -9,17 +9,14 @@ others are given once, at the end of an episode. `robustness` (RL_S) is the robu
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, get_args
 
 import torch
 from torch import Tensor
 
 from stlc.controller.problem.native import NativeStep
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
 from stlc.diagnostics import usage
-
-if TYPE_CHECKING:
-    from stlc.controller.problem.task import PlanVerdicts, Task
 
 Reward: TypeAlias = Literal["task", "robustness", "accuracy"]
 """Reward of learners; `task` is the one that the system file declares (`train: {reward: …}`)."""

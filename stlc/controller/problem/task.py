@@ -19,7 +19,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import is_state, nodes
-from stlc.compile.pipeline import compile_spec
+from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_spec
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.compile.semantics.tolerance import satisfied as satisfied
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
@@ -29,7 +29,6 @@ from stlc.native import check_plans
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.compile.pipeline import Compiled, CompiledRequirement
     from stlc.compile.schedule.schedule import End
     from stlc.dynamics.system import System
     from stlc.grammar import ast

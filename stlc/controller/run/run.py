@@ -6,10 +6,10 @@ import json
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from torch import nn
+from torch import Tensor, nn
 
 from stlc.compile.frontend.modules import file_of
-from stlc.controller.problem.task import Task
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.checkpoint import load_checkpoint, weights
 from stlc.controller.run.config import ResolvedConfig, checked_config
 from stlc.diagnostics import Diagnostic, PluginError, RunError
@@ -27,11 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from torch import Tensor
-
     from stlc.controller.guard.loop import GuardedLoop
     from stlc.controller.policies.policy import PlanProposer, Policy
-    from stlc.controller.problem.task import PlanVerdicts
     from stlc.dynamics.declaration.decl import SystemDecl
 
 LIB = "lib"

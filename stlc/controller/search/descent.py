@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stlc.controller.search.newton import LENGTHS, barrier_weight
+from stlc.controller.search.newton import LENGTHS, GaussNewton, barrier_weight
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from stlc.controller.search.newton import GaussNewton
     from stlc.controller.search.schedules import GoalScheduler
 
     Flags = NDArray[np.bool_]

@@ -11,12 +11,11 @@ from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.local_search import THOROUGH, Searcher, SearchResult
 from stlc.controller.search.starts import extremes
-from stlc.native import never
+from stlc.native import Stop, never
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from stlc.native import Stop
 
 PASSES = 4
 TRIES = 20_000

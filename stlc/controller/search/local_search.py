@@ -22,14 +22,12 @@ from torch import Tensor
 from stlc.compile.backends.c.emit import LANES
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.rows import Rows
-from stlc.controller.problem.task import satisfied
-from stlc.native import cores, never
+from stlc.controller.problem.task import Task, satisfied
+from stlc.native import Stop, cores, never
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from stlc.controller.problem.task import Task
-    from stlc.native import Stop
 
 CYCLE = 1000
 """Evaluations after which the search for plans of a mission changes the comparison of violating plans.

@@ -26,13 +26,12 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import ENOUGH, solve
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import Diagnostic, Label
-from stlc.native import never
+from stlc.native import Stop, never
 
 if TYPE_CHECKING:
     from stlc.compile.ir.functions import Bounds
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.controller.search.local_search import SearchResult
-    from stlc.native import Stop
 
 STARTS = 64
 PROOF = (

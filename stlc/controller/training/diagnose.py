@@ -22,7 +22,6 @@ from stlc.dynamics.system import System
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import PlanNetwork
-    from stlc.controller.problem.task import Task
 
 HARD = Hard()
 SHOWN = 6

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stlc.native import never
+from stlc.native import Stop, never
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stlc.controller.run.run import Run
-    from stlc.native import Stop
 
 FAILURES_VERSION = 3
 """Version of the rounds and of the use of their states; results of older versions are recomputed."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from stlc.controller.evaluation.closed_loop import ClosedLoop, closed_loop
 from stlc.controller.evaluation.held_out import Score, score, silent
 from stlc.controller.run.run import Run
-from stlc.controller.training.budget import simulation_reserve, verdict_reserve
+from stlc.controller.training.budget import TimeBudget, simulation_reserve, verdict_reserve
 from stlc.controller.training.conflict import conflict, refuted
 from stlc.jsontext import plain
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
     from stlc.controller.problem.task import Task
     from stlc.controller.run.config import ResolvedConfig
-    from stlc.controller.training.budget import TimeBudget
     from stlc.controller.training.writer import RunWriter
     from stlc.diagnostics import Diagnostic
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
-from stlc.controller.planning.policy import planner_of
+from stlc.controller.planning.policy import PlannerChoice, planner_of
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.controller.search.planner import prepared
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from stlc.controller.planning.policy import PlannerChoice
     from stlc.controller.problem.task import Task
 
 

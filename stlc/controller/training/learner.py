@@ -21,7 +21,7 @@ from torch import Tensor
 
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
-from stlc.controller.problem.task import rank, satisfied
+from stlc.controller.problem.task import Task, rank, satisfied
 from stlc.controller.run.checkpoint import below
 from stlc.controller.run.run import load_weights
 from stlc.controller.search.feasibility import safety_task
@@ -31,19 +31,16 @@ from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.failures import FailureBank
 from stlc.controller.training.method import Learner, Method, Validation
 from stlc.controller.training.mission_plans import mission_plans
-from stlc.controller.training.objective import loss
+from stlc.controller.training.objective import Objective, loss
 from stlc.controller.training.samplers import Draws, FixedSet, Missions, ReplayBuffer, Supply
-from stlc.native import never
+from stlc.native import Stop, never
 from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.controller.problem.task import Task
     from stlc.controller.run.config import ResolvedConfig
-    from stlc.controller.training.objective import Objective
     from stlc.diagnostics import StlcError
-    from stlc.native import Stop
     from stlc.rundir import RunDir
 
 MARGIN_STATES = 128

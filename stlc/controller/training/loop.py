@@ -6,7 +6,7 @@ import ctypes
 import math
 import sys
 import time
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, Tim
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.conflict import refuted
 from stlc.controller.training.diagnose import check_mirror
-from stlc.controller.training.failures import SHARE
+from stlc.controller.training.failures import SHARE, FailureBank, FailureSearch
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.writer import RunWriter
 from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, usage
@@ -32,10 +32,8 @@ from stlc.registry import METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
-    from contextlib import AbstractContextManager
 
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.failures import FailureBank, FailureSearch
     from stlc.controller.training.method import Learner, Method, Validation
     from stlc.rundir import RunDir
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
 from stlc.controller.run.config import ResolvedConfig
-from stlc.controller.training.config import base_config
-from stlc.diagnostics import Diagnostic, RunError
-from stlc.native import never
+from stlc.controller.training.config import TrainConfig, base_config
+from stlc.diagnostics import Diagnostic, RunError, StlcError
+from stlc.native import Stop, never
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,11 +22,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.problem.task import PlanVerdicts, Task
-    from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.failures import FailureBank
-    from stlc.diagnostics import StlcError
-    from stlc.native import Stop
     from stlc.rundir import RunDir
 
 

@@ -10,12 +10,10 @@ from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough, Switch, Tanh
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import Task, satisfied
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from stlc.controller.problem.task import Task
 
 
 VIOLATION = 2.0

@@ -14,20 +14,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import torch
 from torch import Tensor
 
-from stlc.controller.problem.task import satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
 from stlc.dynamics.uncertainty.disturbance import Events
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from torch import Tensor
-
-    from stlc.controller.problem.task import PlanVerdicts, Task
 
 BLOCK = 8192
 

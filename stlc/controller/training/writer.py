@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from stlc.controller.evaluation.held_out import save_states
+from stlc.controller.evaluation.held_out import Score, save_states
 from stlc.controller.run.checkpoint import save_checkpoint
 from stlc.controller.run.run import save_config, spec_hash, system_hash
-from stlc.rundir import HELD_OUT, RunDir
+from stlc.rundir import HELD_OUT, RunDir, Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from torch import Tensor
 
-    from stlc.controller.evaluation.held_out import Score
     from stlc.controller.problem.task import Task
     from stlc.controller.run.config import ResolvedConfig
-    from stlc.rundir import Status
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,23 +17,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.diagnostics import Diagnostic
-from stlc.dynamics.declaration.learning import Feedback
+from stlc.dynamics.declaration.learning import Feedback, FeedbackDecl
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
-    from typing import TypeAlias
-
     from numpy.typing import NDArray
 
     from stlc.dynamics.declaration.decl import SystemDecl
-    from stlc.dynamics.declaration.learning import FeedbackDecl
 
     Doubles: TypeAlias = NDArray[np.float64]
 

@@ -19,10 +19,6 @@ from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
 from stlc.units import parse_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from torch import Tensor
-
     from stlc.dynamics.declaration.motion import Assign
     from stlc.dynamics.system import System
 

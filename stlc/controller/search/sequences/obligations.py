@@ -8,7 +8,7 @@ that count from the state at hand: 5 s into the mission, `p until[0 s, 20 s] q`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeGuard
@@ -27,8 +27,6 @@ from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.tolerance import satisfied
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
     from torch import Tensor
 
