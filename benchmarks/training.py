@@ -23,9 +23,8 @@ from stlc.controller.parallel.inputs import input_files
 from stlc.controller.parallel.jobs import Job
 from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
+from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED, Clock
 from stlc.controller.run.run import Run, spec_hash, system_hash
-from stlc.controller.training.budget import Clock
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig
 from stlc.diagnostics import StlcError
 from stlc.provenance import sha256

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -185,6 +186,30 @@ def test_imports_go_down_only():
         and room_of(entry.target) > room_of(entry.module)
     ]
     assert not upward, "\n".join(upward)
+
+
+def order_of_packages() -> dict[str, list[str]]:
+    """Packages and modules of each room, from below, as the table of docs/architecture.md names them."""
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    table = text.partition("| room | packages and modules, from below |\n|---|---|\n")[2].partition("\n\n")[0]
+    rows = [row.split("|")[1:3] for row in table.splitlines()]
+    return {re.findall("`(.+?)`", room)[0]: re.findall("`(.+?)`", names) for room, names in rows}
+
+
+def test_packages_of_a_room_import_those_before_them():
+    order = order_of_packages()
+    assert {"grammar", "compile", "dynamics", "controller", "cli"} < order.keys()
+    backward, seen = [], 0
+    for entry in every_import():
+        places = [name.removeprefix("stlc.").split(".")[:2] for name in (entry.module, entry.target)]
+        rooms, (taker, giver) = {place[0] for place in places}, (place[-1] for place in places)
+        names = order.get(places[0][0], [])
+        if len(rooms) == 1 and {taker, giver} <= {*names}:
+            seen += 1
+            if names.index(giver) > names.index(taker):
+                backward.append(f"{entry.module}:{entry.line} imports {entry.target}")
+    assert not backward, "\n".join(backward)
+    assert seen > 100
 
 
 def test_no_cycles():

@@ -10,9 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias, final
-
-from stlc.compile.schedule.schedule import Pick
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, TypeAlias, final
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,6 +21,9 @@ Array: TypeAlias = Any
 
 Mask: TypeAlias = Any
 """An array of booleans."""
+
+Pick: TypeAlias = Literal["min", "max"]
+"""The extremum that an operator takes."""
 
 
 @final

@@ -28,17 +28,17 @@ from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.augment.mission import Goal, mission_steps, never_over
 from stlc.compile.augment.timers import Timer, TimerTable
 from stlc.compile.augment.whole import over_mission
+from stlc.compile.backends.schedule import End
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, in_samples, in_words
+from stlc.compile.ir.lower import as_written, lower
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import columns, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
-from stlc.compile.lowering.lower import as_written, lower
-from stlc.compile.lowering.simplify import simplify
-from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast

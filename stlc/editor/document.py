@@ -19,11 +19,11 @@ from stlc.compile.frontend.scope import Definition, Failed, Known, Scope
 from stlc.compile.frontend.values import Value
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, to_window
+from stlc.compile.ir.lower import lower
 from stlc.compile.ir.nodes import Window
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import reach
 from stlc.compile.ir.traverse import nodes
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.diagnostics import Diagnostic, Label, SpecError, StlcError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl

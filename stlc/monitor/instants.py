@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import earliest
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.schedule.schedule import Boundary
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.uncertain import outer

@@ -13,13 +13,13 @@ from stlc.compile.analysis.holes import holes_in, partial, unsure, without_holes
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.support import columns_of, history
 from stlc.compile.ir.traverse import map_children, nodes, subexpressions
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Exact, Semantics
 from stlc.monitor.cells import Cells
 from stlc.signature import Signature

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir.discretize import Grid, lacks
 from stlc.compile.ir.support import columns_of, farthest
 from stlc.compile.ir.traverse import numbers
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
-from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.semantics import Semantics, semantics_of
 from stlc.compile.semantics.tolerance import TOLERANCE, End, weighed
 from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError

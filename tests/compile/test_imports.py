@@ -18,7 +18,7 @@ from stlc.compile.frontend.modules import file_of, library_of, spec_sha256
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.lowering.lower import lower
+from stlc.compile.ir.lower import lower
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError, StlcError
 from stlc.files import read_source

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from stlc.cli.framework.app import main
 from stlc.compile.backends.c.streams import streams_of
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.diagnostics import UsageError
 from stlc.export.monitor import _texts, export_monitor
 from stlc.monitor.online.online import How, Online

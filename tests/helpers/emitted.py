@@ -21,9 +21,9 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.traverse import leaves, nodes, subexpressions
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.switch import StraightThrough
 from stlc.native import Adjoint, Kernel, ObjectiveSlopes, Sizes, load
 

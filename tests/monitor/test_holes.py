@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from stlc.compile.analysis.holes import partial
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.monitor.explain.report import explain
 from stlc.monitor.online.online import How
 from stlc.monitor.values import Record, bounds, window_bounds

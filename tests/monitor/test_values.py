@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import history
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 

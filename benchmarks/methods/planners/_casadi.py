@@ -19,8 +19,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.namespace import FloatConstants, Ops, Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import FloatConstants, Ops, Pick, Sliding
 
 ROUNDING = 1e-3
 """Width of a rounded kink, in the unit of the operand; the error is half of it."""

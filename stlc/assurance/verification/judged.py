@@ -17,9 +17,9 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
+from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import frozen_in, leaves, map_children
-from stlc.compile.schedule.schedule import Boundary
 from stlc.compile.semantics.tolerance import TOLERANCE
 
 PROVED = 0.5 * TOLERANCE

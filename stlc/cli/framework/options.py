@@ -17,7 +17,7 @@ from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
     from stlc.controller.planning.policy import PlannerChoice
-    from stlc.controller.training.budget import Clock
+    from stlc.controller.run.config import Clock
 
 MOST_SEED = 2**63 - 1
 """Greatest seed of torch's random numbers."""

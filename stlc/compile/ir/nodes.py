@@ -204,7 +204,7 @@ class Windowed(Operator):
 class Truth:
     """Formula `true` or `false`, with robustness +inf or -inf.
 
-    `stlc.compile.lowering.simplify` removes such constants where they are operands of other operators.
+    `stlc.compile.ir.simplify` removes such constants where they are operands of other operators.
     """
 
     value: bool

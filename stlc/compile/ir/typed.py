@@ -91,7 +91,7 @@ class Predicate(Node):
             Such a predicate decides whether an enclosing formula holds, but not by how much.
         unit: unit of the margin, in SI.
         written: unit of the comparison in the source. For recorded traces, `num` and `unit` are converted to
-            this unit (`stlc.compile.lowering.lower`).
+            this unit (`stlc.compile.ir.lower`).
     """
 
     num: ir.Num

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Protocol, TypeAlias
 
-from stlc.compile.namespace import Array, Ops
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Array, Ops, Pick
 
 Parts: TypeAlias = tuple[Array, ...]
 """Partial result for some of the operands: their extremum, or sums that determine it."""

@@ -15,7 +15,7 @@ Each semantics is one file in `stlc.compile.semantics.kinds`; its name is that o
 
 from __future__ import annotations
 
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Pick
 from stlc.compile.semantics.kinds.agm import ArithmeticGeometricMean
 from stlc.compile.semantics.kinds.dgmsr import GeneralizedMean
 from stlc.compile.semantics.kinds.exact import Exact

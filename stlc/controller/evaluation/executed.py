@@ -18,8 +18,8 @@ from stlc.controller.problem.task import Task, satisfied
 from stlc.controller.search.feasibility import viable as search_safe
 
 if TYPE_CHECKING:
+    from stlc.compile.backends.schedule import Boundary
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.compile.schedule.schedule import Boundary
     from stlc.controller.deployment.simulator import DeploymentRecording
 
 MOST_TIMED = 200

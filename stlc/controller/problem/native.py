@@ -37,8 +37,8 @@ from stlc.native import (
 from stlc.toolchain import compiler
 
 if TYPE_CHECKING:
+    from stlc.compile.backends.schedule import End
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.compile.schedule.schedule import End
     from stlc.dynamics.system import System
 
 

@@ -22,8 +22,8 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.lower import lower
 from stlc.compile.ir.support import Reach, reach
-from stlc.compile.lowering.lower import lower
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -29,7 +29,7 @@ from stlc.native import check_plans
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.compile.schedule.schedule import End
+    from stlc.compile.backends.schedule import End
     from stlc.dynamics.system import System
     from stlc.grammar import ast
 

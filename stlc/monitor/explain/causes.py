@@ -29,6 +29,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.lower import lower
 from stlc.compile.ir.normal_form import connective, unless
 from stlc.compile.ir.support import columns_of, history
 from stlc.compile.ir.traverse import (
@@ -42,7 +43,6 @@ from stlc.compile.ir.traverse import (
     operands,
     substitute_frozen,
 )
-from stlc.compile.lowering.lower import lower
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.cells import over_columns
 from stlc.monitor.values import Record, assume_missing_true, bounds

@@ -16,9 +16,9 @@ from stlc.compile.augment.lift import from_first_sample
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import to_window
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.traverse import absolute, leaves, numbers
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.monitor.judgement import RequirementVerdict
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.uncertain import outer

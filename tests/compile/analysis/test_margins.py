@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.lowering.lower import in_unit
+from stlc.compile.ir.lower import in_unit
 from stlc.monitor.explain.report import explain
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from stlc.compile.backends.array import frozen
 from stlc.compile.backends.array.graph import evaluate, robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.schedule import IndexRange, TraceDomain, spanning
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
-from stlc.compile.schedule.schedule import IndexRange, TraceDomain, spanning
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.diagnostics import TraceError
 
 Env = dict[str, np.ndarray]

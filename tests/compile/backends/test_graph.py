@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from stlc.compile.backends.array.graph import RobustnessGraph, evaluate, planned, robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.schedule import TraceDomain, spanning
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.traverse import nodes, operands
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
-from stlc.compile.schedule.schedule import TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, LogSumExp, Semantics
 from stlc.signature import Column, Signature
 

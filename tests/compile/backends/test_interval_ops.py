@@ -31,9 +31,9 @@ from stlc.compile.backends.array.interval_ops import INTERVALS, IntervalOps, _an
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.traverse import nodes
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.compile.namespace import Ops, Sliding
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 from stlc.compile.semantics.switch import StraightThrough, Tanh

@@ -15,8 +15,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.backends.torch.extrema import small_extrema, small_until
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.namespace import Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Pick, Sliding
 from stlc.compile.semantics.semantics import Exact
 
 BOTH = pytest.mark.parametrize("pick", ["min", "max"])

@@ -10,8 +10,7 @@ import torch
 
 from stlc.compile.backends.torch.extrema import _Choice, _Reduction, by_kernel, choice, reduction
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.namespace import Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Pick, Sliding
 from stlc.native import compiler
 
 SHAPES = [(2, 3), (40, 700)]

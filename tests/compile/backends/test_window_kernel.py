@@ -15,8 +15,7 @@ from stlc.compile.backends.array import kernel
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.backends.torch.extrema import by_kernel
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.namespace import Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Pick, Sliding
 from stlc.compile.semantics.semantics import Exact
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")

@@ -18,7 +18,7 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.lowering.lower import lower
+from stlc.compile.ir.lower import lower
 
 GRID = Grid()
 L_SHAPE = "polygon([0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3])"

@@ -14,9 +14,9 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.lower import lower
 from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import nodes
-from stlc.compile.lowering.lower import lower
 from stlc.compile.pipeline import compile_spec
 from stlc.grammar.parse.parser import parse
 from stlc.source import Source

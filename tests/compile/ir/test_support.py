@@ -10,9 +10,9 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
+from stlc.compile.ir.lower import lower
 from stlc.compile.ir.support import columns, reach, uses_end
 from stlc.compile.ir.traverse import nodes
-from stlc.compile.lowering.lower import lower
 
 P, Q = ir.Predicate(ir.Signal("p")), ir.Predicate(ir.Signal("q"))
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from stlc.compile.backends import schedule
 from stlc.compile.backends.array.graph import evaluate, planned
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.steps import MAX_BEYOND
+from stlc.compile.backends.schedule import TraceDomain, spanning
 from stlc.compile.ir import nodes as ir
-from stlc.compile.schedule import schedule
-from stlc.compile.schedule.schedule import TraceDomain, spanning
 from stlc.compile.semantics.semantics import SEMANTICS, semantics_of
 from stlc.diagnostics import StlcError
 

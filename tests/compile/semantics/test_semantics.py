@@ -15,7 +15,7 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import typed
-from stlc.compile.lowering.lower import lower
+from stlc.compile.ir.lower import lower
 from stlc.compile.namespace import Ops
 from stlc.compile.semantics.semantics import (
     SEMANTICS,

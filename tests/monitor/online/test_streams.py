@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from stlc import native
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
+from stlc.compile.ir.lower import lower
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.pipeline import Compiled
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds

@@ -17,11 +17,11 @@ from typing import Any, TypeAlias
 
 from stlc.compile.backends.array.tape import GradientTape, Instr, Operand
 from stlc.compile.backends.numbers import Leaf, NumberEvaluator
+from stlc.compile.backends.schedule import IndexRange
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import key_of, leaves
 from stlc.compile.namespace import Array, Ops
-from stlc.compile.schedule.schedule import IndexRange
 from stlc.compile.semantics.switch import Hard, Switch
 
 ExternFunction: TypeAlias = Callable[..., Sequence[Array]]

@@ -17,11 +17,11 @@ from typing import TypeAlias, final
 import numpy as np
 
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
+from stlc.compile.backends.schedule import IndexRange, TraceDomain, reads, spanning, within
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, columns, depends_on_ends, reach, uses_end
 from stlc.compile.ir.traverse import frozen_in, map_children, nodes, numbers
 from stlc.compile.namespace import Array, Ops
-from stlc.compile.schedule.schedule import IndexRange, TraceDomain, reads, spanning, within
 
 Env: TypeAlias = Mapping[str, Array]
 Judge: TypeAlias = Callable[[ir.Formula, Env, IndexRange, TraceDomain], Array]

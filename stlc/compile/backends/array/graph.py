@@ -1,6 +1,6 @@
 """Robustness of formulas at given instants, over any array library.
 
-Signals are arrays `(time, batch)`. `stlc.compile.schedule.schedule` lists the values to compute, and
+Signals are arrays `(time, batch)`. `stlc.compile.backends.schedule` lists the values to compute, and
 `stlc.compile.backends.array.steps` computes them.
 """
 
@@ -17,10 +17,10 @@ import numpy as np
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.steps import ArrayPlan, all_values, array_plan
 from stlc.compile.backends.array.windows import Windows
+from stlc.compile.backends.schedule import Boundary, End, IndexRange, TraceDomain, spanning
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.namespace import Array, Ops
-from stlc.compile.schedule.schedule import Boundary, End, IndexRange, TraceDomain, spanning
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import weighed
 from stlc.signature import Signature
@@ -46,7 +46,7 @@ def evaluate(
         semantics: definition of min and max; None for the exact ones.
         start: first instant.
         count: number of instants.
-        end: treatment of instants beyond the last sample (`stlc.compile.schedule.schedule.Boundary`).
+        end: treatment of instants beyond the last sample (`stlc.compile.backends.schedule.Boundary`).
         stop: final number of samples of a trace that continues (`end` "lower" or "upper"). Unbounded windows
             end there. If None, they end with the last known sample.
 

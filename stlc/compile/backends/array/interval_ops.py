@@ -50,8 +50,7 @@ from stlc.compile.backends.array.interval import (
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.namespace import FloatConstants, Ops, Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import FloatConstants, Ops, Pick, Sliding
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.diagnostics import Diagnostic, UsageError
 

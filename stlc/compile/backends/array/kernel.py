@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias, final, get_args
 
 from stlc import native
-from stlc.compile.namespace import Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Pick, Sliding
 
 Direction: TypeAlias = Literal["values", "pull", "push"]
 """Results of a kernel: values, gradients of the operands, or changes of the values."""

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.kernel import Strided, window_kernel
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.namespace import Array, FloatConstants, Mask, Ops, Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Array, FloatConstants, Mask, Ops, Pick, Sliding
 
 _WIDE = 8
 """Columns from which the C kernel beats pairwise doubling."""

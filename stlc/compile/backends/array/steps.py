@@ -1,4 +1,4 @@
-"""Execution of an evaluation schedule (`stlc.compile.schedule.schedule`: a list of steps) over arrays.
+"""Execution of an evaluation schedule (`stlc.compile.backends.schedule`: a list of steps) over arrays.
 
 A step is one sub-formula at a range of instants; its values are an array `(count, batch)`. One program
 computes all predicates that are evaluated at the same instants. The step of every other sub-formula has its
@@ -18,12 +18,9 @@ import numpy as np
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.frozen import Freezer
 from stlc.compile.backends.array.windows import Windows
-from stlc.compile.ir import nodes as ir
-from stlc.compile.namespace import Array
-from stlc.compile.schedule.schedule import (
+from stlc.compile.backends.schedule import (
     PICKS,
     IndexRange,
-    Pick,
     Schedule,
     Step,
     TraceDomain,
@@ -33,6 +30,8 @@ from stlc.compile.schedule.schedule import (
     spanning,
     within,
 )
+from stlc.compile.ir import nodes as ir
+from stlc.compile.namespace import Array, Pick
 from stlc.diagnostics import Diagnostic, TraceError
 
 Kernel: TypeAlias = Callable[[Sequence[Array], Array], Array]

@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 from typing import final
 
-from stlc.compile.namespace import Array, Ops, Sliding
-from stlc.compile.schedule.schedule import Pick, dual, neutral
+from stlc.compile.backends.schedule import dual, neutral
+from stlc.compile.namespace import Array, Ops, Pick, Sliding
 from stlc.compile.semantics.protocol import Parts, Semantics
 
 _SCAN_BATCH = 64

@@ -15,8 +15,8 @@ from stlc.compile.backends.c.parts import Frame, declared, in_parts
 from stlc.compile.backends.c.plan import plan_of
 from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.backends.c.slopes import SlopeWriter
+from stlc.compile.backends.schedule import End
 from stlc.compile.ir import nodes as ir
-from stlc.compile.schedule.schedule import End
 
 _BUMP = """
 /* e^x for x <= 0, to the last digits, in a form that vectorises. */

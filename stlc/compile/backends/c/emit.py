@@ -15,9 +15,9 @@ from stlc.compile.backends.c.parts import Frame, declared, in_parts
 from stlc.compile.backends.c.plan import Plan, Storage, plan_of
 from stlc.compile.backends.c.printer import StepPrinter
 from stlc.compile.backends.numbers import Leaf
+from stlc.compile.backends.schedule import End
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import leaves
-from stlc.compile.schedule.schedule import End
 from stlc.compile.semantics.tolerance import TOLERANCE
 
 LANES = 16

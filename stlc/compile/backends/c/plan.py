@@ -16,16 +16,12 @@ from typing import TypeAlias
 
 from stlc.compile.backends.c.families import Family, FamilyTable, families
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_of, reach_of
-from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
-from stlc.compile.schedule.schedule import (
+from stlc.compile.backends.schedule import (
     PICKS,
     End,
     IndexRange,
     Instant,
     LoopIndex,
-    Pick,
     Schedule,
     Scheduler,
     Step,
@@ -34,6 +30,10 @@ from stlc.compile.schedule.schedule import (
     earliest,
     latest,
 )
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.support import columns_of, reach_of
+from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
+from stlc.compile.namespace import Pick
 
 CallKey: TypeAlias = tuple[str, tuple[ir.Signal, ...]]
 

@@ -22,8 +22,9 @@ from stlc.compile.backends.c.numbers import LISTED, NumberWriter, literal
 from stlc.compile.backends.c.plan import Buffer, Called, Frozen, Loop, Plan, Tabled, call_of
 from stlc.compile.backends.c.slopes import COUNTED, SlopeWriter
 from stlc.compile.backends.numbers import Leaf
+from stlc.compile.backends.schedule import PICKS, IndexRange, Step, earliest, latest, neutral
 from stlc.compile.ir import nodes as ir
-from stlc.compile.schedule.schedule import PICKS, IndexRange, Pick, Step, earliest, latest, neutral
+from stlc.compile.namespace import Pick
 
 Macro: TypeAlias = Literal["MIN", "MAX"]
 

@@ -28,11 +28,11 @@ from stlc.compile.backends.milp.model import (
     constant,
     junction,
 )
+from stlc.compile.backends.schedule import End
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.text import show_number
 from stlc.compile.ir.traverse import leaves, nodes, numbers
-from stlc.compile.schedule.schedule import End
 
 MARGIN = 1e-5
 """Margin of the dynamics' conditions in a tight encoding; tolerance of all conditions in a relaxed one."""

@@ -15,11 +15,11 @@ from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import BATCH, Kind, Value, joined
+from stlc.compile.backends.schedule import spanning
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
-from stlc.compile.namespace import Ops, Sliding
-from stlc.compile.schedule.schedule import Pick, spanning
+from stlc.compile.namespace import Ops, Pick, Sliding
 
 Number: TypeAlias = Value | float
 

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from stlc.compile.backends.array.kernel import Direction, Strided, WindowKernel, window_kernel
-from stlc.compile.namespace import Sliding
-from stlc.compile.schedule.schedule import Pick, dual, neutral
+from stlc.compile.backends.schedule import dual, neutral
+from stlc.compile.namespace import Pick, Sliding
 
 _LARGE = 1 << 12
 """Elements from which the custom gradient is faster."""

@@ -24,8 +24,7 @@ from stlc.compile.backends.torch.extrema import (
 )
 from stlc.compile.backends.torch.guarded import lerp, sifted
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.namespace import Mask, Ops, Sliding
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Mask, Ops, Pick, Sliding
 
 
 class _MaskedRows(torch.autograd.Function):

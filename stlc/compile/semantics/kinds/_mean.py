@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from functools import reduce
 from typing import ClassVar
 
-from stlc.compile.namespace import Array, Ops
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Array, Ops, Pick
 from stlc.compile.semantics.protocol import Parts
 
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, final
 
-from stlc.compile.namespace import Array, Ops
-from stlc.compile.schedule.schedule import Pick
+from stlc.compile.namespace import Array, Ops, Pick
 from stlc.compile.semantics.protocol import Associative
 
 

@@ -19,11 +19,11 @@ from stlc.compile.augment.lift import hoist_absolute
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.lower import lower
 from stlc.compile.ir.normal_form import joined, normal
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import map_children, nodes
-from stlc.compile.lowering.lower import lower
-from stlc.compile.lowering.simplify import simplify
 from stlc.compile.semantics.tolerance import satisfied
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ from stlc.compile.backends.c.emit import LANES, emit
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined
+from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import columns
 from stlc.compile.ir.traverse import map_children, nodes
-from stlc.compile.lowering.simplify import simplify
 from stlc.controller.problem.native import motion_of
 from stlc.native import Kernel, SearchOptions, Sizes, load
 

@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeAlias
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Reach, farthest, reach_of, tail
 from stlc.compile.ir.traverse import operands as parts_of
+from stlc.compile.namespace import Pick
 
 Boundary: TypeAlias = Literal["strict", "truncate", "lower", "upper", "both"]
 """Treatment of instants beyond the last sample.
@@ -29,8 +30,6 @@ without `freeze`): the batch holds two traces, the first with lower, the second 
 
 End: TypeAlias = Literal["strict", "truncate"]
 """Treatment of windows that extend beyond the end of a plan: an error, or they are cut there."""
-
-Pick: TypeAlias = Literal["min", "max"]
 
 PICKS: Mapping[str, Pick] = MappingProxyType(
     {name: "min" if name == kind.names[0] else "max" for name, kind in ir.OPERATORS.items()}

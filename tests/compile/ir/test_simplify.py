@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.lowering.simplify import simplify
+from stlc.compile.ir.simplify import simplify
 
 P, Q, R = (ir.Predicate(ir.Signal(name)) for name in "pqr")
 TRUE, FALSE = ir.Truth(True), ir.Truth(False)

@@ -14,9 +14,9 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.lower import lower
 from stlc.compile.ir.support import reach
 from stlc.compile.ir.text import show_formula
-from stlc.compile.lowering.lower import lower
 from stlc.diagnostics import Diagnostic
 
 X = typed.Predicate(SPAN, ir.Signal("x"), strict=True)

@@ -1,1 +1,0 @@
-"""Lowering (translation) of typed formulas to the intermediate representation, with time in steps."""
