@@ -26,7 +26,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import TraceError
 from stlc.grammar.parse.parser import parse
-from stlc.grammar.show.printer import show
+from stlc.grammar.printer import show
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta, read_recording, save_trace

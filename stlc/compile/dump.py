@@ -17,7 +17,7 @@ from stlc.compile.ir.text import show_formula, shown
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.escape import screen
-from stlc.grammar.show.printer import show, show_name
+from stlc.grammar.printer import show, show_name
 
 WIDTH, LEFT = 110, 44
 """Width of the text, and maximum width of the source column, in characters."""

@@ -18,8 +18,8 @@ from stlc.editor.hover import about, about_shared, summary
 from stlc.editor.symbols import inside
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.grammar import ast
+from stlc.grammar.printer import own_name
 from stlc.grammar.scan import declaration_starts, lexemes
-from stlc.grammar.show.printer import own_name
 from stlc.grammar.tables import acceptable
 from stlc.grammar.words import BINARY_TEMPORAL, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.units import PREFIXED, SYMBOLS

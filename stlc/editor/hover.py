@@ -16,8 +16,8 @@ from stlc.editor.symbols import Symbol
 from stlc.editor.vocabulary import BUILT_IN, FUNCTIONS, KEYWORDS, TAGS, TEMPORAL, TYPES
 from stlc.escape import markdown, markdown_code, screen
 from stlc.grammar import ast
+from stlc.grammar.printer import show
 from stlc.grammar.scan import Lexeme, lexemes
-from stlc.grammar.show.printer import show
 from stlc.grammar.traverse import descendants
 from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS, UNARY_TEMPORAL
 from stlc.signature import Column

@@ -10,7 +10,7 @@ from stlc.editor.document import Document
 from stlc.editor.symbols import Occurrence, SymbolNames, names_of
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse
-from stlc.grammar.show.printer import own_name
+from stlc.grammar.printer import own_name
 from stlc.lint.lint import Edit, edited
 from stlc.source import Source, Span
 

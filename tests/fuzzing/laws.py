@@ -24,8 +24,8 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
     from stlc.compile.ir.discretize import Grid
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import StlcError
+    from stlc.grammar.english import sentence
     from stlc.grammar.parse.parser import parse
-    from stlc.grammar.show.english import sentence
     from stlc.lint.lint import Selection, Surroundings, lint
 
     decl = _system()

@@ -15,8 +15,8 @@ from stlc.editor.document import Systems, analyse
 from stlc.grammar.errors.unicode import plain_text
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse, parse_expr
+from stlc.grammar.printer import show
 from stlc.grammar.scan import lexemes
-from stlc.grammar.show.printer import show
 from stlc.lint.lint import lint
 from stlc.source import Source
 from stlc.units import parse_unit

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from stlc.grammar import ast
+from stlc.grammar.english import REPEATED, Meanings, sentence
 from stlc.grammar.parse.parser import parse
-from stlc.grammar.show.english import REPEATED, Meanings, sentence
 from stlc.source import Source
 
 

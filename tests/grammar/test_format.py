@@ -15,7 +15,7 @@ from stlc.files import read_source
 from stlc.grammar.format.format import WIDTH, format_text
 from stlc.grammar.parse.parser import parse
 from stlc.grammar.parse.tokens import tokenize
-from stlc.grammar.show.printer import show
+from stlc.grammar.printer import show
 from stlc.source import Source
 
 DATA = sorted((Path(__file__).parent / "data").glob("*.stl"))

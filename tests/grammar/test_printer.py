@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import parse, parse_expr
-from stlc.grammar.show.printer import show
+from stlc.grammar.printer import show
 from stlc.source import Source
 
 DATA = sorted((Path(__file__).parent / "data").glob("*.stl"))

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from stlc.diagnostics import SpecError
+from stlc.grammar.english import sentence
 from stlc.grammar.format.format import format_text
 from stlc.grammar.parse.parser import parse
 from stlc.grammar.scan import lexemes
-from stlc.grammar.show.english import sentence
 from stlc.lint.lint import Selection, fix, lint
 from stlc.source import Source
 

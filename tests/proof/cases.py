@@ -12,7 +12,7 @@ from proof.levels import End, Record, ahead
 from proof.written import specification
 
 from stlc.grammar.parse.parser import parse
-from stlc.grammar.show.printer import show
+from stlc.grammar.printer import show
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.check import options as given
+from stlc.cli.framework.manual import CodeList, Page, RequirementInWords, SpecInWords, read_page
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, JsonOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, table
 from stlc.cli.framework.program import command
@@ -80,9 +81,9 @@ def explain(
 
 def _spec(name: str, wanted: list[str]) -> Answer[SpecInWords]:
     """Translate requirements of a specification into English: those in `wanted`, or all if it is empty."""
+    from stlc.cli.framework.manual import in_words
     from stlc.files import find_spec, read_source
     from stlc.grammar.parse.parser import parse
-    from stlc.grammar.show.manual import in_words
 
     found = in_words(parse(read_source(find_spec(name))), name, wanted)
     text = "\n\n".join("\n".join(_in_words(each)) for each in found.requirements)

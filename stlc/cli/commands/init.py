@@ -263,7 +263,7 @@ def _spec_text(name: str, system: SystemDecl | None, reference: str) -> str:
 
 
 def _signal(column: Column) -> str:
-    from stlc.grammar.show.printer import own_name
+    from stlc.grammar.printer import own_name
 
     role = column.role if column.role in ("input", "output", "state", "env") else "state"
     head = f"{role} signal {own_name(column.name)}"
@@ -279,7 +279,7 @@ def _signal(column: Column) -> str:
 
 
 def _predicate(column: Column) -> str:
-    from stlc.grammar.show.printer import own_name
+    from stlc.grammar.printer import own_name
 
     if column.kind == "bool":
         return own_name(column.name)

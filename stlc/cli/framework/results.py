@@ -25,9 +25,9 @@ RESULTS: dict[str, tuple[str, ...]] = {
     ),
     "doctor": (f"{_DOCUMENTS}:InstallationReport",),
     "explain": (
-        "stlc.grammar.show.manual:CodeList",
-        "stlc.grammar.show.manual:Page",
-        "stlc.grammar.show.manual:SpecInWords",
+        "stlc.cli.framework.manual:CodeList",
+        "stlc.cli.framework.manual:Page",
+        "stlc.cli.framework.manual:SpecInWords",
         "stlc.monitor.explain.tree:Explanation",
         "stlc.controller.guard.coverage:Guarantee",
     ),

@@ -20,7 +20,7 @@ from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import Number, Value
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
-from stlc.grammar.show.printer import show_expr
+from stlc.grammar.printer import show_expr
 from stlc.grammar.traverse import descendants
 from stlc.source import Span
 

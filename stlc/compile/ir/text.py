@@ -9,7 +9,7 @@ from typing import Any
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import operands
-from stlc.grammar.show.printer import show_name
+from stlc.grammar.printer import show_name
 
 _LEVELS = {"+": 1, "-": 1, "*": 2, "/": 2, "%": 2, "^": 4}
 """Sign of an operator between two numbers -> its precedence."""

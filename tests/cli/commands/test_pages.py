@@ -17,9 +17,9 @@ from helpers.exported import exported
 from helpers.several import ENVIRONMENT, free_port
 
 from stlc.cli.framework.app import main
+from stlc.cli.framework.manual import FOLDER, Example, Page, read_page
 from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
-from stlc.grammar.show.manual import FOLDER, Example, Page, read_page
 from stlc.grammar.tables import load_parser
 from stlc.rundir import RunDir
 
@@ -341,7 +341,7 @@ def test_an_unknown_code(capsys):
 
 def test_precedence_is_that_of_the_grammar():
     from stlc.grammar.parse.parser import parse_expr
-    from stlc.grammar.show.printer import show
+    from stlc.grammar.printer import show
     from stlc.source import Source
 
     for written, meant in [

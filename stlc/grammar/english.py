@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from stlc.grammar import ast
-from stlc.grammar.show.printer import show_expr, show_set
+from stlc.grammar.printer import show_expr, show_set
 from stlc.grammar.traverse import descendants
 from stlc.grammar.words import OPERATORS
 

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 from stlc.diagnostics import usage
 from stlc.grammar import ast
-from stlc.grammar.show.english import Meanings
+from stlc.grammar.english import Meanings
 from stlc.registry import did_you_mean
 
 FOLDER = Path(__file__).parents[2] / "pages"

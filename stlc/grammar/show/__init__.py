@@ -1,1 +1,0 @@
-"""Syntax trees as canonical text and as English."""
