@@ -19,8 +19,8 @@ from stlc.diagnostics import CODES, usage
 from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
+    from stlc.cli.framework.manual import CodeList, Page, RequirementInWords, SpecInWords
     from stlc.controller.guard.coverage import Chance, Guarantee
-    from stlc.grammar.show.manual import CodeList, Page, RequirementInWords, SpecInWords
     from stlc.monitor.explain.tree import Explanation
 
 _CODE = re.compile(r"[A-Za-z]\d{3}")
@@ -56,7 +56,7 @@ def explain(
     """
     if guarantee:
         return _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_))
-    from stlc.grammar.show.manual import CodeList, read_page
+    from stlc.cli.framework.manual import CodeList
 
     if what is None:
         return Answer(CodeList(dict(CODES)), lambda: emit(table(list(CODES.items()), indent="")))
