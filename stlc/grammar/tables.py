@@ -42,7 +42,7 @@ def load_parser() -> lark.Lark:
 
 def grammar_text() -> str:
     """Return the text of `stl.lark` with the words of the language inserted."""
-    text = Path(__file__).parents[1].joinpath("stl.lark").read_text(encoding="utf-8")
+    text = Path(__file__).with_name("stl.lark").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: PATTERNS[match[1]], text)
 
 
