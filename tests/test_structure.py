@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463637
+NODES = 463704
 CROSSINGS = 6.81
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {

@@ -41,7 +41,7 @@ COSTLY = 4_000
 """Number of plans, a limit of judged plans given, that must be left for a search for phases."""
 RESTARTS = 16
 """Number of searches for sequences of phases from one state. Each ends when no prefix is left to extend."""
-EFFORTS = 1, 2, 4, 8
+EFFORTS = 1, 1, 1, 2, 4, 8
 """Efforts for each phase in these searches, one after another; the last of them for the rest."""
 
 

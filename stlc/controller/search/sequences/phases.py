@@ -229,8 +229,7 @@ class Phases:
         `effort` is a factor of the generations of local searches.
         """
         row, middle = self._row(state, ask), np.broadcast_to(self._middle, self._bank[0].shape)
-        plans = np.stack((middle, *self._known[ask.target]))
-        rho = self._judged(np.repeat(row, len(plans), 0), plans)
+        plans, rho = self._remembered(row, ask, middle)
         for _ in range(min(ROUNDS[0] + effort - 1, ROUNDS[1])):
             if rho.max() < 0.0:
                 plans, rho = self._improved(row, ask, plans, random, effort)
@@ -260,6 +259,19 @@ class Phases:
             found = self._calm(state, ask, found)
             self._known[ask.target].append(found.plan)
         return found
+
+    def _remembered(self, row: Numbers, ask: Ask, middle: Numbers) -> tuple[Numbers, Numbers]:
+        """Return initial plans, (k, L, m), with their robustness.
+
+        They are the middle of the ranges of the controls, what reached the target before, and the best of
+        what reached other targets.
+        """
+        own, others = self._known[ask.target], [*chain(*self._known)]
+        plans = np.stack((middle, *own, *others))
+        rho = self._judged(np.repeat(row, len(plans), 0), plans)
+        first = 1 + len(own)
+        kept = [*range(first), *(first + (-rho[first:]).argsort(kind="stable")[:KEPT])]
+        return plans[kept], rho[kept]
 
     def _calm(self, state: Numbers, ask: Ask, found: Phase) -> Phase:
         """Return a phase without the controls that it does not need: they keep the middle of their ranges."""
