@@ -20,8 +20,6 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
-from stlc.compile.analysis.ranges import KnownRanges
-from stlc.compile.analysis.warnings import jumps
 from stlc.compile.augment.augment import Augmented, augment
 from stlc.compile.augment.guidance import guidance_cost
 from stlc.compile.augment.lift import from_first_sample
@@ -36,9 +34,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid, in_samples, in_words
 from stlc.compile.ir.lower import as_written, lower
+from stlc.compile.ir.ranges import KnownRanges
 from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import columns, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
+from stlc.compile.ir.warnings import jumps
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast

@@ -12,7 +12,7 @@ import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from stlc.compile.analysis.ranges import bounds
+from stlc.compile.ir.ranges import bounds
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
 

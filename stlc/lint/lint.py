@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from stlc.compile.analysis.deadlines import beyond_plans
+from stlc.compile.deadlines import beyond_plans
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir import typed

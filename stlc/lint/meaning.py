@@ -10,12 +10,12 @@ from itertools import pairwise
 from types import MappingProxyType
 from typing import TypeAlias
 
-from stlc.compile.analysis.warnings import in_range, truth
 from stlc.compile.frontend.scope import enforced
 from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import typed
 from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import mentions_horizon, nodes, operands
+from stlc.compile.ir.warnings import in_range, truth
 from stlc.diagnostics import Diagnostic, Fix
 from stlc.grammar import ast
 from stlc.grammar.traverse import descendants

@@ -9,13 +9,13 @@ from typing import Literal, TypeAlias, cast
 
 import numpy as np
 
-from stlc.compile.analysis.holes import holes_in, partial, unsure, without_holes
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
+from stlc.compile.ir.holes import holes_in, partial, unsure, without_holes
 from stlc.compile.ir.support import columns_of, history
 from stlc.compile.ir.traverse import map_children, nodes, subexpressions
 from stlc.compile.namespace import Array, Ops
@@ -39,7 +39,7 @@ class Record:
         env: signal name -> values, none of them NaN.
         ops: the array library.
         semantics: definition of minimum and maximum.
-        holes: names of the signals with unknown values (`stlc.compile.analysis.holes`).
+        holes: names of the signals with unknown values (`stlc.compile.ir.holes`).
         computed: whether NaN that a function gives outside of its domain is unknown too.
         cells: recorded values between the samples, if the signals were resampled.
         loose: whether a step of the grid counts as a whole: windows end at an instant of their own.

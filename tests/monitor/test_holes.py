@@ -10,8 +10,8 @@ from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stlc.compile.analysis.holes import partial
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.ir.holes import partial
 from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.monitor.explain.report import explain

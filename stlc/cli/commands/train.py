@@ -258,7 +258,7 @@ def _task(
     `overrides` gives new values of constants and of fields of the system file. If the training `method` can
     do so, plans reach to the end of missions.
     """
-    from stlc.compile.analysis.deadlines import beyond_plans
+    from stlc.compile.deadlines import beyond_plans
     from stlc.controller.problem.load import load_task, require_controls
     from stlc.controller.training.config import method_name
     from stlc.dynamics.model.feedback import unstable

@@ -16,11 +16,11 @@ from fractions import Fraction
 from functools import reduce
 from typing import Literal
 
-from stlc.compile.analysis.ranges import bounds
 from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import Number, VectorValue, literal, unit_text
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, Function
+from stlc.compile.ir.ranges import bounds
 from stlc.diagnostics import Diagnostic, Label
 from stlc.signature import Kind
 from stlc.source import Span

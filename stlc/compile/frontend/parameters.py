@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from stlc.compile.analysis.ranges import usual_range
 from stlc.compile.frontend.arithmetic import in_unit, on_scale
 from stlc.compile.frontend.coerce import Expectation, loose_number, require_unit
 from stlc.compile.frontend.declare import ends_of
@@ -16,6 +15,7 @@ from stlc.compile.frontend.scope import Scope
 from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
+from stlc.compile.ir.ranges import usual_range
 from stlc.compile.ir.support import columns_of
 from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError
 from stlc.grammar import ast

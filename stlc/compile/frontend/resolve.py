@@ -15,8 +15,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import PurePath
 from typing import TypeVar
 
-from stlc.compile.analysis.ranges import KnownRanges
-from stlc.compile.analysis.warnings import contradictions, safety_never_violated, vacuous
 from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.declare import Declared, check_names, declare, ranged
 from stlc.compile.frontend.evaluate import evaluate
@@ -30,6 +28,8 @@ from stlc.compile.frontend.values import Number, Value, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
+from stlc.compile.ir.ranges import KnownRanges
+from stlc.compile.ir.warnings import contradictions, safety_never_violated, vacuous
 from stlc.diagnostics import Diagnostic, Findings, Label, SpecError
 from stlc.grammar import ast
 from stlc.grammar.parse.parser import MAX_ERRORS

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from stlc.compile.analysis.ranges import KnownRanges, bounds
 from stlc.compile.frontend.arithmetic import refuse_point
 from stlc.compile.frontend.coerce import Expectation, as_number
 from stlc.compile.frontend.evaluate import evaluate
@@ -14,6 +13,7 @@ from stlc.compile.frontend.scope import Failed, Scope
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
+from stlc.compile.ir.ranges import KnownRanges, bounds
 from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 
-from stlc.compile.analysis.deadlines import unreached
+from stlc.compile.deadlines import unreached
 from stlc.controller.deployment.simulator import (
     DeploymentRecording,
     Recorder,

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from stlc.compile.analysis.ranges import bounds
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.ranges import bounds
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.planning.missed import better_planner, missed

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Protocol, get_args
 
-from stlc.compile.analysis.ranges import usual_range
 from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Definition, Known, column_entries, constant_value, member_entries
 from stlc.compile.frontend.values import VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import add, multiply
+from stlc.compile.ir.ranges import usual_range
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, shared_draws, state_assigns
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, ControlDecl, Names, Squash, component_names

@@ -23,12 +23,12 @@ from typing import Any, TypeAlias, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.analysis.holes import KNOWN
 from stlc.compile.backends.array.graph import evaluate_parts
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.discretize import Grid
+from stlc.compile.ir.holes import KNOWN
 from stlc.compile.ir.lower import lower
 from stlc.compile.ir.normal_form import connective, unless
 from stlc.compile.ir.support import columns_of, history

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.analysis.holes import holes_in, without_holes
-from stlc.compile.analysis.ranges import bounds
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds
+from stlc.compile.ir.holes import holes_in, without_holes
+from stlc.compile.ir.ranges import bounds
 from stlc.compile.ir.support import columns, columns_of
 from stlc.grammar import ast
 from stlc.monitor.facts.triggers import Trigger, triggers

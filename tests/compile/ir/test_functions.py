@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.compile.analysis.ranges import bounds
 from stlc.compile.backends.array import numpy_ops
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY, NumpyOps
@@ -19,6 +18,7 @@ from stlc.compile.backends.torch.ops import TORCH, TorchOps
 from stlc.compile.ir import functions
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS, SHARED, Function
+from stlc.compile.ir.ranges import bounds
 
 COMPUTED = [function for function in FUNCTIONS.values() if function.kind != "sampler"]
 X = ir.Signal("x")

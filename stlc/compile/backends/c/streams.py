@@ -23,11 +23,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from stlc.compile.analysis.holes import unsure
 from stlc.compile.backends.c.numbers import NumberWriter
 from stlc.compile.backends.numbers import Leaf, Untranslatable
 from stlc.compile.backends.schedule import PICKS
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.holes import unsure
 from stlc.compile.ir.support import farthest, reach_of
 from stlc.compile.ir.traverse import leaves, map_children, operands
 

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from stlc.compile.analysis.deadlines import beyond_plans, unreached
+from stlc.compile.deadlines import beyond_plans, unreached
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
 from stlc.grammar.parse.parser import parse

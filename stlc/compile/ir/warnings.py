@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 
-from stlc.compile.analysis.ranges import KnownRanges, bounds
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import Sign, normal
+from stlc.compile.ir.ranges import KnownRanges, bounds
 from stlc.compile.ir.traverse import leaves, nodes, numbers, subexpressions
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast

@@ -17,8 +17,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.analysis.ranges import has_value
 from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.ranges import has_value
 from stlc.compile.ir.traverse import leaves, map_children, numbers, subexpressions
 
 Floats: TypeAlias = NDArray[np.float64]

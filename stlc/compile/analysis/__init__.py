@@ -1,1 +1,0 @@
-"""Static analysis of a specification: warnings that follow from its declared ranges."""
