@@ -20,7 +20,7 @@ import numpy as np
 
 from stlc.diagnostics import Diagnostic, StlcError, UsageError
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.provenance import sha256
 
 JUDGE = "judge.py"

@@ -15,7 +15,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.functions import function_files
 from stlc.dynamics.system import System
 from stlc.files import SPECS, alone_in, find_system, read_source, write_atomic
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.jsontext import dumps, plain
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.rundir import now

@@ -109,14 +109,14 @@ def load(path: Path | str) -> ast.Spec:
         SpecError: the text is not a specification; the error carries all diagnostics.
     """
     from stlc.files import find_spec, read_source
-    from stlc.grammar.parse.parser import parse as parse_source
+    from stlc.grammar.parser import parse as parse_source
 
     return parse_source(read_source(find_spec(path)))
 
 
 def parse(text: str, name: str = "<text>") -> ast.Spec:
     """Parse the text of a specification; `name` names the text in messages. Raises SpecError."""
-    from stlc.grammar.parse.parser import parse as parse_source
+    from stlc.grammar.parser import parse as parse_source
     from stlc.source import Source
 
     return parse_source(Source(name, text))

@@ -381,7 +381,7 @@ def test_what_could_wait_or_never_end_is_not_read(tmp_path: Path) -> None:
             read_source(tmp_path / name)
     (tmp_path / "main.stl").write_text('import "pipe.stl" as p\nsignal x\nrequire r: x > 0\n')
     from stlc.compile.frontend.modules import library_of
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
 
     with pytest.raises(SpecError, match="it is a pipe"):
         library_of(parse(read_source(tmp_path / "main.stl")))

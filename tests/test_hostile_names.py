@@ -25,7 +25,7 @@ from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import TraceError
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
 from stlc.signature import Column, Signature
 from stlc.source import Source

@@ -23,7 +23,7 @@ from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.system import System
 from stlc.export.c_header import header, main_of
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.jsontext import dumps
 from stlc.rundir import RunDir
 

@@ -17,7 +17,7 @@ from stlc.dynamics.load import load_system_decl
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.grammar.words import RESERVED
 from stlc.lint.lint import Selection, lint
 from stlc.monitor.verdict import Monitor

@@ -55,7 +55,7 @@ HOMES = {
         "benchmarks",
     ),
     "safetensors": ("stlc.controller",),
-    "lark": ("stlc.grammar.parse", "stlc.grammar.tables"),
+    "lark": ("stlc.grammar.tables", "stlc.grammar.parser", "stlc.grammar.fold", "stlc.grammar.tokens"),
     "rich": ("stlc.cli", "stlc.view"),
     "typer": ("stlc.cli", "benchmarks"),
     "click": (),

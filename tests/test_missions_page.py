@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -14,7 +14,7 @@ from helpers import reference
 from stlc.compile.backends.array.graph import RobustnessGraph
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 GRID = Grid(Fraction(1, 10), 25)

@@ -10,7 +10,7 @@ import pytest
 from stlc.compile.pipeline import compile_spec
 from stlc.dynamics.load import load_system_decl
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

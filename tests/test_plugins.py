@@ -20,7 +20,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.diagnostics import PluginError, SystemFileError, UsageError
 from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.plants.declaration import load_plant_decl, plant_schema
 from stlc.plants.kinds import KINDS
 from stlc.plugins import plugins, variable

@@ -26,7 +26,7 @@ from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.uncertain import Uncertainty
 from stlc.monitor.verdict import Monitor
 

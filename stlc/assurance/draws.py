@@ -19,7 +19,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.files import find_spec, find_system, read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.judgement import chosen
 from stlc.plants.declaration import PlantDecl, load_plant_decl
 from stlc.provenance import sha256

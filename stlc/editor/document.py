@@ -30,7 +30,7 @@ from stlc.dynamics.load import load_system_decl
 from stlc.editor.symbols import Symbol, SymbolNames, names_of
 from stlc.files import find_system
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.grammar.traverse import descendants
 from stlc.lint.lint import Surroundings, lint

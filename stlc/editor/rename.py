@@ -9,7 +9,7 @@ from stlc.diagnostics import SpecError
 from stlc.editor.document import Document
 from stlc.editor.symbols import Occurrence, SymbolNames, names_of
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.grammar.printer import own_name
 from stlc.lint.lint import Edit, edited
 from stlc.source import Source, Span

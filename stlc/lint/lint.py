@@ -15,7 +15,7 @@ from stlc.compile.pipeline import Purpose, compile_resolved
 from stlc.diagnostics import CODES, Diagnostic, Fix, SpecError, UsageError
 from stlc.grammar import ast
 from stlc.grammar.allow import not_allowed
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.lint.meaning import TYPED_RULES
 from stlc.lint.rules import RULES
 from stlc.registry import closest

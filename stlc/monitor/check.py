@@ -370,7 +370,7 @@ def _monitor(
     system: str | None,
     overrides: tuple[tuple[str, str], ...],
 ) -> Monitor:
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
     from stlc.monitor.verdict import Monitor
 
     parsed = replace(parse(source), library=None if library is None else dict(library))

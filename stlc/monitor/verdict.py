@@ -22,7 +22,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE, End, weighed
 from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import cause_of
 from stlc.monitor.facts.rules import facts_of
 from stlc.monitor.given import UNNAMED, Given, is_frame, trace_of_frame

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.files import find_spec, read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.jsontext import Num
 from stlc.monitor.judgement import Verdict
 from stlc.monitor.signals import arrange, needs_of

@@ -14,7 +14,7 @@ from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.scenario import under
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import MOST_ARRAYS, SIMULATION, SPEC, SYSTEM, TRACE, RunDir
 from stlc.signature import Signature

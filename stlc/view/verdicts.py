@@ -16,7 +16,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import margin_unit, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import violations
 from stlc.monitor.judgement import RequirementVerdict, Verdict
 from stlc.monitor.verdict import Monitor, robustness_signals

@@ -19,7 +19,7 @@ from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

@@ -27,7 +27,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.world import ModelWorld, independent_agents
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.jsontext import plain
 from stlc.registry import METHODS
 from stlc.source import Source

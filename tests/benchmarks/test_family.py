@@ -24,7 +24,7 @@ from stlc.controller.run.run import Run
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import every_run
 from stlc.source import Source
 

@@ -12,7 +12,7 @@ from stlc.cli.framework.app import main
 from stlc.cli.framework.watch import watch
 from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).resolve().parents[2]

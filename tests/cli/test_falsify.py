@@ -16,7 +16,7 @@ from stlc.cli.framework.app import main
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.rules import Rules
 from stlc.controller.run.run import Run
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 from stlc.source import Source
 from stlc.trace import load_trace

@@ -9,7 +9,7 @@ import pytest
 from stlc.compile.deadlines import beyond_plans, unreached
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 

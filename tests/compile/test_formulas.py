@@ -12,7 +12,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
 from stlc.diagnostics import SystemFileError
-from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.signature import Column
 from stlc.source import Source
 from stlc.units import parse_unit

@@ -23,7 +23,7 @@ from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError, StlcError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source

@@ -9,7 +9,7 @@ import torch
 import stlc
 from stlc.grammar.english import sentence
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.lint.lint import lint
 from stlc.source import Source
 

@@ -22,7 +22,7 @@ from stlc.compile.frontend.scope import (
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.diagnostics import SpecError, StlcError, SystemFileError
-from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.signature import Column
 from stlc.source import Source
 from stlc.units import DIMENSIONLESS, parse_unit, same_dims

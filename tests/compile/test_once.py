@@ -15,7 +15,7 @@ from stlc.compile import pipeline
 from stlc.compile.frontend import resolve as resolving
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir.discretize import Grid
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.lint.lint import Surroundings, lint
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature

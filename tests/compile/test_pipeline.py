@@ -18,7 +18,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.text import show_formula
 from stlc.compile.pipeline import Compiled, Purpose, compile_spec
 from stlc.diagnostics import SpecError
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]
@@ -286,7 +286,7 @@ def test_numbers_read_like_mathematics() -> None:
 def test_torch_is_not_needed() -> None:
     code = (
         "import sys; from pathlib import Path; from fractions import Fraction\n"
-        "from stlc.grammar.parse.parser import parse; from stlc.source import Source\n"
+        "from stlc.grammar.parser import parse; from stlc.source import Source\n"
         "from stlc.compile.pipeline import compile_spec; from stlc.compile.ir.discretize import Grid\n"
         "from stlc.compile.dump import dump; import stlc.compile.backends.array.graph\n"
         "text = Path('specs/traffic.stl').read_text()\n"

@@ -14,7 +14,7 @@ from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 
 DATA = Path(__file__).parent.parent / "data"
 

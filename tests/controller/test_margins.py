@@ -15,7 +15,7 @@ from stlc.diagnostics import UsageError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

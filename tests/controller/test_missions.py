@@ -21,7 +21,7 @@ from stlc.controller.training.learner import Trainer
 from stlc.controller.training.samplers import GLIMPSES, POOL, Draws, Missions
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

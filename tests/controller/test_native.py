@@ -12,7 +12,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import guided_objective, loss
 from stlc.diagnostics import Notice
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")

@@ -24,7 +24,7 @@ from stlc.controller.training.objective import VIOLATION, Objective, guided_obje
 from stlc.diagnostics import SpecError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 

@@ -24,7 +24,7 @@ from stlc.controller.training.loop import train
 from stlc.diagnostics import StlcError, TraceError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -13,7 +13,7 @@ from stlc.controller.training.diagnose import check_mirror
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parent.parent.parent

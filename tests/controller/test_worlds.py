@@ -15,7 +15,7 @@ from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import RunError, SystemFileError
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -15,7 +15,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError, StlcError, SystemFileError, UsageError
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

@@ -13,7 +13,7 @@ from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import StlcError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 Make = Callable[..., System]

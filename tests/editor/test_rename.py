@@ -10,7 +10,7 @@ from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
 from stlc.editor.document import Systems, analyse
 from stlc.editor.rename import RenameError, can_rename, rename
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.lint.lint import edited
 from stlc.source import Source
 

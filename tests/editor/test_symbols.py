@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from stlc.editor.symbols import inside, names_of
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source, Span
 
 

@@ -17,7 +17,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.loop import train
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,7 +13,7 @@ from stlc.controller.problem.task import Task
 from stlc.dynamics.model.feedback import growth_of
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 
 TASKS = Path(__file__).parents[2] / "examples" / "tasks"
 PLANTS = ("cart_pole", "quadrotor_rates", "quadrotor_rotors", "thermostat", "watch")

@@ -19,7 +19,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.lint.lint import lint
 from stlc.monitor.verdict import Monitor
 from stlc.rundir import every_run

@@ -23,7 +23,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.world import Choosing, world_type
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 
 ROOT = Path(__file__).parents[2]
 WORLDS = {

@@ -25,7 +25,7 @@ def laws(source, limit: float, *, one_in: int = 1) -> int:
     from stlc.compile.pipeline import compile_spec
     from stlc.diagnostics import StlcError
     from stlc.grammar.english import sentence
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
     from stlc.lint.lint import Selection, Surroundings, lint
 
     decl = _system()
@@ -65,7 +65,7 @@ def _some(findings) -> None:
 
 def _formatted(spec, source, limit) -> None:
     from stlc.grammar.format.format import format_text
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
     from stlc.source import Source
 
     with stage("format", limit):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from stlc.grammar.ambiguity import ambiguities
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 

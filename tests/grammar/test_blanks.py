@@ -14,7 +14,7 @@ from stlc.diagnostics import SpecError, StlcError
 from stlc.editor.document import Systems, analyse
 from stlc.grammar.errors.unicode import plain_text
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parse.parser import parse, parse_expr
+from stlc.grammar.parser import parse, parse_expr
 from stlc.grammar.printer import show
 from stlc.grammar.scan import lexemes
 from stlc.lint.lint import lint

@@ -6,7 +6,7 @@ import pytest
 
 from stlc.grammar import ast
 from stlc.grammar.english import REPEATED, Meanings, sentence
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from stlc.diagnostics import SpecError
 from stlc.files import read_source
 from stlc.grammar.format.format import WIDTH, format_text
-from stlc.grammar.parse.parser import parse
-from stlc.grammar.parse.tokens import tokenize
+from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
+from stlc.grammar.tokens import tokenize
 from stlc.source import Source
 
 DATA = sorted((Path(__file__).parent / "data").glob("*.stl"))

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parse.fold import LONG_CHAIN, MAX_DEPTH
-from stlc.grammar.parse.parser import MAX_LEXEMES, MAX_TEXT, parse, parse_expr
+from stlc.grammar.fold import LONG_CHAIN, MAX_DEPTH
+from stlc.grammar.parser import MAX_LEXEMES, MAX_TEXT, parse, parse_expr
 from stlc.grammar.traverse import descendants
 from stlc.source import Source
 from stlc.units import SYMBOLS
@@ -457,7 +457,7 @@ def test_a_text_is_bounded():
 @pytest.mark.parametrize("least", [5_000, pytest.param(MAX_LEXEMES, marks=pytest.mark.apart)])
 @pytest.mark.parametrize(("text", "lexemes"), [("x+", 2), ("(", 1), ("if x then ", 3), ("x > 0 and ", 4)])
 def test_a_text_of_endless_words_is_refused_at_once(text, lexemes, least, monkeypatch):
-    monkeypatch.setattr("stlc.grammar.parse.parser.MAX_LEXEMES", least)
+    monkeypatch.setattr("stlc.grammar.parser.MAX_LEXEMES", least)
     endless = text * (3 * least // (2 * lexemes))
     error, spent = refused(lambda: parse(Source("big.stl", f"require r: {endless} x > 0")), SpecError)
     assert [finding.code for finding in error.diagnostics] == ["E005"]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse, parse_expr
+from stlc.grammar.parser import parse, parse_expr
 from stlc.grammar.printer import show
 from stlc.source import Source
 

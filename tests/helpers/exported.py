@@ -21,7 +21,7 @@ from stlc.dynamics.system import System
 from stlc.export.verify import BUILT
 from stlc.export.write import Exported, export
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 
 ROOT = Path(__file__).parents[2]
 STRICT = ("-Wall", "-Wextra", "-Wshadow", "-pedantic", "-Werror")

@@ -16,7 +16,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.semantics.switch import Hard
-from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.source import Source
 
 GRID = Grid(Fraction(1, 10), 5)

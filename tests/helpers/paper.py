@@ -13,7 +13,7 @@ from scipy.stats import ks_2samp
 from stlc.controller.problem.task import Task
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[2]

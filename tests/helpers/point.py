@@ -6,7 +6,7 @@ from pathlib import Path
 
 from stlc.controller.problem.task import Task
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """

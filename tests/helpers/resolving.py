@@ -10,7 +10,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.normal_form import condition
 from stlc.diagnostics import Diagnostic, StlcError
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 HEAD = """

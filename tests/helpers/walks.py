@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source

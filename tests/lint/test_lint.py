@@ -12,7 +12,7 @@ from stlc.diagnostics import UsageError
 from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.lint.lint import Selection, Surroundings, edited, fix, lint
 from stlc.lint.rules import RULES
 from stlc.source import Source

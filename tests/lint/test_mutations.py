@@ -10,7 +10,7 @@ import pytest
 from stlc.diagnostics import SpecError
 from stlc.grammar.english import sentence
 from stlc.grammar.format.format import format_text
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.grammar.scan import lexemes
 from stlc.lint.lint import Selection, fix, lint
 from stlc.source import Source

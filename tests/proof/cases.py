@@ -11,7 +11,7 @@ from proof.language import Constant, Formula, nodes
 from proof.levels import End, Record, ahead
 from proof.written import specification
 
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.grammar.printer import show
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source

@@ -71,7 +71,7 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
     from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
     from stlc.files import read_source
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
 
     specs, findings = [], list[Diagnostic]()
     for name in names:
@@ -94,7 +94,7 @@ def _files(spec: Path, system: str | None) -> list[str]:
     """Files to watch: the specification, and the system file if there is one."""
     from stlc.diagnostics import StlcError
     from stlc.files import find_spec, find_system, read_source
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
 
     spec = find_spec(spec)
     try:
@@ -122,7 +122,7 @@ def _compiled(
     from stlc.diagnostics import usage
     from stlc.dynamics.load import load_system_decl
     from stlc.files import find_spec, find_system, read_source
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
 
     overrides = parse_overrides(set_)
     path = find_spec(path)

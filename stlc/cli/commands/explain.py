@@ -83,7 +83,7 @@ def _spec(name: str, wanted: list[str]) -> Answer[SpecInWords]:
     """Translate requirements of a specification into English: those in `wanted`, or all if it is empty."""
     from stlc.cli.framework.manual import in_words
     from stlc.files import find_spec, read_source
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
 
     found = in_words(parse(read_source(find_spec(name))), name, wanted)
     text = "\n\n".join("\n".join(_in_words(each)) for each in found.requirements)

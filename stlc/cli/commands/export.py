@@ -122,7 +122,7 @@ def _monitor(
     from stlc.cli.check.options import time_step
     from stlc.export.monitor import export_monitor
     from stlc.files import find_spec, read_source
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
     from stlc.monitor.verdict import Monitor
 
     step = time_step("--dt", dt)

@@ -115,7 +115,7 @@ def lint(
 
 def _on_trace(source: Source, trace: Path, system: str | None, selection: Selection) -> Iterator[Diagnostic]:
     """Yield what a recording does not test of a specification, and what looks odd in it."""
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
     from stlc.monitor.facts.findings import findings_on
 
     yield from (each for each in findings_on(parse(source), trace, system) if selection.wants(each.code))
@@ -130,7 +130,7 @@ def _surroundings(system: str | None, source: Source) -> Surroundings | None:
 
     Return None if there is none, or if the specification cannot be read.
     """
-    from stlc.grammar.parse.parser import parse
+    from stlc.grammar.parser import parse
 
     if system is None:
         try:

@@ -42,7 +42,7 @@ from stlc.compile.ir.functions import OPERATORS as ARITHMETIC
 from stlc.compile.ir.traverse import is_state
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.grammar.traverse import children, descendants
 from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS
 from stlc.registry import closest

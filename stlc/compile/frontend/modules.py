@@ -15,7 +15,7 @@ from pathlib import Path
 from stlc.diagnostics import Diagnostic, SpecError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.jsontext import dumps
 from stlc.provenance import sha256
 from stlc.source import Source

@@ -19,7 +19,7 @@ from stlc.compile.ir.ranges import usual_range
 from stlc.compile.ir.support import columns_of
 from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.registry import closest
 from stlc.signature import Column
 from stlc.source import Source

@@ -32,7 +32,7 @@ from stlc.compile.ir.ranges import KnownRanges
 from stlc.compile.ir.warnings import contradictions, safety_never_violated, vacuous
 from stlc.diagnostics import Diagnostic, Findings, Label, SpecError
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import MAX_ERRORS
+from stlc.grammar.parser import MAX_ERRORS
 from stlc.signature import Column, Signature
 from stlc.source import Span
 from stlc.units import same_dims

@@ -22,7 +22,7 @@ from stlc.controller.run.run import INDEX, Run, read_library, save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
 

@@ -11,7 +11,7 @@ from stlc.diagnostics import StlcError
 from stlc.dynamics.functions import function_files
 from stlc.dynamics.load import load_system_decl
 from stlc.files import find_spec, find_system, read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 
 
 def input_files(

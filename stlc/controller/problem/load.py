@@ -10,7 +10,7 @@ from stlc.diagnostics import usage
 from stlc.dynamics.scenario import scenario_constants
 from stlc.dynamics.system import System
 from stlc.files import find_spec, find_system, read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -17,7 +17,7 @@ from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.scenario import scenario_constants, under
 from stlc.dynamics.system import System
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.plugins import variable
 from stlc.provenance import sha256
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry

@@ -25,7 +25,7 @@ from stlc.dynamics.schema.reader import Reader, first_line
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.source import Span
 from stlc.units import Unit, parse_unit, same_dims
 

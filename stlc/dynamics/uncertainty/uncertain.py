@@ -27,7 +27,7 @@ from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar, as_bool
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
-from stlc.grammar.parse.parser import parse_expr
+from stlc.grammar.parser import parse_expr
 from stlc.grammar.traverse import children, descendants
 from stlc.source import Source, Span
 from stlc.units import SYMBOLS

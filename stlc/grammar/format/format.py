@@ -33,8 +33,8 @@ from stlc.grammar.format.layout import (
     render,
 )
 from stlc.grammar.format.tokens import Text, behind, gap, prepare
-from stlc.grammar.parse.parser import parse
-from stlc.grammar.parse.tokens import Comment, Item, Token, TokenLayout, tokenize
+from stlc.grammar.parser import parse
+from stlc.grammar.tokens import Comment, Item, Token, TokenLayout, tokenize
 from stlc.source import Source
 
 # Operators at which an expression may break, loosest first; those of one row break together.

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias, assert_never
 
-from stlc.grammar.parse.tokens import Comment
+from stlc.grammar.tokens import Comment
 
 INDENT = 4
 

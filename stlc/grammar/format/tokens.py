@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.grammar.parse.fold import MAX_DEPTH
-from stlc.grammar.parse.tokens import Token
+from stlc.grammar.fold import MAX_DEPTH
+from stlc.grammar.tokens import Token
 from stlc.grammar.words import BINARY_TEMPORAL, SPACE, UNARY_TEMPORAL
 
 Role: TypeAlias = Literal["interval", "call", "index", "group", "list", "enum"]

@@ -26,7 +26,7 @@ from stlc.diagnostics import SystemFileError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 PLANS = 4

@@ -22,7 +22,7 @@ from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance, ErrorSizes
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[3]

@@ -24,7 +24,7 @@ from stlc.diagnostics import UsageError
 from stlc.dynamics.declaration.init import GridDecl, InitDecl, Situation
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 

@@ -25,7 +25,7 @@ from stlc.export.programs import Deciding, Guarding
 from stlc.export.verify import answers
 from stlc.export.write import export
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.runtime import Controller
 
 pytestmark = pytest.mark.apart

@@ -340,7 +340,7 @@ def test_an_unknown_code(capsys):
 
 
 def test_precedence_is_that_of_the_grammar():
-    from stlc.grammar.parse.parser import parse_expr
+    from stlc.grammar.parser import parse_expr
     from stlc.grammar.printer import show
     from stlc.source import Source
 

@@ -8,7 +8,7 @@ from helpers.walks import walk
 
 from stlc.cli.commands.plot import _as_declared
 from stlc.cli.framework.app import main
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 from stlc.trace import load_trace, save_trace

@@ -20,7 +20,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.signature import Column
 from stlc.source import Source
 

@@ -13,7 +13,7 @@ from proof.missions import check_margins, check_mission, check_nested, check_pas
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 seeds = st.integers(0, 2**32 - 1)

@@ -15,7 +15,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Compiled, compile_spec
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 WINDOW, END, BATCH = 5, 17, 200

@@ -8,7 +8,7 @@ from stlc.cli.framework.render import render_text
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.frontend.resolve import resolve
 from stlc.diagnostics import CODES, Diagnostic, SpecError
-from stlc.grammar.parse.parser import MAX_ERRORS, parse
+from stlc.grammar.parser import MAX_ERRORS, parse
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.units import parse_unit

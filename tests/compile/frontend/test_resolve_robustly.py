@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from stlc.compile.frontend.resolve import resolve
 from stlc.diagnostics import CODES, Diagnostic, SpecError
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 DEFS = """

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import Diagnostic, SpecError
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.lint.lint import lint
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature

@@ -18,7 +18,7 @@ from stlc.compile.ir.lower import lower
 from stlc.compile.ir.support import columns_of
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import compile_spec
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SIGNALS = """

@@ -6,7 +6,7 @@ import pytest
 
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 

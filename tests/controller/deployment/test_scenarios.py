@@ -22,7 +22,7 @@ from stlc.dynamics.load import parse_system
 from stlc.dynamics.scenario import standard, under
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance, errors_of
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

@@ -17,7 +17,7 @@ from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.world import world_type
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 POINT = """

@@ -14,7 +14,7 @@ from stlc.controller.search.feasibility import solvable
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import HELD_OUT, RunDir
 from stlc.view.held_out import load_held_out, unsolved_text
 

@@ -23,7 +23,7 @@ from stlc.controller.training.launch import Launch, open_folder
 from stlc.diagnostics import RunError, SpecError, SystemFileError
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
 SYSTEM = """stlc: 1

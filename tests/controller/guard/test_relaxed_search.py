@@ -16,7 +16,7 @@ from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

@@ -12,7 +12,7 @@ from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """\

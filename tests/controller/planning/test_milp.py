@@ -15,7 +15,7 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, PlanSearch, plan
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 pytest.importorskip("highspy")

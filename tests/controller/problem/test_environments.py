@@ -11,7 +11,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
 from stlc.files import find_system, read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 ROOT = Path(__file__).parents[3]

@@ -11,7 +11,7 @@ from stlc import native
 from stlc.controller.problem.native import NativeJudge
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")

@@ -17,7 +17,7 @@ from stlc.controller.problem.task import Task
 from stlc.diagnostics import SpecError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")

@@ -14,7 +14,7 @@ from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.controller.problem.task import GOALS, Task
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 LINE = """

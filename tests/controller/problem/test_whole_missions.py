@@ -19,7 +19,7 @@ from stlc.controller.search.local_search import SearchResult, remainders
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 CART = """

@@ -15,7 +15,7 @@ from stlc.controller.search import ascent
 from stlc.controller.search.ascent import APART, KEPT, GradientAscent
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from tests.controller.guard.test_prefix_shooting import F64, failing
 
 ROOT = Path(__file__).parents[3]

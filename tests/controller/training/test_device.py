@@ -18,7 +18,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]

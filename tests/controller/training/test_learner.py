@@ -14,7 +14,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import EFFORTS, Trainer
 from stlc.controller.training.method import Validation
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """

@@ -16,7 +16,7 @@ from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes,
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.samplers import POOL, Missions
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 from stlc.source import Source
 

@@ -23,7 +23,7 @@ from stlc.controller.training.loop import Watch, resume, train
 from stlc.diagnostics import MissingError, RunError
 from stlc.dynamics.system import System
 from stlc.files import read_source
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.rundir import RunDir
 
 ROOT = Path(__file__).parents[3]

@@ -8,7 +8,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.diagnostics import SpecError
 from stlc.dynamics.load import load_system_decl
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 SYSTEM = """

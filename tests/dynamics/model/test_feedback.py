@@ -24,7 +24,7 @@ from stlc.dynamics.model.feedback import growth_of, linearised, riccati, unstabl
 from stlc.dynamics.scenario import truth, under
 from stlc.dynamics.system import System
 from stlc.export.write import export
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.native import compiler
 from stlc.runtime import Controller
 from stlc.source import Source

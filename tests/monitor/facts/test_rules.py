@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stlc.diagnostics import CODES, FACTS
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.monitor.facts.findings import findings_on
 from stlc.monitor.facts.rules import RULES
 from stlc.monitor.verdict import Monitor

@@ -16,7 +16,7 @@ from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.planner import PlanBudget, PlanSearch, plan
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
-from stlc.grammar.parse.parser import parse
+from stlc.grammar.parser import parse
 from stlc.source import Source
 
 pytestmark = pytest.mark.apart

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
-from stlc.grammar.parse.builder import (
+from stlc.grammar.builder import (
     BuildContext,
     BuildRule,
     TerminalToken,

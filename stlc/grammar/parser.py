@@ -1,7 +1,7 @@
 """Parser from text to syntax tree, based on Lark.
 
 A text is split before each declaration and the pieces are parsed separately, so that one run reports all
-independent errors. Only these modules and `stlc.grammar.tables` use Lark.
+independent errors.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from lark import Tree, UnexpectedInput
 
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.grammar import ast
+from stlc.grammar.builder import BuildContext
+from stlc.grammar.declarations import Item, assemble
 from stlc.grammar.errors.failure import Piece
 from stlc.grammar.errors.hints import diagnose
 from stlc.grammar.errors.unicode import unseen_characters
-from stlc.grammar.parse.builder import BuildContext
-from stlc.grammar.parse.declarations import Item, assemble
-from stlc.grammar.parse.fold import PieceError, fold
+from stlc.grammar.fold import PieceError, fold
 from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.grammar.tables import load_parser
 from stlc.source import Source

@@ -14,8 +14,8 @@ from typing import Any
 from lark import Token, Tree
 
 from stlc.diagnostics import Diagnostic
-from stlc.grammar.parse.builder import EXPRESSIONS, BuildContext, BuildRule, TerminalToken
-from stlc.grammar.parse.declarations import DECLARATIONS
+from stlc.grammar.builder import EXPRESSIONS, BuildContext, BuildRule, TerminalToken
+from stlc.grammar.declarations import DECLARATIONS
 from stlc.grammar.scan import lexemes
 from stlc.source import Span
 

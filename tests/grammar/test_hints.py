@@ -8,10 +8,10 @@ import pytest
 
 from stlc.cli.framework.render import render_text
 from stlc.diagnostics import CODES, Fix, SpecError
-from stlc.grammar.parse.parser import MAX_ERRORS, parse, parse_expr
+from stlc.grammar.parser import MAX_ERRORS, parse, parse_expr
 from stlc.source import Source
 
-GOLDEN = Path(__file__).resolve().parents[2] / "golden" / "diagnostics"
+GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "diagnostics"
 CASES = sorted(GOLDEN.glob("*.stl"))
 
 

@@ -1,1 +1,0 @@
-"""Parser from text to syntax tree, based on Lark."""
