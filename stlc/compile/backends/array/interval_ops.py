@@ -51,7 +51,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.namespace import FloatConstants, Ops, Pick, Sliding
-from stlc.compile.semantics.kinds.exact import Exact
+from stlc.compile.semantics.semantics import Exact
 from stlc.diagnostics import Diagnostic, UsageError
 
 _ULPS = 8.0

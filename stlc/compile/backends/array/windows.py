@@ -14,7 +14,7 @@ from typing import final
 
 from stlc.compile.backends.schedule import dual, neutral
 from stlc.compile.namespace import Array, Ops, Pick, Sliding
-from stlc.compile.semantics.protocol import Parts, Semantics
+from stlc.compile.semantics.semantics import Parts, Semantics
 
 _SCAN_BATCH = 64
 """Batch size from which a sequential scan beats the log-depth one."""
