@@ -15,7 +15,7 @@ from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from stlc.diagnostics import Diagnostic, MissingError, RunError, SpecError, UsageError, os_reason
+from stlc.diagnostics import Diagnostic, MissingError, RunError, SpecError, UsageError, os_reason, usage
 from stlc.escape import operand, shell
 from stlc.registry import closest
 from stlc.source import Source
@@ -289,9 +289,7 @@ def find_spec(name: Path | str) -> Path:
     path = Path(name)
     if path.suffix in (".yaml", ".yml"):
         advice = f"name the specification, and  {shell(('--system', operand(str(path))))}"
-        raise UsageError(
-            Diagnostic("U101", f"`{name}` is a system file, not a specification", help=(advice,))
-        )
+        raise usage(f"`{name}` is a system file, not a specification", advice)
     if path.is_absolute() or ".." in path.parts or path.suffix != ".stl" or path.exists():
         return path
     return next((there for folder in (LIBRARY, SPECS) if (there := folder / path).is_file()), path)

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.deployment import ErrorsDecl, ScenarioDecl
 from stlc.dynamics.load import load_system_decl, parse_system
@@ -64,7 +64,7 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
     listed = f"scenarios of {decl.name}: {', '.join(names)}" if names else f"{decl.name} declares none"
     every = f"every system has {', '.join(DISTURBED)}"
     help_ = (f"did you mean `{near}`?  {listed}" if near else listed, every)
-    raise UsageError(Diagnostic("U101", f"there is no scenario `{name}`", help=help_))
+    raise usage(f"there is no scenario `{name}`", *help_)
 
 
 def scenario_constants(path: Path | Source, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 from stlc.compile.backends.c.streams import TABLES, Streams, runtime, streams_of
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import c_comment, c_string
 from stlc.files import place, write_atomic
 from stlc.monitor.online.online import How, Online
@@ -74,7 +74,7 @@ def export_monitor(monitor: Monitor, folder: Path, *, single: bool = False) -> E
     try:
         program = streams_of([rule for rule in rules if rule is not None], online.signals, cut=False)
     except Untranslatable as error:
-        raise UsageError(Diagnostic("U101", f"this specification has no form as C: {error}")) from error
+        raise usage(f"this specification has no form as C: {error}") from error
     texts, size = _texts(online, program, single=single)
     for name, text in texts.items():
         write_atomic(place(folder, name), text)

@@ -15,7 +15,7 @@ from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, GraphNode, OnnxGraph, Value
 from stlc.controller.guard import candidates as backup
 from stlc.controller.run.run import Run, spec_hash, system_hash
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.export.onnx_graphs import deciding, falling, following, judging
 from stlc.extras import needed
 from stlc.jsontext import dumps
@@ -164,7 +164,7 @@ def write_onnx(run: Run, folder: Path, real: Precision = "float64") -> None:
             outputs = make()
         except Untranslatable as error:
             message = f"this task has no form as an ONNX graph: {error}"
-            raise UsageError(Diagnostic("U101", message, help=("take --to torch instead",))) from error
+            raise usage(message, "take --to torch instead") from error
         data = model_of(Path(name).stem, outputs, {"stlc": dumps(facts)}, real)
         (folder / name).write_bytes(data)
         digests[name] = sha256(data)

@@ -80,9 +80,7 @@ def target_of(word: str) -> Target:
     for target in TARGETS:
         if target == word:
             return target
-    raise UsageError(
-        Diagnostic("U101", f"there is no target `{word}`", help=(f"one of {', '.join(TARGETS)}",))
-    )
+    raise usage(f"there is no target `{word}`", f"one of {', '.join(TARGETS)}")
 
 
 def precision_of(word: str, target: Target) -> Precision:

@@ -12,7 +12,7 @@ from stlc.compile.frontend.resolve import resolve
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import Purpose, compile_resolved
-from stlc.diagnostics import CODES, Diagnostic, Fix, SpecError, UsageError
+from stlc.diagnostics import CODES, Diagnostic, Fix, SpecError, usage
 from stlc.grammar import ast
 from stlc.grammar.allow import not_allowed
 from stlc.grammar.parser import parse
@@ -112,7 +112,7 @@ class Selection:
             if prefix != "ALL" and not any(code.startswith(prefix) for code in CODES):
                 near = closest(prefix, CODES)
                 advice = f"did you mean `{near}`?" if near else "stlc explain  lists the codes"
-                raise UsageError(Diagnostic("U101", f"there is no code `{prefix}`", help=(advice,)))
+                raise usage(f"there is no code `{prefix}`", advice)
 
     def wants(self, code: str) -> bool:
         """True if findings with this code are to be reported."""

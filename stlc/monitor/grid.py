@@ -14,7 +14,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, TraceError, UsageError, usage
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.source import Source
@@ -65,7 +65,7 @@ class Times:
                 message = f"`{self.trace}` has dt {dt:g} s, and T = {horizon:g} s is no whole number of steps"
                 raise TraceError(Diagnostic("E602", message, help=help_))
             message = f"the horizon {horizon:g} s is not a whole number of steps of {dt:g} s"
-            raise UsageError(Diagnostic("U101", message))
+            raise usage(message)
         return Grid(self.dt, whole)
 
 
@@ -73,7 +73,7 @@ def given_times(dt: float | Fraction | None, horizon: float | Fraction | None) -
     """Exact times of `dt` and `horizon` in seconds. Raises UsageError (U101) if one is not positive."""
     for name, value in (("dt", dt), ("horizon", horizon)):
         if value is not None and not 0 < value < float("inf"):
-            raise UsageError(Diagnostic("U101", f"{name} is a time in seconds above 0, not {value}"))
+            raise usage(f"{name} is a time in seconds above 0, not {value}")
     return Times(None if dt is None else as_fraction(dt), None if horizon is None else as_fraction(horizon))
 
 

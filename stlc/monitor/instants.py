@@ -25,7 +25,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import earliest
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, usage
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.uncertain import outer
 from stlc.monitor.values import Ends, Record, bounds, window_bounds
@@ -42,7 +42,7 @@ def starts_of(rule: CompiledRequirement, samples: int, horizon: int | None, at: 
     if isinstance(at, int):
         if not 0 <= at < samples:
             message = f"there is no sample {at}: the trace has {samples}, counted from 0"
-            raise UsageError(Diagnostic("U101", message))
+            raise usage(message)
         return range(at, at + 1)
     if rule.windowed and horizon is not None and not rule.absolute:
         return range(max(samples - horizon, 1))

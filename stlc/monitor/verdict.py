@@ -19,7 +19,7 @@ from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.semantics.semantics import Semantics, semantics_of
 from stlc.compile.semantics.tolerance import TOLERANCE, End, weighed
-from stlc.diagnostics import Diagnostic, SpecError, TraceError, UsageError
+from stlc.diagnostics import SpecError, TraceError, usage
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
@@ -161,7 +161,7 @@ class Monitor:
         """
         reported = semantics_of(semantics)
         if uncertain and not reported.exact:
-            raise UsageError(Diagnostic("U101", "uncertain signals have bounds in exact semantics only"))
+            raise usage("uncertain signals have bounds in exact semantics only")
         ready = self._prepare(signals, require, plain=True)
         judged = ready
         if uncertain:
@@ -329,7 +329,7 @@ def _read_until(rules: Sequence[CompiledRequirement], at: int, horizon: int | No
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
     """Requirements called `names`; all if there are no names. Raises UsageError (U101) if there are none."""
     if not compiled.requirements:
-        raise UsageError(Diagnostic("U101", f"`{compiled.name}` has no requirement to judge"))
+        raise usage(f"`{compiled.name}` has no requirement to judge")
     return chosen(compiled.requirements, names)
 
 
@@ -380,7 +380,7 @@ def _starts(rule: CompiledRequirement, part: Part, ready: Prepared, at: At) -> r
     if not part.first <= at < part.stop:
         ends = f"{ready.moment(part.first)} to {ready.moment(part.stop - 1).removeprefix('t = ')}"
         message = f"`{rule.name}` has no value at {ready.moment(at)}: its signals were seen from {ends}"
-        raise UsageError(Diagnostic("U101", message))
+        raise usage(message)
     return starts_of(rule, samples, ready.horizon, at - part.first)
 
 

@@ -16,7 +16,7 @@ from zipfile import is_zipfile
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.escape import shell
 from stlc.files import require_regular
 from stlc.signature import Kind, Signature
@@ -409,9 +409,7 @@ def check_writable(path: Path | str) -> None:
         found.require()
     elif not Path(path).is_char_device():
         message = f"`{path}`: a trace is written as {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
-        raise UsageError(
-            Diagnostic("U101", message, help=(f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}",))
-        )
+        raise usage(message, f"e.g. {Path(path).stem or 'trace'}{WRITTEN[0]}")
 
 
 def as_fraction(dt: float | Fraction) -> Fraction:

@@ -17,7 +17,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.ranges import usual_range
 from stlc.compile.ir.support import columns_of
-from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError
+from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError, usage
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.registry import closest
@@ -244,4 +244,4 @@ def _given(name: str, group: Sequence[typed.Parameter], text: str) -> list[typed
 
 
 def _unfit(name: str, text: str, reason: str) -> UsageError:
-    return UsageError(Diagnostic("U101", f"`--set {name}={text}`: {reason}"))
+    return usage(f"`--set {name}={text}`: {reason}")

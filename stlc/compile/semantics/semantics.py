@@ -21,7 +21,7 @@ from stlc.compile.semantics.kinds.dgmsr import GeneralizedMean
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.compile.semantics.kinds.smooth import LogSumExp
 from stlc.compile.semantics.protocol import Parts, Semantics
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.registry import SEMANTICS
 
 __all__ = [
@@ -53,5 +53,5 @@ def semantics_of(asked: str | Semantics = "exact", smoothing: float | None = Non
         return chosen
     if not isinstance(chosen, Exact | LogSumExp):
         message = f"`{type(chosen).__name__}` has no `smoothing`"
-        raise UsageError(Diagnostic("U101", message, help=("`smoothing` is the scale of log-sum-exp",)))
+        raise usage(message, "`smoothing` is the scale of log-sum-exp")
     return LogSumExp(float(smoothing))

@@ -24,7 +24,7 @@ from stlc.compile.ir.algebra import add, multiply
 from stlc.compile.ir.traverse import map_children
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 from stlc.dynamics.model.samplers import seeded
 from stlc.dynamics.uncertainty.disturbance import Disturbance
 from stlc.registry import GUARDS, closest
@@ -170,9 +170,7 @@ class MarginRequest:
                 near = closest(name, names)
                 help_ = (f"did you mean `{near}`?",) if near else ()
                 listed = f"safety requirements: {', '.join(names) or 'none'}"
-                raise UsageError(
-                    Diagnostic("U101", f"`{name}` is no safety requirement", help=(*help_, listed))
-                )
+                raise usage(f"`{name}` is no safety requirement", *help_, listed)
         found = dict.fromkeys(names, self.every)
         kind = GUARDS.get(guard)
         if self.share is not None and kind.intervenes:
@@ -209,5 +207,5 @@ def _number(text: str, whole: str, most: float = 1e9) -> float:
     except ValueError:
         value = -1.0
     if not 0.0 <= value <= most:
-        raise UsageError(Diagnostic("U101", f"`{whole}` is no margin", help=(FORMS,)))
+        raise usage(f"`{whole}` is no margin", FORMS)
     return value

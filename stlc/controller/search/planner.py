@@ -20,7 +20,7 @@ from torch import Tensor
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import value_of
 from stlc.controller.problem.rows import Rows
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import usage
 from stlc.native import Stop, never
 from stlc.registry import PLANNERS, closest
 
@@ -283,7 +283,7 @@ def planner_named(name: str, **options: Any) -> Planner:
             near = closest(key, known)
             listed = f"options: {', '.join(known)}" if known else "it has none"
             advice = listed if near is None else f"did you mean `{near}`?  {listed}"
-            raise UsageError(Diagnostic("U101", f"planner `{name}` has no option `{key}`", help=(advice,)))
+            raise usage(f"planner `{name}` has no option `{key}`", advice)
         values[key] = value_of(f"planner `{name}`", known[key], value)
     planner: Planner = kind(**values)
     return planner

@@ -16,7 +16,7 @@ from stlc.compile.ir.support import endless, farthest
 from stlc.compile.ir.traverse import map_children, numbers
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, beyond, check_length, starts_of, window_of
 from stlc.monitor.judgement import Status, unknown_requirement
@@ -331,7 +331,7 @@ class Online:
         everywhere = not once and (self.how.at == "all" or (rule.windowed and horizon is not None))
         if everywhere and not rule.windowed and rule.uses_end:
             message = f"`{rule.name}` runs to the end: at every start it would stay open until then"
-            raise UsageError(Diagnostic("U101", message, help=("judge it once, without `--at all`",)))
+            raise usage(message, "judge it once, without `--at all`")
         ending: Ends = "truncate" if self.how.end == "truncate" else "open"
         deciding = decisive(rule, self.how.tolerance, self.compiled.signature)
         return Asked(rule, deciding, begin, everywhere, horizon, ending, self.how.tolerance)
@@ -524,7 +524,7 @@ class Online:
         """
         watched = self._find(name)
         if start not in self._pending(watched):
-            raise UsageError(Diagnostic("U101", f"`{name}` is not open at sample {start}"))
+            raise usage(f"`{name}` is not open at sample {start}")
         judged = watched.live(range(start, start + 1))
         return float(judged.low[0]), float(judged.high[0])
 

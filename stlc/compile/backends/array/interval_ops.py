@@ -52,7 +52,7 @@ from stlc.compile.backends.array.windows import Windows
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.namespace import FloatConstants, Ops, Pick, Sliding
 from stlc.compile.semantics.semantics import Exact
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import usage
 
 _ULPS = 8.0
 """Rounding error of functions, in units of the last place, both ways."""
@@ -298,7 +298,7 @@ class IntervalOps(FloatConstants):
         Raises:
             UsageError: U101. Bounds are computed for exact extrema only.
         """
-        raise UsageError(Diagnostic("U101", "intervals have exact extrema only", help=("--semantics exact",)))
+        raise usage("intervals have exact extrema only", "--semantics exact")
 
     def softmax2(self, a: Intervals, b: Intervals, k: float) -> Intervals:  # noqa: ARG002
         """Not available; see `softmax`."""
