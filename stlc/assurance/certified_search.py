@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from stlc.assurance.verification.tubes import Tube, TubeModel
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import (
     POLICY,
@@ -102,7 +102,7 @@ class Certifier:
             if loss > max(least.get(rule.name, 0.0), TOLERANCE):
                 margin[rule.name] = loss
             if rule.name not in least:
-                ramp[rule.name] = _growth(tube, columns(rule.formula))
+                ramp[rule.name] = _growth(tube, columns_in(rule.formula))
         return with_margins(self.task, margin, ramp)
 
 

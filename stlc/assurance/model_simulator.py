@@ -17,7 +17,7 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import counts_samples
-from stlc.compile.ir.support import columns as columns_read_by
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.planning.traces import trace_of
@@ -127,7 +127,7 @@ class ModelSimulator:
             return 1.0
         names = {each.name for each in inputs}
         read_by = (self.task.rules[requirement], *self.task.compiled.assumptions)
-        last = max(rule.reach + bool(columns_read_by(rule.formula) & names) for rule in read_by)
+        last = max(rule.reach + bool(columns_in(rule.formula) & names) for rule in read_by)
         # an input is also read at the last sample
         return min(last * self.task.system.dt / _duration(self.task), 1.0)
 
@@ -136,7 +136,7 @@ class ModelSimulator:
         whole = {each.name for each in self.task.system.decl.signature.columns if each.kind != "real"}
         found = nodes(self.task.rules[requirement].formula)
         predicates = [each for each in found if isinstance(each, ir.Predicate) and not each.guard]
-        return not predicates or any(columns_read_by(each) - whole for each in predicates)
+        return not predicates or any(columns_in(each) - whole for each in predicates)
 
     def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
         """Simulate `points`, (count, dim), and judge them by a requirement."""

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 from stlc.compile.augment.timers import Timer
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid, duration, in_words
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.text import show_formula, shown
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement
@@ -79,7 +79,7 @@ def _beside(compiled: Compiled) -> Iterator[str]:
 def _became(rule: CompiledRequirement, compiled: Compiled) -> Iterator[str]:
     """Yield texts about a compiled requirement: its formula, its added states, its intervals."""
     yield show_formula(rule.formula)
-    read = columns(rule.formula)
+    read = columns_in(rule.formula)
     added = [timer for timer in compiled.timers if timer.name in read]
     if added:
         yield "+ " + ", ".join(

@@ -36,7 +36,7 @@ from stlc.compile.ir.discretize import Grid, in_samples, in_words
 from stlc.compile.ir.lower import as_written, lower
 from stlc.compile.ir.ranges import KnownRanges
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import columns, reach, uses_end
+from stlc.compile.ir.support import columns_in, reach, uses_end
 from stlc.compile.ir.traverse import absolute, margin_unit, mentions_horizon
 from stlc.compile.ir.warnings import jumps
 from stlc.compile.semantics.semantics import Semantics
@@ -358,7 +358,7 @@ def _without(interface: Interface, names: Iterable[str]) -> Interface:
 
 def _signature(spec: typed.Spec, rules: Iterable[CompiledRequirement], timers: Iterable[Timer]) -> Signature:
     """Return the signature: signals that requirements read, then the added states."""
-    read = frozenset().union(*(columns(rule.formula) for rule in rules))
+    read = frozenset().union(*(columns_in(rule.formula) for rule in rules))
     kept = Signature(tuple(column for column in spec.signature.columns if column.name in read))
     return kept.extended(*(timer.column for timer in timers))
 

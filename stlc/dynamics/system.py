@@ -16,7 +16,8 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.interface import Interface
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply, names_in, substitute
+from stlc.compile.ir.algebra import add, multiply, substitute
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
@@ -472,7 +473,7 @@ class System:
     @cached_property
     def _named_first(self) -> tuple[str, ...]:
         """Names of the states whose value at the start of the plan (`x_start`) a performance term reads."""
-        read = {name for term in self.decl.objective.terms for name in names_in(term.value)}
+        read = {name for term in self.decl.objective.terms for name in columns_in(term.value)}
         return tuple(name for name in self.names if name + START in read)
 
     @cached_property
@@ -494,7 +495,7 @@ class System:
         given = commands(self.decl)
         for term in self.decl.objective.terms:
             if term.weight:
-                kind = bool(names_in(term.value) & set(self.control_names))
+                kind = bool(columns_in(term.value) & set(self.control_names))
                 value = multiply(ir.Const(term.weight), substitute(term.value, given) if kind else term.value)
                 before = sums[kind]
                 sums[kind] = value if before is None else add(before, value)

@@ -16,7 +16,7 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numbers, written
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import names_in
+from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.tolerance import TOLERANCE, weighed
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
@@ -115,7 +115,7 @@ class _Rollout:
     def _loop(self, stage: RolloutStage) -> None:
         """Compute the states of a stage step by step, because they depend on one another."""
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
-        read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
+        read = {name for block in stage.blocks for num in block.values() for name in columns_in(num)}
         outside = sorted(read - inside)
         timed = [name for name in outside if len(self.now[name]) == self.steps]
         steady = [name for name in outside if name not in timed]

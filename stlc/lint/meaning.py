@@ -13,7 +13,7 @@ from typing import TypeAlias
 from stlc.compile.frontend.scope import enforced
 from stlc.compile.frontend.tags import nominal
 from stlc.compile.ir import typed
-from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import mentions_horizon, nodes, operands
 from stlc.compile.ir.warnings import in_range, truth
 from stlc.diagnostics import Diagnostic, Fix
@@ -139,9 +139,9 @@ def beyond_ranges(spec: typed.Spec) -> Iterator[Diagnostic]:
             if node.span.source is not spec.source_ast.source or any(_within(node.span, d) for d in general):
                 continue
             decided = truth(node, ranges)
-            if decided is not None and columns_of(node.num) and truth(node, facts) is None:
+            if decided is not None and columns_in(node.num) and truth(node, facts) is None:
                 reported.add(node.span)
-                names = sorted(columns_of(node.num) & ranges.keys())
+                names = sorted(columns_in(node.num) & ranges.keys())
                 known = ", ".join(in_range(name, spec.signature, ranges) for name in names)
                 word = "true" if decided else "false"
                 yield Diagnostic(

@@ -27,7 +27,7 @@ from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.holes import holes_in, without_holes
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import leaves, map_children, nodes
 from stlc.compile.namespace import Array
 
@@ -263,8 +263,8 @@ def _beyond_ends(extreme: Floats, point: Floats, *, least: bool) -> Floats:
 def _compared(items: Sequence[ir.Formula]) -> list[ir.Formula]:
     """Operands that compare instants, and predicates on the same signals, as in `rise(p)`; [] without any."""
     shifts = [item for item in items if isinstance(item, ir.Shift)]
-    read = frozenset().union(*(columns(shift) for shift in shifts))
-    same = [item for item in items if isinstance(item, ir.Predicate) and columns(item) <= read]
+    read = frozenset().union(*(columns_in(shift) for shift in shifts))
+    same = [item for item in items if isinstance(item, ir.Predicate) and columns_in(item) <= read]
     return [*shifts, *same] if shifts else []
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics
 from stlc.diagnostics import Diagnostic, TraceError
@@ -115,7 +115,7 @@ class Prepared:
         whole = found = self.whole
         if whole is None or found is None or rule.absolute:
             return None
-        spans = {name: span for name, span in self.signals.spans.items() if name in columns(rule.formula)}
+        spans = {name: span for name, span in self.signals.spans.items() if name in columns_in(rule.formula)}
         for span in spans.values():
             found = found.within(span)
         if found.last < found.first:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.tags import BETWEEN, age_of
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns as columns_of
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.pipeline import Compiled, CompiledRequirement
@@ -69,7 +69,7 @@ def needs_of(compiled: Compiled, rules: Sequence[CompiledRequirement]) -> tuple[
     Raises UsageError (E107) if the requirements call functions that are not loaded.
     """
     _require_functions(compiled, rules)
-    read = [(rule.name, columns_of(rule.formula)) for rule in rules]
+    read = [(rule.name, columns_in(rule.formula)) for rule in rules]
     items = (item for item in compiled.spec.items if isinstance(item, (ast.Signal, ast.Param)))
     spans = {item.name: item.name_span for item in items}
     parameters = {each.column.name for each in compiled.typed.parameters}

@@ -16,7 +16,7 @@ from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.holes import holes_in, partial, unsure, without_holes
-from stlc.compile.ir.support import columns_of, history
+from stlc.compile.ir.support import columns_in, history
 from stlc.compile.ir.traverse import map_children, nodes, subexpressions
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.pipeline import CompiledRequirement
@@ -211,7 +211,7 @@ def assume_missing_true(formula: ir.Formula, names: Collection[str]) -> ir.Formu
 
 def _read(num: ir.Num) -> set[str]:
     """Names of the signals that an expression reads, and of the values stored by `freeze` that it reads."""
-    return {*columns_of(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
+    return {*columns_in(num), *(part.name for part in subexpressions(num) if isinstance(part, ir.FrozenVar))}
 
 
 def decisive(rule: CompiledRequirement, tolerance: float, signature: Signature) -> CompiledRequirement:

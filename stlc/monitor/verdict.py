@@ -13,7 +13,7 @@ import numpy as np
 
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir.discretize import Grid, lacks
-from stlc.compile.ir.support import columns_of, farthest
+from stlc.compile.ir.support import columns_in, farthest
 from stlc.compile.ir.traverse import numbers
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
@@ -112,7 +112,7 @@ class Monitor:
         """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
         rules = chosen(self.resolved.requirements, require)
         formulas = [each.formula for each in (*rules, *self.resolved.assumptions)]
-        return frozenset().union(*(columns_of(num) for formula in formulas for num in numbers(formula)))
+        return frozenset().union(*(columns_in(num) for formula in formulas for num in numbers(formula)))
 
     @property
     def compiled(self) -> Compiled:

@@ -16,7 +16,7 @@ from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.ranges import usual_range
-from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, Label, SpecError, UsageError, usage
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
@@ -167,7 +167,7 @@ def _in_column(number: Number, expr: ast.Expr, column: Column, unit: Unit, scope
     Raises:
         Failed: the number depends on a signal (E205), or has another unit than the column (E203).
     """
-    if columns_of(number.num):
+    if columns_in(number.num):
         message = "a parameter is drawn before anything moves: its distribution reads constants alone"
         scope.fail(Diagnostic("E205", message, expr.span))
     if number.bare:

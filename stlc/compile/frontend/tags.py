@@ -14,7 +14,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.ranges import KnownRanges, bounds
-from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
@@ -60,7 +60,7 @@ def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope)
     ends = bounds(num, ranges)
     if ends is not None and all(map(math.isfinite, ends)) and ends != (0.0, 0.0):
         return max(map(abs, ends))
-    missing = sorted(columns_of(num) - ranges.keys())
+    missing = sorted(columns_in(num) - ranges.keys())
     help_: tuple[str, ...] = ("say it: `@scale(10)`",)
     message = "how far this reaches is not known"
     if missing:

@@ -1,4 +1,4 @@
-"""Algebra on numeric expressions: names of columns, substitution, sums and products.
+"""Algebra on numeric expressions: substitution, sums and products.
 
 The expressions are in the compiler's intermediate representation (IR).
 """
@@ -9,14 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import leaves, map_children, map_leaves
+from stlc.compile.ir.traverse import map_children, map_leaves
 
 N = TypeVar("N", ir.Num, ir.Formula)
-
-
-def names_in(node: ir.Num | ir.Formula) -> frozenset[str]:
-    """Names of all columns that occur in a numeric expression or a state formula."""
-    return frozenset(leaf.name for leaf in leaves(node) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal)))
 
 
 def map_parts(node: N, rewrite: Callable[[ir.Num], ir.Num]) -> N:

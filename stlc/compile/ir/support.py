@@ -230,15 +230,10 @@ _EARLIEST = _Earliest()
 # ---------------------------------------------------------------------------------- signals
 
 
-def columns_of(num: ir.Num) -> frozenset[str]:
-    """Return the names of the signals that a numeric expression reads, at any sample."""
-    read = {leaf.name for leaf in leaves(num) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
+def columns_in(node: ir.Num | ir.Formula) -> frozenset[str]:
+    """Return the names of the signals that a number or a formula reads, at any sample."""
+    read = {leaf.name for leaf in leaves(node) if isinstance(leaf, (ir.Signal, ir.ShiftedSignal))}
     return frozenset(read - {ir.ELAPSED})
-
-
-def columns(formula: ir.Formula) -> frozenset[str]:
-    """Return the names of the signals that a formula reads."""
-    return frozenset(name for num in numbers(formula) for name in columns_of(num))
 
 
 def depends_on_ends(num: ir.Num) -> bool:

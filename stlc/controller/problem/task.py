@@ -17,7 +17,7 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.frontend.parameters import fixed
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import is_state, nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_spec
 from stlc.compile.semantics.switch import Hard, Switch
@@ -97,7 +97,7 @@ def _on_starts(compiled: Compiled, system: System) -> dict[str, ir.Formula]:
     return {
         f"assume {rule.name}": rule.formula
         for rule in compiled.assumptions
-        if is_state(rule.typed.formula) and columns(rule.formula) <= known
+        if is_state(rule.typed.formula) and columns_in(rule.formula) <= known
     }
 
 

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 from stlc.compile.frontend.scope import Known, column_value
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply, names_in, total
+from stlc.compile.ir.algebra import add, multiply, total
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import map_leaves
 from stlc.dynamics.declaration.columns import (
     RANGE,
@@ -191,7 +192,7 @@ def _without_controls(cell: _Held, cx: Context) -> _Held:
 
     Values are computed before controls are chosen.
     """
-    read = names_in(cell.value) | (frozenset() if cell.before is None else names_in(cell.before))
+    read = columns_in(cell.value) | (frozenset() if cell.before is None else columns_in(cell.before))
     found = {control.name for control in cx.names.controls} & {name.split(ir.BEFORE)[0] for name in read}
     if not found:
         return cell

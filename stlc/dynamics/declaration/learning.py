@@ -11,7 +11,8 @@ from stlc.compile.frontend.arithmetic import absolute
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import names_in, substitute
+from stlc.compile.ir.algebra import substitute
+from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
 from stlc.dynamics.schema.expressions import SECOND, written
 from stlc.dynamics.schema.names import Context, ControlDecl, each_number
@@ -107,7 +108,7 @@ def term_list(cx: Context, node: Node | None, label: str) -> tuple[Term, ...]:
 
 def _at_start(number: Number) -> Number:
     """Replace each state `x` in a number by the column `x_start`, its value at the start of the plan."""
-    table = {name: ir.Signal(name + START) for name in names_in(number.num)}
+    table = {name: ir.Signal(name + START) for name in columns_in(number.num)}
     return replace(number, num=substitute(number.num, table))
 
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, names_in
+from stlc.compile.ir.algebra import add
+from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.schema.names import Context
 from stlc.signature import Column
@@ -85,7 +86,7 @@ def in_order(assigns: Iterable[Assign], cx: Context) -> tuple[Assign, ...]:
     S202 is reported if values depend on each other at the same sample.
     """
     known = {assign.name: assign for assign in assigns}
-    reads = {name: names_in(assign.value) & known.keys() for name, assign in known.items()}
+    reads = {name: columns_in(assign.value) & known.keys() for name, assign in known.items()}
     try:
         return tuple(known[name] for name in TopologicalSorter(reads).static_order())
     except CycleError as error:

@@ -10,7 +10,8 @@ from typing import Literal, TypeAlias, get_args
 
 from stlc.compile.frontend.scope import External
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import multiply, names_in, total
+from stlc.compile.ir.algebra import multiply, total
+from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.columns import unit_text
 from stlc.dynamics.schema.names import Context
 from stlc.dynamics.schema.reader import first_line
@@ -101,7 +102,7 @@ def _table(entry: Entry, cx: Context) -> TableDecl | None:
     table = TableDecl(entry.key.text, units, keys.unit, points, values, keys.extrapolate)
     if not _sound(table, keys, cx):
         return None
-    factors = tuple(sorted({name for row in numbers for number in row for name in names_in(number)}))
+    factors = tuple(sorted({name for row in numbers for number in row for name in columns_in(number)}))
     cx.names.entries[table.name] = External(
         table.name,
         (None,) * len(points),

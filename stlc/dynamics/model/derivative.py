@@ -13,7 +13,8 @@ from types import MappingProxyType
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, multiply, names_in, total
+from stlc.compile.ir.algebra import add, multiply, total
+from stlc.compile.ir.support import columns_in
 
 Partials: TypeAlias = Callable[..., Sequence[ir.Num | None]]
 """The partial derivatives of a function, from its result and its arguments; None for 0."""
@@ -28,7 +29,7 @@ def derivative(num: ir.Num, of: str) -> ir.Num | None:
 
 def _along(num: ir.Num, slopes: Mapping[str, ir.Num]) -> ir.Num | None:
     """Derivative of an expression, given those of the names in it; names without one are constants."""
-    if not names_in(num) & slopes.keys():
+    if not columns_in(num) & slopes.keys():
         return None
     match num:
         case ir.Signal(name):

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import Assignments, add, multiply, names_in, substitute
+from stlc.compile.ir.algebra import Assignments, add, multiply, substitute
+from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.motion import JumpDecl
 from stlc.dynamics.model.integrators._tableau import Method, Rate, State
 
@@ -98,7 +99,7 @@ class LocatedJumps:
 
     def _any(self, segment: _Segment, share: ir.Num, waiting: Formulas | None) -> ir.Formula:
         """Condition that a jump happens after a share of a segment."""
-        read = frozenset[str]().union(*(names_in(jump.guard) for jump in self.jumps))
+        read = frozenset[str]().union(*(columns_in(jump.guard) for jump in self.jumps))
         due = self._due(self._named(segment.at(share, read & segment.moving)), waiting)
         return due[0] if len(due) == 1 else ir.BoolOp("or", due)
 

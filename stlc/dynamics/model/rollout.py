@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.ir.algebra import names_in
+from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.switch import Switch
 from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
 from stlc.dynamics.model.step import ModelStep
@@ -115,7 +115,7 @@ class _StageRunner:
         self.early = ArrayProgram(stage.early) if stage.early else None
         self.blocks = tuple(ArrayProgram(block) for block in stage.blocks)
         inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
-        read = {name for block in stage.blocks for num in block.values() for name in names_in(num)}
+        read = {name for block in stage.blocks for num in block.values() for name in columns_in(num)}
         self.outside = tuple(sorted(read - inside))
 
     def __call__(self, columns: _Columns) -> None:

@@ -14,7 +14,8 @@ from functools import reduce
 from typing import TypeAlias
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import add, map_parts, multiply, names_in
+from stlc.compile.ir.algebra import add, map_parts, multiply
+from stlc.compile.ir.support import columns_in
 from stlc.dynamics.model.step import ModelStep
 
 Lets: TypeAlias = Mapping[str, ir.Num]
@@ -48,7 +49,7 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
     A stage reads only its own states and expressions, and those of earlier stages.
     """
     numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
-    reads = {name: names_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
+    reads = {name: columns_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((f"{name}'",)) for name in step.next}
     level: dict[str, int] = {}
     groups: list[list[list[str]]] = []
@@ -125,7 +126,7 @@ def blocks(numbers: Lets) -> tuple[Lets, ...]:
     """Split named expressions into blocks, each of which reads only names of earlier blocks."""
     level: dict[str, int] = {}
     for name, num in numbers.items():
-        level[name] = 1 + max((level[other] for other in names_in(num) if other in level), default=-1)
+        level[name] = 1 + max((level[other] for other in columns_in(num) if other in level), default=-1)
     depth = max(level.values(), default=-1) + 1
     return tuple({name: numbers[name] for name in numbers if level[name] == at} for at in range(depth))
 
@@ -145,8 +146,8 @@ def _increment(states: Mapping[str, str], body: Lets) -> ir.Num | None:
     (state,) = states
     (num,) = body.values()
     match num:
-        case ir.Op("add", (ir.Signal(name), increment)) if name == state and state not in names_in(increment):
-            return increment
+        case ir.Op("add", (ir.Signal(name), added)) if name == state and state not in columns_in(added):
+            return added
         case _:
             return None
 
@@ -208,14 +209,14 @@ class Hoist:
 
     def split(self, num: ir.Num) -> ir.Num:
         """Replace the largest loop-invariant parts of `num` by names, and add these parts to `early`."""
-        if not names_in(num) & self.moving:
+        if not columns_in(num) & self.moving:
             return self._steady(num)
         match num:
             case ir.Op("add" | "sub" | "neg"):
                 return self._sum(num)
             case ir.Op("mul"):
                 return self._product(num)
-            case ir.Where(cond, yes, no) if not names_in(cond) & self.moving:
+            case ir.Where(cond, yes, no) if not columns_in(cond) & self.moving:
                 return self._choice(cond, yes, no)
             case _:
                 return map_parts(num, self.split)
@@ -245,8 +246,8 @@ class Hoist:
     def _sum(self, num: ir.Num) -> ir.Num:
         """Rewrite a sum: its loop-invariant terms are combined into one expression in `early`."""
         terms = _terms(num)
-        moving = [(sign, self.split(term)) for sign, term in terms if names_in(term) & self.moving]
-        steady = [(sign, term) for sign, term in terms if not names_in(term) & self.moving]
+        moving = [(sign, self.split(term)) for sign, term in terms if columns_in(term) & self.moving]
+        steady = [(sign, term) for sign, term in terms if not columns_in(term) & self.moving]
         total = _signed_sum(moving)
         rest = _total(steady)
         return total if rest == ir.Const(0.0) else add(total, self._steady(rest))
@@ -254,8 +255,8 @@ class Hoist:
     def _product(self, num: ir.Num) -> ir.Num:
         """Rewrite a product: its loop-invariant factors are combined into one expression in `early`."""
         factors = _factors(num)
-        moving = [self.split(factor) for factor in factors if names_in(factor) & self.moving]
-        steady = [factor for factor in factors if not names_in(factor) & self.moving]
+        moving = [self.split(factor) for factor in factors if columns_in(factor) & self.moving]
+        steady = [factor for factor in factors if not columns_in(factor) & self.moving]
         result = reduce(multiply, moving)
         return multiply(result, self._steady(reduce(multiply, steady))) if steady else result
 

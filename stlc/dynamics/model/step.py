@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import Assignments, add, multiply, names_in, substitute
+from stlc.compile.ir.algebra import Assignments, add, multiply, substitute
+from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import JumpDecl
 from stlc.dynamics.model.integrators._tableau import State
@@ -142,7 +143,7 @@ def _updated(decl: SystemDecl, writer: Assignments, state: State) -> State:
     if not decl.updates:
         return state
     before = {f"{name}{ir.BEFORE}": ir.Signal(name) for name in decl.signature.names}
-    read = frozenset[str]().union(*(names_in(assign.value) for assign in decl.updates))
+    read = frozenset[str]().union(*(columns_in(assign.value) for assign in decl.updates))
     known = {name: writer.name(num, name + "#{}") if name in read else num for name, num in state.items()}
     for assign in decl.updates:
         num = substitute(assign.value, {**known, **before})

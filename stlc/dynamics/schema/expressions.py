@@ -19,7 +19,7 @@ from stlc.compile.frontend.expressions import (
 from stlc.compile.frontend.scope import Entry, Scope
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import names_in
+from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, StlcError
 from stlc.dynamics.schema.reader import Reader, first_line
 from stlc.dynamics.schema.yaml_nodes import Node, Scalar
@@ -342,7 +342,7 @@ def _columns(found: Number | tuple[Number, ...] | ir.Formula) -> frozenset[str]:
     """Names of the columns that a number, several numbers or a formula read."""
     if isinstance(found, tuple):
         return frozenset().union(*map(_columns, found))
-    return names_in(found.num if isinstance(found, Number) else found)
+    return columns_in(found.num if isinstance(found, Number) else found)
 
 
 def written(node: Node | None) -> str:

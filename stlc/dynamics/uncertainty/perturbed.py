@@ -16,7 +16,8 @@ from torch import Tensor
 from stlc.compile.frontend.scope import Entry, Known
 from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import multiply, names_in
+from stlc.compile.ir.algebra import multiply
+from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import Assign
@@ -89,7 +90,7 @@ def perturbable(decl: SystemDecl) -> Perturbable:
             worth = [value for name, (value, _) in decl.constants.items() if base_name(name) == number.text]
             if not number.states or not any(worth):
                 raise _without_effect(number, found, decl)
-    late = any(texts.keys() & names_in(each.value) for each in started)
+    late = any(texts.keys() & columns_in(each.value) for each in started)
     return Perturbable(
         replace(factored, init=decl.init),
         tuple(each for each in numbers if each.states),
@@ -146,10 +147,10 @@ def _readers(decl: SystemDecl) -> Mapping[str, dict[str, None]]:
     guard or its reset.
     """
     found: defaultdict[str, dict[str, None]] = defaultdict(dict)
-    read = [(each.name, names_in(each.value)) for each in (*decl.flow, *decl.updates, *decl.init.computed)]
+    read = [(each.name, columns_in(each.value)) for each in (*decl.flow, *decl.updates, *decl.init.computed)]
     for jump in decl.jumps:
-        guard = names_in(jump.guard)
-        read += [(each.name, guard | names_in(each.value)) for each in jump.resets]
+        guard = columns_in(jump.guard)
+        read += [(each.name, guard | columns_in(each.value)) for each in jump.resets]
     for name, columns in read:
         for column in columns:
             found[column][base_name(name)] = None

@@ -31,7 +31,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.holes import KNOWN
 from stlc.compile.ir.lower import lower
 from stlc.compile.ir.normal_form import connective, unless
-from stlc.compile.ir.support import columns_of, history
+from stlc.compile.ir.support import columns_in, history
 from stlc.compile.ir.traverse import (
     from_now,
     frozen_in,
@@ -280,7 +280,7 @@ class CauseFinder:
         names = {name for name, _ in leaf.reads}
         own = self._lowered(leaf.thawed, not leaf.holds)
         others = {node for node in nodes(lowered) if isinstance(node, ir.Predicate)} - set(_leaves_of(own))
-        shared = len(names) < len(leaf.reads) or any(columns_of(other.num) & names for other in others)
+        shared = len(names) < len(leaf.reads) or any(columns_in(other.num) & names for other in others)
         if not tree.path_moves or not shared:
             return tree.path_moves
 
@@ -470,7 +470,7 @@ class CauseFinder:
         for (key, written), unit in zip(formula.bindings, units, strict=True):
             num = substitute_frozen(written, outer)
             value: ir.Num = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
-            given = columns_of(num) <= self.record.env.keys()
+            given = columns_in(num) <= self.record.env.keys()
             if given and sample <= last and defined(ir.Predicate(num), last + 1)[sample]:
                 low, high = bounds(ir.Predicate(num), self.record, range(sample, sample + 1), "open")
                 if low[0, 0] == high[0, 0]:

@@ -17,7 +17,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import Bounds
 from stlc.compile.ir.holes import holes_in, without_holes
 from stlc.compile.ir.ranges import bounds
-from stlc.compile.ir.support import columns, columns_of
+from stlc.compile.ir.support import columns_in
 from stlc.grammar import ast
 from stlc.monitor.facts.triggers import Trigger, triggers
 from stlc.monitor.judgement import RequirementVerdict, Verdict
@@ -65,7 +65,7 @@ class Evidence:
     def read(self) -> tuple[Column, ...]:
         """Signals that the judged requirements read, without parameters, which are constant by nature."""
         compiled, rules = self.subject.compiled, self.subject.rules
-        names = frozenset[str]().union(*(columns(rule.formula) for rule in rules)) & self.values.keys()
+        names = frozenset[str]().union(*(columns_in(rule.formula) for rule in rules)) & self.values.keys()
         names -= {each.column.name for each in compiled.typed.parameters}
         return tuple(column for column in compiled.signature.columns if column.name in names)
 
@@ -96,7 +96,7 @@ class Evidence:
         """Least and greatest margin of a predicate over all recorded values."""
         if _linear(predicate.num):
             return bounds(predicate.num, self.ranges) or (math.nan, math.nan)
-        env = {name: self.values[name] for name in columns_of(predicate.num)}
+        env = {name: self.values[name] for name in columns_in(predicate.num)}
         holes, samples = holes_in(env), len(next(iter(env.values())))
         filled = without_holes(env, holes) if holes else env
         (found,) = evaluate([predicate], filled, ops=NUMPY, count=samples, end="truncate")

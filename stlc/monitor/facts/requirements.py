@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import leaves, nodes
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic
@@ -87,7 +87,7 @@ def out_of_reach(evidence: Evidence) -> Iterator[Fact]:
         atoms = {
             " ".join(node.span.text.split()): node
             for node in nodes(judged.rule.formula)
-            if isinstance(node, ir.Predicate) and node.span is not None and columns_of(node.num)
+            if isinstance(node, ir.Predicate) and node.span is not None and columns_in(node.num)
             if not any(isinstance(leaf, ir.FrozenVar) for leaf in leaves(node.num))
         }
         for written, atom in atoms.items():

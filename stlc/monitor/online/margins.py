@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.ir.support import columns, history
+from stlc.compile.ir.support import columns_in, history
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
@@ -124,7 +124,7 @@ class Margins:
 
     def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:
         self._watched = [_Watched.of(rule, horizon) for rule in rules]
-        self._names = sorted({name for rule in rules for name in columns(rule.formula)})
+        self._names = sorted({name for rule in rules for name in columns_in(rule.formula)})
         self._history = ColumnHistory()
         self._found: dict[str, Margin] = {}
         self._evaluated = 0

@@ -15,7 +15,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.lower import lower
-from stlc.compile.ir.support import columns_of
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import compile_spec
 from stlc.grammar.parser import parse
@@ -108,4 +108,4 @@ def test_what_looks_before_a_plan_is_told_so() -> None:
         warnings("require a: always[0, T] delta(x) < 1 m")
     assert warnings("require a: always[1 steps, T] delta(x) < 1 m") == []
     node = formula("always[1 steps, 3 steps] delta(x) < 1")
-    assert [columns_of(part.num) for part in nodes(node) if isinstance(part, typed.Predicate)] == [{"x"}]
+    assert [columns_in(part.num) for part in nodes(node) if isinstance(part, typed.Predicate)] == [{"x"}]

@@ -11,7 +11,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.lower import lower
-from stlc.compile.ir.support import columns, reach, uses_end
+from stlc.compile.ir.support import columns_in, reach, uses_end
 from stlc.compile.ir.traverse import nodes
 
 P, Q = ir.Predicate(ir.Signal("p")), ir.Predicate(ir.Signal("q"))
@@ -37,7 +37,7 @@ def test_reach(formula: ir.Formula, past: int, future: int, end: bool) -> None:
 
 def test_columns_of_conditions_inside_numbers() -> None:
     num = ir.Op("add", (ir.Where(P, ir.Signal("a"), ir.Const(1.0)), ir.Indicator(Q)))
-    assert columns(ir.Temporal("always", ir.Window(0, 1), ir.Predicate(num))) == {"p", "q", "a"}
+    assert columns_in(ir.Temporal("always", ir.Window(0, 1), ir.Predicate(num))) == {"p", "q", "a"}
 
 
 @settings(max_examples=75)

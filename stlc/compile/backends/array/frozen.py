@@ -19,7 +19,7 @@ import numpy as np
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.schedule import IndexRange, TraceDomain, reads, spanning, within
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import Reach, columns, depends_on_ends, reach, uses_end
+from stlc.compile.ir.support import Reach, columns_in, depends_on_ends, reach, uses_end
 from stlc.compile.ir.traverse import frozen_in, map_children, nodes, numbers
 from stlc.compile.namespace import Array, Ops
 
@@ -153,7 +153,7 @@ class Freezer:
         that the shape is known.
         """
         own = {name for name, _ in node.bindings}
-        names = set(columns(node.body)).union(*map(frozen_in, numbers(node.body))) - own
+        names = set(columns_in(node.body)).union(*map(frozen_in, numbers(node.body))) - own
         return {name: self.env[name] for name in names & self.env.keys() or list(self.env)[:1]}
 
     @property

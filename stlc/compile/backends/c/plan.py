@@ -31,7 +31,7 @@ from stlc.compile.backends.schedule import (
     latest,
 )
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_of, reach_of
+from stlc.compile.ir.support import columns_in, reach_of
 from stlc.compile.ir.traverse import frozen_in, operands, subexpressions
 from stlc.compile.namespace import Pick
 
@@ -375,10 +375,10 @@ def _frozen_names(formula: ir.Formula) -> frozenset[str]:
     """
     match formula:
         case ir.Predicate(num):
-            return frozen_in(num) | columns_of(num)
+            return frozen_in(num) | columns_in(num)
         case ir.Freeze(bindings, body):
             inner = _frozen_names(body) - {name for name, _ in bindings}
-            return inner.union(*(frozen_in(num) | columns_of(num) for _, num in bindings))
+            return inner.union(*(frozen_in(num) | columns_in(num) for _, num in bindings))
         case _:
             return frozenset().union(*map(_frozen_names, operands(formula)))
 

@@ -18,7 +18,7 @@ from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined, rejoined, terms
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.tolerance import satisfied
 
 if TYPE_CHECKING:
@@ -73,8 +73,10 @@ class Landmarks:
         key = one, other
         if key not in self._apart:
             self._apart[key] = False
-            read = columns(one)
-            column = self.ranges.get(next(iter(read))) if len(read) == 1 and read == columns(other) else None
+            read = columns_in(one)
+            column = (
+                self.ranges.get(next(iter(read))) if len(read) == 1 and read == columns_in(other) else None
+            )
             if column is not None and column.low is not None and column.high is not None:
                 env = {column.name: np.linspace(column.low, column.high, VALUES)[None]}
                 held = [np.broadcast_to(satisfied(each[0]), VALUES) for each in evaluate(key, env, ops=NUMPY)]

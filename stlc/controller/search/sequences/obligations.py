@@ -22,7 +22,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.lower import lower
 from stlc.compile.ir.normal_form import joined, normal
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import map_children, nodes
 from stlc.compile.semantics.tolerance import satisfied
 
@@ -115,7 +115,7 @@ class Obligations:
         kept = [
             item
             for item in formula.items
-            if columns(item) != {self._clock}
+            if columns_in(item) != {self._clock}
             or bool((evaluate([item], env, ops=NUMPY, count=len(time))[0] >= 0.0).any())
         ]
         return joined("or", kept)
@@ -186,7 +186,7 @@ def _responses(written: ir.Formula, form: ir.Formula, own: frozenset[str]) -> It
     formula = written.body if isinstance(written, ir.AtStart) else written
     if not (isinstance(formula, ir.Temporal) and formula.op == "always"):
         return
-    asked = [node for node in nodes(formula) if isinstance(node, ir.Predicate) and columns(node) & own]
+    asked = [node for node in nodes(formula) if isinstance(node, ir.Predicate) and columns_in(node) & own]
     names = {node.num: f"#{i}" for i, node in enumerate(asked)}
 
     def named(node: ir.Formula) -> ir.Formula:

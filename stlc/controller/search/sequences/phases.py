@@ -25,7 +25,7 @@ from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined
 from stlc.compile.ir.simplify import simplify
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import map_children, nodes
 from stlc.controller.problem.native import motion_of
 from stlc.native import Kernel, SearchOptions, Sizes, load
@@ -526,7 +526,7 @@ def _demands(formula: ir.Formula, known: frozenset[str], later: int = 0) -> list
     Of an `always`, the first, the middle and the last sample count.
     """
     match formula:
-        case ir.Predicate() if columns(formula) <= known:
+        case ir.Predicate() if columns_in(formula) <= known:
             return [(Demand(formula, later, SPARE),)]
         case ir.BoolOp("or", items):
             return [each for item in items for each in _demands(item, known, later)][:OPTIONS]
@@ -596,7 +596,7 @@ class _Shortfall:
                 margin = num if sign > 0 else ir.Op("neg", (num,))
                 spare = ir.Op("sub", (margin, ir.Const(SPARE))) if strict else margin
                 share = ir.Const(1.0 / self._scale(formula))
-                group = self._groups.setdefault(columns(formula), len(self._groups)) % WEIGHTS
+                group = self._groups.setdefault(columns_in(formula), len(self._groups)) % WEIGHTS
                 weight = ir.Op("mul", (ir.Signal(WEIGHT.format(group)), share))
                 return ir.Op("mul", (ir.Op("relu", (ir.Op("neg", (spare,)),)), weight))
             case ir.BoolOp(op, items):

@@ -25,9 +25,9 @@ import numpy as np
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import names_in, substitute
+from stlc.compile.ir.algebra import substitute
 from stlc.compile.ir.normal_form import joined, negate, rejoined, terms
-from stlc.compile.ir.support import columns
+from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.search.sequences.phases import levels
@@ -131,7 +131,7 @@ class Relaxation:
         while more := {
             name
             for name, value in self._flow.items()
-            if name not in self.driven and names_in(_settled(value, None)) & self.driven
+            if name not in self.driven and columns_in(_settled(value, None)) & self.driven
         }:
             self.driven |= more
         clauses = [clause for formula in safe for clause in clauses_of(formula)]
@@ -174,7 +174,7 @@ class Relaxation:
             for literal in self._literals_of(group.target):
                 if self._sort(literal) == "driven" and literal not in self._ways:
                     self._motions.setdefault(self._number[literal], []).append(len(jumps) + i)
-        reads = [columns(literal) for literal in self._literals]
+        reads = [columns_in(literal) for literal in self._literals]
         self._setters = [
             [
                 i
@@ -195,7 +195,7 @@ class Relaxation:
             for assign in step.jump.resets:
                 if isinstance(assign.value, ir.Const):
                     env[assign.name][0, i + 1] = assign.value.value
-                elif names_in(assign.value) <= env.keys():
+                elif columns_in(assign.value) <= env.keys():
                     growing[i] = True
                     known = {name: column[:, :1] for name, column in env.items()}
                     env[assign.name][0, i + 1] = _values([ir.Predicate(assign.value)], known)[0, 0]
@@ -269,15 +269,15 @@ class Relaxation:
             extra.append(joined("or", (joined("and", asked), present(order.right))))
         condition = joined("and", (jump.guard, *extra))
         controls = frozenset(self._controls)
-        if not columns(jump.guard) & controls:
+        if not columns_in(jump.guard) & controls:
             return Step(condition, condition, 1, jump)
-        free = rejoined(jump.guard, lambda part: YES if columns(part) & controls else part)
+        free = rejoined(jump.guard, lambda part: YES if columns_in(part) & controls else part)
         effects = (_equal(name, value) for name, value in fixed.items())
         return Step(joined("and", (free, *extra)), joined("and", effects), 0, jump)
 
     def _left(self, clause: Sequence[ir.Formula], fixed: Mapping[str, ir.Num]) -> ir.Formula:
         """Return what a clause, a disjunction, asks before a jump that sets the states `fixed`."""
-        if not any(columns(item) & fixed.keys() for item in clause):
+        if not any(columns_in(item) & fixed.keys() for item in clause):
             return YES
         if any(isinstance(node, (ir.PastTemporal, ir.Since)) for item in clause for node in nodes(item)):
             return YES
@@ -295,7 +295,7 @@ class Relaxation:
                 yield node
 
     def _sort(self, literal: ir.Formula) -> Sort:
-        read = columns(literal)
+        read = columns_in(literal)
         if not read <= self._own:
             return "unknown"
         if read & self.driven:
@@ -310,7 +310,7 @@ class Relaxation:
         sort = self._sort(literal)
         if sort not in ("timed", "driven"):
             return None
-        flowing = [name for name in columns(literal) if name in self._flow]
+        flowing = [name for name in columns_in(literal) if name in self._flow]
         modes = dict.fromkeys(
             part.cond
             for name in flowing
@@ -333,7 +333,7 @@ class Relaxation:
             self._rates[literal] = max(self._rates.get(literal, 0.0), found)
             return found
 
-        if not all(names_in(self._flow[name]) <= now.keys() for name in flowing):
+        if not all(columns_in(self._flow[name]) <= now.keys() for name in flowing):
             return YES  # the flow depends on time
         if not modes:
             return ir.Truth(rate(None, holds=True) > 0.0)
@@ -501,7 +501,7 @@ def _conjunctions(formula: ir.Formula) -> Iterator[ir.Formula]:
 
 def _folded(formula: ir.Formula) -> ir.Formula:
     """Replace a literal that reads no signal by its truth."""
-    if isinstance(formula, ir.Predicate) and not columns(formula):
+    if isinstance(formula, ir.Predicate) and not columns_in(formula):
         return ir.Truth(bool(satisfied(_values([formula], {"": np.zeros((1, 1))}))[0, 0]))
     return formula
 

@@ -22,9 +22,8 @@ import numpy as np
 import torch
 
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.algebra import names_in
 from stlc.compile.ir.normal_form import joined, pieces, terms
-from stlc.compile.ir.support import columns, history, reach
+from stlc.compile.ir.support import columns_in, history, reach
 from stlc.compile.ir.traverse import nodes
 from stlc.controller.search.newton import values_of
 from stlc.controller.search.sequences.landmarks import Landmarks
@@ -165,7 +164,7 @@ class Sequences:
             clause
             for formula in (*self._safe, *self._kept)
             for clause in clauses_of(formula)
-            if all(columns(each) <= own and not history(each) for each in clause)
+            if all(columns_in(each) <= own and not history(each) for each in clause)
         ]
         moved = self._relaxation.driven - {*self._relaxation.modes}
         ranges = {each.name: each for each in task.system.decl.signature.columns if each.name in moved}
@@ -185,7 +184,7 @@ class Sequences:
         controls = frozenset(system.control_names)
         for assign in system.decl.flow:
             low, high = system.decl.signature[assign.name].low, system.decl.signature[assign.name].high
-            driven = assign.name in self._relaxation.driven and not names_in(assign.value) & controls
+            driven = assign.name in self._relaxation.driven and not columns_in(assign.value) & controls
             if driven and low is not None and high is not None:
                 speed = DRIFT * (high - low) / (self.steps * system.dt)
                 margin = ir.Op("sub", (ir.Const(speed), ir.Op("abs", (assign.value,))))
@@ -200,7 +199,7 @@ class Sequences:
             [part for part in clause if isinstance(part, ir.Predicate)]
             for formula in self._safe
             for clause in clauses_of(formula)
-            if all(isinstance(part, ir.Predicate) and columns(part) <= known for part in clause)
+            if all(isinstance(part, ir.Predicate) and columns_in(part) <= known for part in clause)
         ]
         return Phases.of(self.task.system, safe, self._targets, self._kept, self.steps, scale, clauses)
 
