@@ -63,6 +63,10 @@ class Unit:
             return self
         return Unit(self.dims, self.ratio, _si_text(self.dims) if self.ratio == 1 else f"Δ{self.text}")
 
+    def same_dims(self, other: Unit) -> bool:
+        """True if the units have the same dimensions, so that their quantities can be added and compared."""
+        return self.dims == other.dims
+
     def of_si(self, value: float) -> float:
         """Convert a number from SI units to this unit."""
         return (value - float(self.offset)) / self.scale
@@ -223,9 +227,9 @@ CELSIUS = "degrees Celsius are written `degC`, kelvin `K`"
 _CELSIUS = re.compile(r"deg(?:ree)?s?[_. ]*C(?:elsius)?|°[_ ]*C|Cel(?:sius)?|centigrade", re.IGNORECASE)
 
 
-def means_celsius(text: str) -> bool:
-    """True for spellings of degrees Celsius."""
-    return _CELSIUS.fullmatch(text.strip()) is not None
+def celsius_advice(text: str) -> tuple[str, ...]:
+    """Return the advice about a text that means degrees Celsius but is not `degC`; () for any other text."""
+    return (CELSIUS,) if _CELSIUS.fullmatch(text.strip()) else ()
 
 
 def nearest(value: Fraction | float) -> float:
@@ -242,11 +246,6 @@ def time_text(seconds: Fraction | float) -> str:
         if seconds >= 2 * size and seconds % part == 0:
             return f"{nearest(seconds) / size:g} {unit}"
     return f"{nearest(seconds):g} s"
-
-
-def same_dims(a: Unit, b: Unit) -> bool:
-    """True if the units have the same dimensions, so that their quantities can be added and compared."""
-    return a.dims == b.dims
 
 
 def _factors(text: str) -> list[tuple[str, int]]:

@@ -20,7 +20,7 @@ from stlc.grammar import ast
 from stlc.grammar.errors.units import unit_advice
 from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, SPACE, UNARY_TEMPORAL
 from stlc.source import Source, Span
-from stlc.units import CELSIUS, means_celsius, parse_unit
+from stlc.units import celsius_advice, parse_unit
 
 MAX_DIGITS = 400
 _UNIT_LENGTH = 60
@@ -99,10 +99,9 @@ def unit_of(context: BuildContext, leaf: TerminalToken | None) -> str:
 def _bad_unit(leaf: TerminalToken, text: str, reason: str) -> Diagnostic:
     if "," in text:
         advice: tuple[str, ...] = (f"a range is written `in {leaf.text}`",)
-    elif means_celsius(text.strip("[] ")):
-        advice = (CELSIUS,)
     else:
-        advice = next((found for word in _LETTERS.findall(text) if (found := unit_advice(word))), ())
+        advice = celsius_advice(text.strip("[] "))
+        advice = advice or next(filter(None, map(unit_advice, _LETTERS.findall(text))), ())
     return Diagnostic(
         "E101", reason, leaf.span, help=advice, note=("a unit is a product of powers: [m/s^2], [1/s], [%]",)
     )

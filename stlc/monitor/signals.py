@@ -37,7 +37,7 @@ from stlc.trace.enums import TRUTH, Words
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.recording import Conversion, conversion
 from stlc.trace.resample import Between, How, Moments, TimeRange
-from stlc.units import SYMBOLS, same_dims, written_unit
+from stlc.units import SYMBOLS, written_unit
 
 CLOCK = "t"
 """Name under which a trace also offers its time in seconds."""
@@ -122,7 +122,7 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[s
         name = item.column or item.name
         words[name] = {} if item.type is None else worth.get(item.type.name, {})
         kinds[name] = "real" if item.type is None else _KINDS.get(item.type.name, "enum")
-        timelike[name] = not item.unit or same_dims(written_unit(item.unit), SYMBOLS["s"])
+        timelike[name] = not item.unit or written_unit(item.unit).same_dims(SYMBOLS["s"])
         if (declared := _declared_between(item)) is not None:
             between[name] = declared
     _require_signals(requested, spec, columns)

@@ -108,7 +108,7 @@ def _conversions(online: Online, units: Mapping[str, str], name: str) -> dict[st
         TraceError: E605, a unit is invalid, or has another dimension than the declared one.
     """
     from stlc.trace.recording import conversion
-    from stlc.units import CELSIUS, means_celsius, parse_unit
+    from stlc.units import celsius_advice, parse_unit
 
     changes: dict[str, Conversion] = {}
     for column in online.compiled.signature.columns:
@@ -118,8 +118,8 @@ def _conversions(online: Online, units: Mapping[str, str], name: str) -> dict[st
             recorded = parse_unit(units[column.name])
         except ValueError as error:
             message = f"column `{column.name}` of the {name}: {error}"
-            help_ = (CELSIUS,) if means_celsius(units[column.name]) else ()
-            raise TraceError(Diagnostic("E605", message, help=help_)) from None
+            advice = celsius_advice(units[column.name])
+            raise TraceError(Diagnostic("E605", message, help=advice)) from None
         change = conversion(name, column, recorded)
         if change is not None:
             changes[column.name] = change

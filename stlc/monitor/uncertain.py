@@ -26,7 +26,7 @@ from stlc.jsontext import Num
 from stlc.monitor.values import Record
 from stlc.registry import closest
 from stlc.signature import Column
-from stlc.units import DIMENSIONLESS, Unit, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, Unit, parse_unit
 
 _AMOUNT = re.compile(r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>.*)")
 _INDEX = re.compile(r"(?<=.)\[\d+\]\Z")
@@ -140,7 +140,7 @@ def _misfit(
         message = f"`--uncertain {name}=…`: a signal of type {known.kind} has no error"
         return Diagnostic("U101", message, span, label=label)
     unit = uncertain.unit
-    if not unit.text or not known.unit.text or same_dims(unit, known.unit.interval):
+    if not unit.text or not known.unit.text or unit.same_dims(known.unit.interval):
         return None
     message = f"`--uncertain {name}={uncertain}`: `{name}` is in [{known.unit}], not in [{unit}]"
     help_ = (f"a number alone is in [{known.unit.interval}]: --uncertain {name}={uncertain.absolute:g}",)

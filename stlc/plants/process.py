@@ -24,7 +24,7 @@ from stlc.plants.declaration import OutputDecl, PlantDecl, PlantInput, VariableD
 from stlc.plants.kinds import Reason
 from stlc.plants.messages import SAID, Message, MessageError, encoded, received
 from stlc.plants.watchdog import Watchdog
-from stlc.units import parse_unit, same_dims
+from stlc.units import parse_unit
 
 Floats: TypeAlias = NDArray[np.float64]
 TAIL = 4000
@@ -266,7 +266,7 @@ def _require_units(decl: PlantDecl, units: Mapping[str, Any]) -> None:
                 continue
             if known is None or not known.text or not each.unit.text:
                 continue
-            if not same_dims(known, each.unit) or known.scale != each.unit.scale:
+            if not known.same_dims(each.unit) or known.scale != each.unit.scale:
                 place = f"{section}.{each.name}"
                 span = decl.places.get(f"{place}.unit") or decl.places.get(place)
                 message = f"`{each.name}` is in [{known}] in the plant, and the file declares [{each.unit}]"

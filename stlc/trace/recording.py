@@ -16,7 +16,7 @@ from stlc.registry import closest
 from stlc.signature import MAX_COMPONENTS, Column
 from stlc.source import Span
 from stlc.trace.meta import TraceMeta
-from stlc.units import CELSIUS, DIMENSIONLESS, SYMBOLS, Unit, means_celsius, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, celsius_advice, parse_unit
 
 Array = NDArray[Any]
 
@@ -229,8 +229,8 @@ def unit_of(path: Path, name: str, text: str) -> Unit:
     try:
         return parse_unit(text) if text else DIMENSIONLESS
     except ValueError as error:
-        help_ = (CELSIUS,) if means_celsius(text) else ()
-        raise TraceError(Diagnostic("E605", f"column `{name}` of `{path}`: {error}", help=help_)) from None
+        message = f"column `{name}` of `{path}`: {error}"
+        raise TraceError(Diagnostic("E605", message, help=celsius_advice(text))) from None
 
 
 def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array]:
@@ -293,7 +293,7 @@ def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = N
     wanted = column.unit
     if not wanted.text or not recorded.text:
         return None
-    if not same_dims(recorded, wanted):
+    if not recorded.same_dims(wanted):
         message = f"`{column.name}` is in [{recorded}] in `{trace}`, the specification declares [{wanted}]"
         coulombs = wanted.dims == SYMBOLS["K"].dims and recorded.text == "C"
         help_ = (f"[C] is coulombs: name the column `{column.name} [degC]`",) if coulombs else ()

@@ -25,7 +25,7 @@ from stlc.diagnostics import SpecError, StlcError, SystemFileError
 from stlc.grammar.parser import parse_expr
 from stlc.signature import Column
 from stlc.source import Source
-from stlc.units import DIMENSIONLESS, parse_unit, same_dims
+from stlc.units import DIMENSIONLESS, parse_unit
 
 LABELS = (("stop", 0.0), ("light", 1.0))
 COLUMNS = (
@@ -161,7 +161,7 @@ def test_large_powers_do_not_grow_without_bound() -> None:
 )
 def test_units_follow_the_operations(text: str, unit: str) -> None:
     found = number(text)
-    assert same_dims(found.unit, parse_unit(unit))
+    assert found.unit.same_dims(parse_unit(unit))
     assert not found.flexible
 
 

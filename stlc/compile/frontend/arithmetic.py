@@ -24,7 +24,7 @@ from stlc.compile.ir.ranges import bounds
 from stlc.diagnostics import Diagnostic, Label
 from stlc.signature import Kind
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, nearest, same_dims
+from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, nearest
 
 _MAX_BITS = 512
 _QUANTITY = re.compile(r"(-? *[\d.]+(?:[eE][+-]?\d+)?) *(?:[^\W\d]|°)\S*")
@@ -90,7 +90,7 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
     """
     rigid = [arg for arg in args if not arg.flexible]
     for other in rigid[1:]:
-        if not same_dims(rigid[0].unit, other.unit):
+        if not rigid[0].unit.same_dims(other.unit):
             scope.fail(_mismatch(rigid[0], other, what, span))
     if any(arg.unit.offset for arg in args):
         return _on_one_scale(args, what, span, scope)
@@ -344,7 +344,7 @@ def _sum(function: Function, args: tuple[Number, Number], span: Span, scope: Sco
     left, right = args
     first = left.unit.offset and (not right.unit.offset or left.sense != "open")
     point, other = (left, right) if first else (right, left)
-    if not other.flexible and not same_dims(point.unit, other.unit):
+    if not other.flexible and not point.unit.same_dims(other.unit):
         scope.fail(_mismatch(left, right, _verb(function), span))
     if function.name == "sub" and right.unit.offset:
         return _less_point(left, right, span, scope)
@@ -397,7 +397,7 @@ def _spread(function: Function, args: Sequence[Number], span: Span, scope: Scope
         is_difference = not deviation.bare and deviation.unit.dims == _TEMPERATURE
         around = is_difference and all(place.bare for place in places)
         return found, replace(blank, sense="difference" if around else blank.sense)
-    if not deviation.flexible and not same_dims(point.unit, deviation.unit):
+    if not deviation.flexible and not point.unit.same_dims(deviation.unit):
         scope.fail(_mismatch(middle, deviation, _verb(function), span))
     (middle, *ends), blank = agree(places, _verb(function), span, scope)
     if deviation.bare:

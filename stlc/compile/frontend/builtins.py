@@ -56,7 +56,7 @@ from stlc.compile.ir.traverse import map_leaves, shifted
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
-from stlc.units import SYMBOLS, Unit, same_dims
+from stlc.units import SYMBOLS, Unit
 
 FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -280,8 +280,8 @@ def _delay(value: Value, expr: ast.Expr, scope: Scope) -> typed.Time:
             time = value.on(expr.span)
         case Number(bare=True, exact=known) if known is not None:
             time = typed.Time(steps=known, span=expr.span)
-        case Number(bare=False, flexible=False) if value.constant is not None and same_dims(
-            value.unit, _SECOND
+        case Number(bare=False, flexible=False) if value.constant is not None and value.unit.same_dims(
+            _SECOND
         ):
             time = moment(expr, value, scope).on(expr.span)
         case _:
@@ -353,7 +353,7 @@ def _argument(number: Number, unit: Unit, need: Expectation, span: Span, scope: 
     """
     if number.bare:
         return in_unit(number, unit, scope)
-    if not number.flexible and not same_dims(number.unit, unit):
+    if not number.flexible and not number.unit.same_dims(unit):
         scope.fail(Diagnostic("E203", f"{need.who} in [{unit}], this is in [{number.unit}]", span))
     return number
 

@@ -17,7 +17,6 @@ from stlc.diagnostics import Diagnostic, Label
 from stlc.grammar import ast
 from stlc.signature import Column
 from stlc.source import Span
-from stlc.units import same_dims
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +126,7 @@ def require_unit(number: Number, column: Column, expr: ast.Expr, scope: Scope) -
     Raises:
         Failed: it has another unit (E203).
     """
-    if not number.flexible and column.unit.text and not same_dims(number.unit, column.unit):
+    if not number.flexible and column.unit.text and not number.unit.same_dims(column.unit):
         message = f"`{column.name}` is in [{column.unit}], this is in [{number.unit}]"
         scope.fail(Diagnostic("E203", message, expr.span, f"[{number.unit}]"))
 

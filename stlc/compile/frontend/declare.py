@@ -32,7 +32,7 @@ from stlc.grammar.words import BUILT_IN
 from stlc.registry import closest
 from stlc.signature import MAX_COMPONENTS, Column, Kind, Role
 from stlc.source import Span
-from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit, same_dims
+from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit
 
 
 def check_names(entry: Definition, scope: Scope) -> None:
@@ -222,7 +222,7 @@ def _matched(column: Column, decl: ast.Signal | ast.Param, interface: Interface,
     own = interface.signature[column.name]
     place = interface.places.get(column.name)
     labels = () if place is None else (Label(place, "declared here"),)
-    if column.unit.text and own.unit.text and not same_dims(column.unit, own.unit):
+    if column.unit.text and own.unit.text and not column.unit.same_dims(own.unit):
         message = f"`{column.name}` is in [{column.unit}] here and in [{own.unit}] in {interface.where}"
         scope.fail(Diagnostic("E203", message, decl.name_span, f"[{column.unit}]", labels))
     discrete = ("bool", "enum")

@@ -13,7 +13,7 @@ from stlc.compile.ir.functions import REGIONS
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
-from stlc.units import Unit, same_dims
+from stlc.units import Unit
 
 
 def arguments(entry: Definition, call: ast.Call, scope: Scope) -> dict[str, ast.Expr]:
@@ -85,7 +85,7 @@ def _in_unit(value: Value, unit: Unit, span: Span, scope: Scope) -> Value:
 def _number_in(number: Number, unit: Unit, span: Span, scope: Scope) -> Number:
     if number.bare:
         return in_unit(number, unit, scope)
-    if not number.flexible and not same_dims(number.unit, unit):
+    if not number.flexible and not number.unit.same_dims(unit):
         message = f"declared as [{unit}], but this is {unit_text(number) or '[1]'}"
         scope.fail(Diagnostic("E203", message, number.span or span))
     return replace(on_scale(number, unit, span, scope), flexible=False)

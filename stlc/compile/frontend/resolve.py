@@ -35,7 +35,6 @@ from stlc.grammar import ast
 from stlc.grammar.parser import MAX_ERRORS
 from stlc.signature import Column, Signature
 from stlc.source import Span
-from stlc.units import same_dims
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +112,7 @@ def _check_same(column: Column, place: Span, known: Column, span: Span, scope: S
         not column.unit.text
         or not known.unit.text
         or (
-            same_dims(column.unit, known.unit)
+            column.unit.same_dims(known.unit)
             and column.unit.offset == known.unit.offset
             and math.isclose(column.unit.scale, known.unit.scale)
         )
@@ -281,7 +280,7 @@ def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope)
     theirs, unit = interface.constants[item.name]
     free = value.flexible or not unit.text
     ours = absolute(value).constant or 0.0
-    if math.isclose(ours, theirs, rel_tol=1e-9) and (free or same_dims(value.unit, unit)):
+    if math.isclose(ours, theirs, rel_tol=1e-9) and (free or value.unit.same_dims(unit)):
         return
     place = interface.places.get(item.name)
     labels = () if place is None else (Label(place, "declared here"),)
@@ -289,7 +288,7 @@ def _compare(item: ast.Const, value: Number, interface: Interface, scope: Scope)
     there = _amount(unit.of_si(theirs), unit.text)
     message = f"`{item.name}` is {here} here and {there} in {interface.where}"
     both = f"make them agree, or change both at once: `--set {item.name}={here.replace(' ', '')}`"
-    help_ = (both,) if free or same_dims(value.unit, unit) else ()
+    help_ = (both,) if free or value.unit.same_dims(unit) else ()
     if value.bare and unit.offset:
         help_ = (f"say its unit: `const {item.name} = {here} {unit}`",)
     scope.report(Diagnostic("E104", message, item.name_span, here, labels, help=help_))

@@ -23,7 +23,7 @@ from stlc.compile.ir.nodes import DUAL, OPERATORS
 from stlc.compile.ir.normal_form import literal, normal
 from stlc.compile.ir.traverse import from_now, map_children, nodes, on_clock, operands
 from stlc.diagnostics import Diagnostic
-from stlc.units import Unit, same_dims
+from stlc.units import Unit
 
 
 def as_written(requirement: typed.Requirement) -> typed.Requirement:
@@ -44,7 +44,7 @@ def _one_unit(formula: typed.Formula) -> Unit | None:
     """
     units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
     first = next(iter(units), None)
-    alike = first is not None and all(same_dims(u, first) and u.ratio == first.ratio for u in units)
+    alike = first is not None and all(u.same_dims(first) and u.ratio == first.ratio for u in units)
     return first if alike else None
 
 

@@ -40,7 +40,7 @@ from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequen
 from stlc.grammar import ast
 from stlc.registry import INTEGRATORS
 from stlc.signature import MAX_COMPONENTS, Column, Role
-from stlc.units import CELSIUS, Unit, means_celsius, parse_unit
+from stlc.units import Unit, celsius_advice, parse_unit
 
 Ranges = tuple[tuple[float, float], ...]
 
@@ -57,10 +57,8 @@ def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
     try:
         return None if text is None else parse_unit(text)
     except ValueError as error:
-        advice = (
-            CELSIUS if means_celsius(text or "") else "a unit is a product of powers, for example `m/s^2`"
-        )
-        cx.reader.report("S103", str(error), node.span, advice)
+        advice = celsius_advice(text or "") or ("a unit is a product of powers, for example `m/s^2`",)
+        cx.reader.report("S103", str(error), node.span, *advice)
         return None
 
 

@@ -27,7 +27,7 @@ from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.source import Span
-from stlc.units import Unit, parse_unit, same_dims
+from stlc.units import Unit, parse_unit
 
 _T = TypeVar("_T", bound="Number | tuple[Number, ...] | ir.Formula")
 SECOND = parse_unit("s")
@@ -335,7 +335,7 @@ class Expressions:
     @staticmethod
     def _fits(number: Number, unit: Unit) -> bool:
         """True if a number may be stored in a column of `unit`; an undeclared unit accepts anything."""
-        return number.flexible or number.bare or not unit.text or same_dims(number.unit, unit)
+        return number.flexible or number.bare or not unit.text or number.unit.same_dims(unit)
 
 
 def _columns(found: Number | tuple[Number, ...] | ir.Formula) -> frozenset[str]:

@@ -16,7 +16,7 @@ from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest
 from stlc.source import Span
-from stlc.units import CELSIUS, means_celsius
+from stlc.units import CELSIUS, celsius_advice
 
 MAX_WORDS = 4
 
@@ -107,7 +107,7 @@ def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
         return None
     if found.text in RESERVED or "UNIT" not in failure.accepts or _begins_line(failure, found):
         return None
-    advice = (CELSIUS,) if means_celsius(found.text) else unit_advice(found.text)
+    advice = celsius_advice(found.text) or unit_advice(found.text)
     product = f"a product is written with a sign: `{previous.text} * {found.text}`"
     return Diagnostic("E101", f"unknown unit `{found.text}`", failure.of(found), help=(*advice, product))
 

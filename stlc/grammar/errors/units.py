@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stlc.grammar.words import UNIT_NAMES
 from stlc.registry import closest
-from stlc.units import PREFIXED, SYMBOLS, means_celsius
+from stlc.units import PREFIXED, SYMBOLS, celsius_advice
 
 _PREFIXES = "pnumkMG"
 _USUAL = tuple(prefix + unit for prefix in ("", *_PREFIXES) for unit in PREFIXED if prefix + unit in SYMBOLS)
@@ -19,7 +19,7 @@ def unit_advice(word: str) -> tuple[str, ...]:
     """
     if word == "T":
         return ("`T` is the planning horizon; a tesla is `Wb/m^2`, a millitesla `mT`",)
-    if len(word) < 2 or word in SYMBOLS or means_celsius(word):
+    if len(word) < 2 or word in SYMBOLS or celsius_advice(word):
         return ()
     named = UNIT_NAMES.get(word.lower())
     alike = [named] if named else [unit for unit in _USUAL if unit.casefold() == word.casefold()]

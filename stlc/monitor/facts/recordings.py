@@ -16,7 +16,7 @@ from stlc.monitor.facts.evidence import Evidence, Floats
 from stlc.monitor.facts.fact import Fact
 from stlc.signature import Column
 from stlc.trace.resample import TimeRange
-from stlc.units import Unit, parse_unit, same_dims
+from stlc.units import Unit, parse_unit
 
 FEW = 10
 """Samples below which a recording is short."""
@@ -186,7 +186,7 @@ def units_in_names(evidence: Evidence) -> Iterator[Fact]:
         source = trace.sources.get(column.name, column.name)
         stated = column.name in trace.signature and trace.signature[column.name].unit.text
         named = None if stated or not column.unit.text else _unit_of(source)
-        if named is None or not same_dims(named, column.unit):
+        if named is None or not named.same_dims(column.unit):
             continue
         if (named.ratio, named.offset) != (column.unit.ratio, column.unit.offset):
             text = f"`{visible(source)}` is read as [{column.unit.text}], and its name says [{named.text}]"
@@ -210,7 +210,7 @@ def degrees(evidence: Evidence) -> Iterator[Fact]:
     turn, radians = 2.0 * np.pi, parse_unit("rad")
     for column, _ in _signals(evidence, "real"):
         unit = column.unit
-        if unit.text != "rad" or not same_dims(unit, radians):
+        if unit.text != "rad" or not unit.same_dims(radians):
             continue
         least, most = evidence.ranges[column.name]
         reach = max(most, -least)
