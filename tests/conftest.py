@@ -32,7 +32,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what ru
 
 settings.register_profile(
     "stlc",
-    max_examples=25,
+    max_examples=15,
     deadline=None,
     derandomize=True,
     print_blob=True,
@@ -55,6 +55,11 @@ def pytest_collection_finish() -> None:
 
 SMALL = {
     "stlc.controller.training.learner.MARGIN_STATES": 8,
+    "stlc.controller.training.learner.EFFORTS": (1000, 2000, 4000),
+    "stlc.controller.training.conflict.JUDGED": 1000,
+    "stlc.controller.training.conflict.TRIES": 1000,
+    "stlc.controller.evaluation.held_out.CEILING_TRIES": 1000,
+    "stlc.controller.evaluation.held_out.JUDGED": 1000,
     "stlc.controller.search.feasibility.TRIES": 1000,
     "stlc.controller.evaluation.deployment.LATENCY_SECONDS": 0.01,
 }

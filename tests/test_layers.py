@@ -121,10 +121,17 @@ MODULES = {module_name(path): path for package in PACKAGES for path in sorted(pa
 @cache
 def nodes_of(name: str) -> list[ast.AST]:
     """The nodes of a module that may import something, guard an import or call a function."""
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-    return [
-        node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom | ast.If | ast.Call)
-    ]
+    found: list[ast.AST] = []
+    queue: list[object] = [ast.parse(MODULES[name].read_text(encoding="utf-8"))]
+    while queue:  # ast.walk takes twice as long
+        each = queue.pop()
+        if isinstance(each, list):
+            queue += each
+        elif isinstance(each, ast.AST):
+            queue += each.__dict__.values()
+            if isinstance(each, ast.Import | ast.ImportFrom | ast.If | ast.Call):
+                found.append(each)
+    return found
 
 
 def imports_of(name: str) -> Iterator[Import]:

@@ -53,7 +53,7 @@ def test_the_literal_value_is_the_monitor_s(formula, rows):
     assert robustness(formula, data, DT) == pytest.approx(np.asarray(found))
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(FORMULA, ROWS)
 def test_rtamt_takes_the_same_formula(formula, rows):
     data = {name: np.array([float(row[i]) for row in rows]) for i, name in enumerate(("x", "y", "go"))}

@@ -69,7 +69,7 @@ def _grown(inner):
     )
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(st.recursive(_atoms, _grown, max_leaves=5), st.lists(SAMPLES, min_size=8, max_size=8))
 def test_a_state_formula_means_what_python_says(case, rows) -> None:
     text, meaning = case
@@ -78,7 +78,7 @@ def test_a_state_formula_means_what_python_says(case, rows) -> None:
         assert reference.true(found, row) == bool(meaning(row)), text
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(st.recursive(_atoms, _grown, max_leaves=5), SAMPLES)
 def test_the_negation_is_the_opposite(case, row) -> None:
     found = formula(case[0])

@@ -49,7 +49,7 @@ def test_while_a_text_is_typed(name):
         ask_everything(text[:length], length)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.sampled_from(sorted(TEXTS)), st.data())
 def test_in_a_damaged_text(name, data):
     text = TEXTS[name]

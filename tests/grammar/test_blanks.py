@@ -113,7 +113,7 @@ def test_crlf_is_a_line_break():
     assert parse(Source("t", TEXT.replace("\n", "\r\n"))) == parse(Source("t", TEXT))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(specs, st.sampled_from([*SPACES, *UNSEEN]), st.data())
 def test_all_parts_agree_on_random_specifications(spec, char, data):
     text = "# first\n" + show(spec).replace("\n", "  # note\n", 2)

@@ -394,7 +394,7 @@ def value(node: ast.Expr) -> Fraction:
     return SIGNS[node.op](value(node.left), value(node.right))
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(
     st.sampled_from([("and", "&&"), ("or", "|"), ("+", "-"), ("*", "/"), ("+",), ("*",)]),
     st.integers(2, 5 * LONG_CHAIN),
@@ -504,7 +504,7 @@ def mutations(draw: st.DrawFn) -> str:
     return text
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(mutations())
 def test_damaged_texts_give_findings_or_trees(text):
     found = findings(parse, text)
@@ -514,7 +514,7 @@ def test_damaged_texts_give_findings_or_trees(text):
         assert 0 <= finding.span.start <= finding.span.end <= len(text)
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(st.text(max_size=60) | st.lists(st.sampled_from(PIECES), max_size=20).map(" ".join))
 def test_any_text_gives_findings_or_a_tree(text):
     for read in (parse, parse_expr):

@@ -22,19 +22,19 @@ def expr(text: str) -> ast.Expr:
     return parse_expr(Source("text", text))
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(expressions)
 def test_an_expression_reads_back(tree):
     assert expr(show(tree)) == tree
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(declarations)
 def test_a_declaration_reads_back(tree):
     assert parse(Source("text", show(tree))).items == (tree,)
 
 
-@settings(max_examples=40)
+@settings(max_examples=24)
 @given(specs)
 def test_a_specification_reads_back(tree):
     assert parse(Source("text", show(tree))) == tree

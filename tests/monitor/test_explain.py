@@ -32,7 +32,7 @@ def nodes(blame: CauseNode) -> Iterator[CauseNode]:
         yield from nodes(part)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(formula=formulas(), env=traces(low=3, batch=1))
 def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     trace = reference.Trace({name: column[:, 0] for name, column in env.items()}, GRID, "open")
@@ -51,7 +51,7 @@ def test_every_node_is_what_it_is_said_to_be(formula: typed.Formula, env: dict[s
         assert all(name in env for name, _ in node.reads)
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(formula=formulas(), env=traces(low=3, batch=1))
 def test_the_cause_is_the_value_behind_the_number(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     """The path of minima and maxima ends at it; where it decides alone, changing it changes the number."""
@@ -78,7 +78,7 @@ def test_the_cause_is_the_value_behind_the_number(formula: typed.Formula, env: d
     assert max(found) > value
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(formula=formulas(bounded_only=True), env=traces(low=3, batch=1))
 def test_an_operator_that_never_succeeds_is_explained_by_its_best(
     formula: typed.Formula, env: dict[str, np.ndarray]

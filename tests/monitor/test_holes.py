@@ -32,7 +32,7 @@ def filled(trace: dict[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
     return {name: np.where(np.isnan(x), rng.integers(-40, 40, x.shape) / 8, x) for name, x in trace.items()}
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     written=random_formulas.formulas(held=()),
     trace=random_formulas.traces(1, 14, 2),

@@ -17,7 +17,7 @@ from stlc.monitor.values import Ends, Record, bounds, window_bounds
 
 
 @pytest.mark.parametrize("ends", ["open", "truncate"])
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     written=random_formulas.formulas(held=()),
     trace=random_formulas.traces(1, 14, 2),

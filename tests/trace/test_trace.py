@@ -77,7 +77,7 @@ def header(shape: tuple[int, ...], descr: str = "<f8") -> bytes:
 
 
 @given(hnp.arrays(np.float64, st.tuples(st.integers(1, 3), st.integers(2, 5)), elements=FINITE))
-@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @pytest.mark.parametrize("suffix", [".npz", ".csv"])
 def test_round_trip_keeps_every_bit(tmp_path: Path, suffix: str, x: np.ndarray) -> None:
     path = tmp_path / f"a{suffix}"
@@ -274,7 +274,7 @@ def damaged(data: bytes, cut: int, flips: list[tuple[int, int]]) -> bytes:
     cut=st.integers(0, 2000),
     flips=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=4),
 )
-@settings(deadline=None, max_examples=75, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=36, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damage_is_a_diagnostic_or_harmless(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
     whole = tmp_path / "whole.npz"
     if not whole.exists():
@@ -607,13 +607,13 @@ def test_csv_that_is_not_text(tmp_path: Path) -> None:
 
 
 @given(st.text(alphabet='t,x\n0123.e-"; ', max_size=60))
-@settings(deadline=None, max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_csv_is_read_or_refused(tmp_path: Path, text: str) -> None:
     assert outcome(csv(tmp_path / "a.csv", text)) in ("read", "E601", "E602", "E603", "E604", "E605")
 
 
 @given(st.lists(st.lists(FINITE, min_size=2, max_size=2), min_size=1, max_size=5))
-@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_both_csv_readers_agree(tmp_path: Path, rows: list[list[float]]) -> None:
     body = "".join(f"{a!r},{b!r}\n" for a, b in rows)
     fast = trace_csv.read(csv(tmp_path / "a.csv", "a,b\n" + body))

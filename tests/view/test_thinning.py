@@ -12,7 +12,7 @@ from stlc.view.signals import Choice, draw_signals
 from stlc.view.thinning import COLUMNS, extremes
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.integers(1, 6 * COLUMNS), st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_each_column_keeps_its_least_and_greatest(count, seed, holes):
     rng = np.random.default_rng(seed)

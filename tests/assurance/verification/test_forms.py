@@ -48,7 +48,7 @@ def check(num: ir.Num, seed: int, width: float) -> None:
         assert not off.any()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=36, deadline=None)
 @given(random_formulas.numbers, st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.05, 0.5, 3.0]))
 def test_random_numbers_stay_within_their_forms(num: ir.Num, seed: int, width: float) -> None:
     check(num, seed, width)

@@ -19,7 +19,7 @@ from stlc.source import Source
 seeds = st.integers(0, 2**32 - 1)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(missions, seeds)
 def test_every_plan_satisfies_the_rewriting_iff_the_trace_satisfies_the_mission(
     formula: typed.Formula, seed: int
@@ -47,7 +47,7 @@ def test_the_same_of_two_thousand_that_look_ahead(formula: typed.Formula, seed: 
     check_nested(formula, seed)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(bodies, seeds)
 def test_timers_say_what_operators_of_the_past_say(formula: typed.Formula, seed: int) -> None:
     check_past(formula, seed)
@@ -66,7 +66,7 @@ def test_margins_of_the_past_are_those_of_the_definition(formula: typed.Formula,
     check_margins(formula, seed)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(missions, seeds)
 def test_a_recorded_trace_is_judged_as_defined(formula: typed.Formula, seed: int) -> None:
     check_recorded(formula, seed)

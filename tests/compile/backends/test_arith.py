@@ -40,7 +40,7 @@ def slow(num: ir.Num, env: dict[str, np.ndarray]) -> np.ndarray:
     return np.array([reference.number(num, dict(zip(env, row, strict=True))) for row in rows])
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(numbers, st.integers(0, 2**32 - 1))
 def test_programs_compute_what_is_written(num: ir.Num, seed: int) -> None:
     env = environment(seed)
@@ -51,7 +51,7 @@ def test_programs_compute_what_is_written(num: ir.Num, seed: int) -> None:
     np.testing.assert_allclose(out, wanted, atol=1e-9, rtol=1e-9)
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(state_formulas(numbers), numbers, numbers, st.integers(0, 2**32 - 1))
 def test_straight_through_steps_like_hard(cond: ir.Formula, yes: ir.Num, no: ir.Num, seed: int) -> None:
     env = tensors(environment(seed))

@@ -48,7 +48,7 @@ def lowered(formula: typed.Formula) -> ir.Formula:
     return out
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(looking, traces(high=10))
 def test_cut_windows_give_the_definition(formula: typed.Formula, env: Env) -> None:
     wanted = expected(formula, env, "truncate")
@@ -57,14 +57,14 @@ def test_cut_windows_give_the_definition(formula: typed.Formula, env: Env) -> No
         np.testing.assert_allclose(signal, wanted, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(bounded, traces(high=16))
 def test_strict_is_the_definition_or_undefined(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="strict")
     np.testing.assert_allclose(signal, expected(formula, env, "strict"), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=24)
 @given(looking, traces(high=7))
 def test_bounds_over_all_continuations(formula: typed.Formula, env: Env) -> None:
     node = lowered(formula)
@@ -73,7 +73,7 @@ def test_bounds_over_all_continuations(formula: typed.Formula, env: Env) -> None
         np.testing.assert_allclose(signal, expected(formula, env, "open", side), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(looking, traces(low=2, high=10), st.sampled_from([1, 16, 60]))
 def test_torch_agrees_whatever_is_laid_out_at_once(formula: typed.Formula, env: Env, most: int) -> None:
     node = simplify(lowered(formula))
@@ -85,7 +85,7 @@ def test_torch_agrees_whatever_is_laid_out_at_once(formula: typed.Formula, env: 
     np.testing.assert_allclose(signal.numpy(), wanted, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(looking, traces(high=10))
 def test_truth_goes_with_the_sign(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="truncate")
@@ -117,7 +117,7 @@ def test_the_gradient_reaches_both_instants() -> None:
     assert int((grad != 0).sum()) == 2
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(looking, st.integers(0, 2**32 - 1))
 def test_gradients_are_central_differences(formula: typed.Formula, seed: int) -> None:
     rng = np.random.default_rng(seed)

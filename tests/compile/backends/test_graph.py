@@ -51,28 +51,28 @@ def as_torch(env: Env, dtype: torch.dtype = torch.float64, *, grad: bool = False
     return {name: torch.tensor(value, dtype=dtype, requires_grad=grad) for name, value in env.items()}
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(formulas(), traces())
 def test_cut_windows_give_the_definition(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="truncate")
     np.testing.assert_allclose(signal, expected(formula, env, "truncate"), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(formulas(bounded_only=True), traces(high=20))
 def test_strict_is_the_definition_or_undefined(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="strict")
     np.testing.assert_allclose(signal, expected(formula, env, "strict"), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=24)
 @given(formulas(), traces(high=20))
 def test_strict_with_windows_to_the_end(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="strict")
     np.testing.assert_allclose(signal, expected(formula, env, "strict"), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(formulas(), traces(high=8))
 def test_bounds_over_all_continuations(formula: typed.Formula, env: Env) -> None:
     node = lowered(formula)
@@ -81,7 +81,7 @@ def test_bounds_over_all_continuations(formula: typed.Formula, env: Env) -> None
         np.testing.assert_allclose(signal, expected(formula, env, "open", side), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(formulas(), traces(high=8, batch=1))
 def test_both_bounds_at_once(formula: typed.Formula, env: Env) -> None:
     node = lowered(formula)
@@ -91,7 +91,7 @@ def test_both_bounds_at_once(formula: typed.Formula, env: Env) -> None:
     np.testing.assert_array_equal(both, np.concatenate([low, high], axis=1))
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(formulas(), traces(low=2, high=6), st.integers(0, 2**32 - 1), st.integers(1, 12))
 def test_bounds_hold_for_every_continuation(formula: typed.Formula, env: Env, seed: int, more: int) -> None:
     """A longer trace stays within the bounds of its prefix, `end` apart, which then is another sample."""
@@ -106,7 +106,7 @@ def test_bounds_hold_for_every_continuation(formula: typed.Formula, env: Env, se
         assert (after >= before).all() if end == "lower" else (after <= before).all()
 
 
-@settings(max_examples=40)
+@settings(max_examples=24)
 @given(formulas(), traces(high=20))
 def test_simplify_keeps_robustness(formula: typed.Formula, env: Env) -> None:
     node = lowered(formula)
@@ -120,7 +120,7 @@ def test_simplify_keeps_robustness(formula: typed.Formula, env: Env) -> None:
     np.testing.assert_array_equal(again[inside], strict[inside])
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(formulas(), traces(high=20))
 def test_torch_agrees_with_numpy(formula: typed.Formula, env: Env) -> None:
     node = simplify(lowered(formula))
@@ -131,7 +131,7 @@ def test_torch_agrees_with_numpy(formula: typed.Formula, env: Env) -> None:
         np.testing.assert_allclose(other.numpy(), one, atol=1e-9, rtol=1e-12)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(formulas(bounded_only=True), traces(low=3, high=20), st.data())
 def test_an_instant_is_a_row_of_the_signal(formula: typed.Formula, env: Env, data: st.DataObject) -> None:
     node = lowered(formula)
@@ -146,7 +146,7 @@ def test_an_instant_is_a_row_of_the_signal(formula: typed.Formula, env: Env, dat
     np.testing.assert_array_equal(rows, signal[start : start + count])
 
 
-@settings(max_examples=40)
+@settings(max_examples=24)
 @given(formulas(), traces(high=16))
 def test_the_sign_is_the_boolean_verdict(formula: typed.Formula, env: Env) -> None:
     signal = robustness_signal(lowered(formula), env, ops=NUMPY, end="truncate")
@@ -163,7 +163,7 @@ def generic(env: Env, seed: int) -> Env:
     return {name: column + rng.uniform(-0.05, 0.05, column.shape) for name, column in env.items()}
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(formulas(), traces(low=4, high=12, batch=1), st.integers(0, 999))
 def test_gradient_is_the_central_difference(formula: typed.Formula, env: Env, seed: int) -> None:
     node = simplify(lowered(formula))
@@ -189,7 +189,7 @@ def test_gradient_is_the_central_difference(formula: typed.Formula, env: Env, se
         assert gradient == pytest.approx(slope, abs=2e-5)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(formulas(truth=False), traces(high=16), st.sampled_from([1.0, 20.0, 500.0]))
 def test_smooth_is_near_exact(formula: typed.Formula, env: Env, k: float) -> None:
     node = lowered(formula)
@@ -255,7 +255,7 @@ def test_infinite_operands_carry_no_gradient(semantics: Exact | LogSumExp, dtype
 
 
 @given(formulas(truth=False), traces(low=3, high=9), st.sampled_from([None, 50.0, 500.0]))
-@settings(max_examples=40)
+@settings(max_examples=24)
 def test_gradients_are_never_nan(formula: typed.Formula, env: Env, k: float | None) -> None:
     tensors = as_torch(env, torch.float32, grad=True)
     semantics = Exact() if k is None else LogSumExp(k)

@@ -106,7 +106,7 @@ def test_a_box_without_width_is_the_value_up_to_rounding(name: str) -> None:
 FINITE = st.floats(-1e300, 1e300, allow_subnormal=True)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=48, deadline=None)
 @given(st.lists(FINITE, min_size=4, max_size=4), st.lists(st.floats(0, 1), min_size=2, max_size=2))
 def test_sums_products_and_quotients_contain_the_exact_values(ends: list[float], shares: list[float]) -> None:
     (a, b), (c, d) = sorted(ends[:2]), sorted(ends[2:])
@@ -442,13 +442,13 @@ def lowered(written: Any) -> ir.Formula:
     return simplify(lower(written, random_formulas.GRID, []))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=48, deadline=None)
 @given(any_formula, any_trace, ends, widths, seeds)
 def test_bounds_of_random_formulas_contain_every_point(written, trace, end, width, seed) -> None:
     check_formula(lowered(written), trace, end, width, seed)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=48, deadline=None)
 @given(random_formulas.numbers, any_trace, widths, seeds)
 def test_bounds_of_random_numbers_contain_every_point(num, trace, width, seed) -> None:
     check_number(num, trace, width, seed)

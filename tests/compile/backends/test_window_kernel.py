@@ -64,7 +64,7 @@ def cases(draw: st.DrawFn) -> tuple[Sliding, int]:
 
 @pytest.mark.parametrize("operands", [1, 2])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(
     case=cases(),
     pick=st.sampled_from(["min", "max"]),

@@ -26,7 +26,7 @@ from stlc.compile.semantics.semantics import (
     "semantics", [Exact(), LogSumExp(1.0), ArithmeticGeometricMean(), GeneralizedMean(0.1)]
 )
 @pytest.mark.parametrize("pick", ["min", "max"])
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(
     values=st.lists(st.integers(-9, 9), min_size=1, max_size=20),
     count=st.integers(1, 20),
@@ -62,7 +62,7 @@ def test_windows_are_the_definition(
 
 
 @pytest.mark.parametrize("pick", ["min", "max"])
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(rows=st.integers(1, 90), count=st.integers(1, 100), width=st.integers(1, 12), batch=st.integers(1, 9))
 def test_long_traces_are_judged_in_stretches(
     pick: Pick, rows: int, count: int, width: int, batch: int

@@ -18,7 +18,7 @@ def robustness(text: str, x: np.ndarray, y: np.ndarray, at: int) -> float:
     return float(monitor.robustness({"x": x, "y": y}, at=at))
 
 
-@settings(max_examples=40)
+@settings(max_examples=24)
 @given(
     st.sampled_from(["max", "min"]),
     st.tuples(st.integers(-4, 4), st.integers(-4, 4)).map(sorted),

@@ -52,7 +52,7 @@ _formulas = st.recursive(
 )
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(_formulas)
 def test_a_macro_is_its_text_written_out(case: tuple[str, str]) -> None:
     short, long = case

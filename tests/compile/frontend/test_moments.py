@@ -72,7 +72,7 @@ def test_the_mission_clock_is_kept() -> None:
     assert interval("@[5 s, 10 s]").clock == "start"
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.fractions(0, 100, max_denominator=1000), st.fractions(0, 100, max_denominator=1000))
 def test_seconds_add_exactly(a: Fraction, b: Fraction) -> None:
     written = f"{a.numerator} s / {a.denominator} + {b.numerator} s / {b.denominator}"

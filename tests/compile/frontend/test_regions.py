@@ -57,7 +57,7 @@ def _inside(p, corners) -> bool:
 @pytest.mark.parametrize(
     "corners", [SQUARE, L_SHAPE, STAR, L_SHAPE[::-1]], ids=["square", "L", "star", "clockwise"]
 )
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(p=points)
 def test_a_polygon_is_its_euclidean_distance(corners, p) -> None:
     edges = zip(corners, (*corners[1:], corners[0]), strict=True)
@@ -68,7 +68,7 @@ def test_a_polygon_is_its_euclidean_distance(corners, p) -> None:
     assert (found > 0) == _inside(p, corners)
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(points)
 def test_a_box_is_the_polygon_of_its_corners(p) -> None:
     assert distance("box(lower = [0, 0], upper = [2, 2])", p) == pytest.approx(
@@ -76,7 +76,7 @@ def test_a_box_is_the_polygon_of_its_corners(p) -> None:
     )
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.tuples(coordinate, coordinate, coordinate))
 def test_a_box_in_space(p) -> None:
     low, high = (-1.0, -2.0, 0.0), (1.0, 2.0, 3.0)
@@ -86,7 +86,7 @@ def test_a_box_in_space(p) -> None:
     assert distance("box([-1, -2, 0], [1, 2, 3])", p) == pytest.approx(wanted, abs=1e-12)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(points)
 def test_simple_regions(p) -> None:
     assert distance("circle(center = [1, 2], radius = 3)", p) == pytest.approx(
@@ -95,7 +95,7 @@ def test_simple_regions(p) -> None:
     assert distance("halfspace([3, 4], 10)", p) == pytest.approx((10 - 3 * p[0] - 4 * p[1]) / 5, abs=1e-12)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(points)
 def test_combinations(p) -> None:
     a, b = "circle([0, 0], 2)", "box([0, 0], [3, 3])"

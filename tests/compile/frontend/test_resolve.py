@@ -51,7 +51,7 @@ def test_the_columns_of_traffic() -> None:
 _positions = st.floats(-10, 10)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(
     x=_positions, tau=st.floats(0, 20), sign=st.sampled_from([0.0, 1.0]), yielding=st.sampled_from([0.0, 1.0])
 )

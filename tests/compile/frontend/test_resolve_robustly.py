@@ -94,7 +94,7 @@ def _grown(inner):
     )
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(
     st.recursive(_leaves, _grown, max_leaves=6),
     st.sampled_from(["require r:", "def d =", "const e =", "region g ="]),

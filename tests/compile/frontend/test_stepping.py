@@ -44,7 +44,7 @@ def finding(text: str, grid: Grid) -> Diagnostic:
 
 
 @given(st.integers(-50, 50), st.sampled_from([1, 2, 10, 25, 100]))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_a_time_is_its_number_of_steps(steps: int, hertz: int) -> None:
     time = f"{float(Fraction(steps, hertz))!r} s"
     by_time = compiled(f"shift(x, {time}) > 1 m", Grid(Fraction(1, hertz)))

@@ -94,7 +94,7 @@ def test_convex_regions_are_exact(region, now, then, obstacle) -> None:
 
 
 @pytest.mark.parametrize("region", SPACE.values(), ids=SPACE)
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(now=st.tuples(coordinate, coordinate, coordinate), then=st.tuples(coordinate, coordinate, coordinate))
 def test_regions_in_space_are_exact(region, now, then) -> None:
     env = columns(now, then)
@@ -104,7 +104,7 @@ def test_regions_in_space_are_exact(region, now, then) -> None:
     )
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(now=places, then=places)
 def test_a_polygon_that_is_not_convex(now, then) -> None:
     """Exact where it is satisfied, and of the right sign everywhere."""
@@ -118,7 +118,7 @@ def test_a_polygon_that_is_not_convex(now, then) -> None:
             assert found < 1e-9
 
 
-@settings(max_examples=40)
+@settings(max_examples=24)
 @given(now=places, then=places)
 def test_unions_and_intersections(now, then) -> None:
     env = columns(now, then)
@@ -132,7 +132,7 @@ def test_unions_and_intersections(now, then) -> None:
     assert robustness(f"sweep(p) in {outside}", env) == robustness(f"sweep(p) not in {either}", env)
 
 
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(st.lists(coordinate, min_size=1, max_size=6))
 def test_a_number_sweeps_a_range(values) -> None:
     env = {"x": np.array(values)[:, None]}

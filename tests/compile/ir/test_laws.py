@@ -68,7 +68,7 @@ def test_at_the_first_sample_the_clock_is_the_time_from_now(data: st.DataObject,
     laws.check_clock(data.draw, env)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(formulas() | formulas(held=()), short)
 def test_a_compiled_formula_has_the_robustness_of_the_definition(
     formula: Formula, env: dict[str, Any]

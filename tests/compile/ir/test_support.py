@@ -40,7 +40,7 @@ def test_columns_of_conditions_inside_numbers() -> None:
     assert columns_in(ir.Temporal("always", ir.Window(0, 1), ir.Predicate(num))) == {"p", "q", "a"}
 
 
-@settings(max_examples=75)
+@settings(max_examples=36)
 @given(formulas(bounded_only=True), traces(high=24))
 def test_nothing_beyond_the_reach_is_read(formula: typed.Formula, env: dict[str, np.ndarray]) -> None:
     """A bounded formula has a value exactly where its reach fits, and samples beyond do not change it."""

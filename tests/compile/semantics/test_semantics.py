@@ -94,7 +94,7 @@ def plain(x: np.ndarray | torch.Tensor) -> np.ndarray:
 
 
 @pytest.mark.parametrize("semantics", SOUND, ids=lambda s: type(s).__name__)
-@settings(max_examples=30)
+@settings(max_examples=18)
 @given(formulas(truth=False), traces(high=16))
 def test_sound_semantics_keep_the_sign(semantics: Semantics, formula: typed.Formula, env: Env) -> None:
     node = lower(formula, GRID, [])

@@ -78,7 +78,7 @@ KINDS = st.sampled_from(["revolute", "continuous", "prismatic", "fixed"])
 CHAINS = st.lists(st.tuples(KINDS, TRIPLES, st.tuples(ANGLES, ANGLES, ANGLES), AXES), min_size=1, max_size=6)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=18)
 @given(CHAINS, st.integers(0, 1000))
 def test_an_unrolled_chain_is_the_product_of_its_transforms(joints: list, seed: int) -> None:
     found = chain(urdf(joints), f"l{len(joints)}")

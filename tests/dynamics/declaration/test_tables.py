@@ -49,7 +49,7 @@ def program(decl: TableDecl) -> ArrayProgram:
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=24, deadline=None)
 @given(st.lists(POINTS, min_size=1, max_size=2), st.sampled_from(("linear", "hold")), st.integers(0, 99))
 def test_values_are_what_scipy_interpolates(
     points: list[tuple[float, ...]], extrapolate: str, seed: int

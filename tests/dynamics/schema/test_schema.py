@@ -137,7 +137,7 @@ def test_a_system_is_found_by_name(monkeypatch: pytest.MonkeyPatch, car: System)
     assert System.load("car.yaml").decl.hash == car.decl.hash
 
 
-@settings(max_examples=75)
+@settings(max_examples=36)
 @given(st.data())
 def test_damaged_files_give_diagnostics_and_nothing_else(data: st.DataObject) -> None:
     text = GOOD

@@ -203,7 +203,7 @@ def texts(draw: st.DrawFn) -> bytes:
 @pytest.mark.usefixtures("reader")
 def test_large_tables_are_read_like_small_ones(choose: Callable[[int], None]) -> None:
     @given(texts(), WANTED)
-    @settings(deadline=None, max_examples=150)
+    @settings(deadline=None, max_examples=60)
     def agree(data: bytes, wanted: Wanted) -> None:
         choose(NEVER)
         careful = outcome(data, wanted)
@@ -215,7 +215,7 @@ def test_large_tables_are_read_like_small_ones(choose: Callable[[int], None]) ->
 
 def test_blocks_that_numpy_reads_are_read_like_others(monkeypatch: pytest.MonkeyPatch) -> None:
     @given(texts(), WANTED)
-    @settings(deadline=None, max_examples=150)
+    @settings(deadline=None, max_examples=60)
     def agree(data: bytes, wanted: Wanted) -> None:
         usual = outcome(data, wanted)
         with monkeypatch.context() as patch:

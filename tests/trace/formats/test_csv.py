@@ -232,7 +232,7 @@ def test_columns_that_are_not_read_refuse_nothing(tmp_path: Path) -> None:
         st.lists(st.sampled_from(["1", "-2.5", "", "NA", '"4"', '"a\nb"', "# x"]), min_size=2, max_size=2)
     )
 )
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_pieces_are_the_whole(tmp_path: Path, rows: list[list[str]]) -> None:
     body = "".join(f"{k},{','.join(row)}\n" for k, row in enumerate(rows))
     path = table(tmp_path / "a.csv", f"t,v,w\n0,1,x\n{body}")

@@ -436,7 +436,7 @@ def whole_73(path: Path) -> None:
 @given(
     cut=st.integers(0, 200), flips=st.lists(st.tuples(st.integers(0, 10**5), st.integers(0, 255)), max_size=4)
 )
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=18, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damage_is_a_diagnostic_or_harmless(
     tmp_path: Path, write: Callable[[Path], None], cut: int, flips: list[tuple[int, int]]
 ) -> None:

@@ -278,7 +278,7 @@ def written(
 
 
 @given(structures(), st.integers(0, 999), st.sampled_from(["cdr", "ros1"]), st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_part_is_the_same_whether_or_not_the_rest_is_read(
     fields: list[tuple[Any, str, str]], seed: int, form: ros.Form, data: st.DataObject
 ) -> None:

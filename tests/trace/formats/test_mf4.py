@@ -122,7 +122,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 @given(
     cut=st.integers(0, 900), flips=st.lists(st.tuples(st.integers(0, 10**4), st.integers(0, 255)), max_size=4)
 )
-@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damage_is_a_diagnostic_or_harmless(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
     whole = tmp_path / "whole.mf4"
     if not whole.exists():

@@ -133,7 +133,7 @@ def test_definitions_that_expand_without_end(tmp_path: Path, formats: list[str])
 @given(
     cut=st.integers(0, 600), flips=st.lists(st.tuples(st.integers(0, 10**4), st.integers(0, 255)), max_size=4)
 )
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=24, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damage_is_a_diagnostic_or_harmless(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
     raw = bytearray(a_log()[: -cut or None])
     for at, value in flips:

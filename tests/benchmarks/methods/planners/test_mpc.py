@@ -138,7 +138,7 @@ _formulas = st.recursive(
 
 
 @given(text=_formulas, seed=st.integers(0, 1000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=18, deadline=None)
 def test_conditions_agree_with_the_exact_robustness(boat: System, text: str, seed: int) -> None:
     """The least of the conditions is the robustness, up to what is rounded; no dynamics are off."""
     task = task_of(boat, text)

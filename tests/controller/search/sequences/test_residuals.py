@@ -61,7 +61,7 @@ FORMULAS = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(FORMULAS, st.lists(st.sampled_from([-1.0, 1.0]), min_size=20, max_size=20), st.integers(0, STEPS - 1))
 def test_a_continuation_that_meets_the_residual_meets_the_formula(
     formula: ir.Formula, values: list[float], now: int
