@@ -26,7 +26,7 @@ from stlc.toolchain import compiler
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs a C compiler")
 
-EXAMPLES = int(os.environ.get("STLC_CASES", "2"))
+EXAMPLES = int(os.environ.get("STLC_CASES", "1"))
 SPEC = """spec demo
 signal x
 signal y

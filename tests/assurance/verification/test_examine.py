@@ -77,7 +77,8 @@ def batch(mode: int, width: float, count: int = 60, *, dive: bool = False) -> Bo
         (1, False),
         pytest.param(3, False, marks=pytest.mark.apart),
         pytest.param(6, False, marks=pytest.mark.apart),
-        (6, True),
+        (3, True),
+        pytest.param(6, True, marks=pytest.mark.apart),
     ],
 )
 def test_the_boxes_of_a_result_cover_the_batch(mode: int, dive: bool) -> None:
