@@ -57,8 +57,15 @@ def said(program: Path, rows: np.ndarray, names: tuple[str, ...]) -> list[tuple[
     return [(float(low), float(high)) for low, high in words]
 
 
-@pytest.mark.parametrize("language", [("-std=c99",), ("-x", "c++", "-std=c++17")])
-@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize(
+    ("language", "single"),
+    [
+        (("-std=c99",), False),
+        (("-x", "c++", "-std=c++17"), True),
+        pytest.param(("-std=c99",), True, marks=pytest.mark.apart),
+        pytest.param(("-x", "c++", "-std=c++17"), False, marks=pytest.mark.apart),
+    ],
+)
 def test_a_monitor_is_built_without_warnings_and_says_what_python_says(
     tmp_path: Path, language: tuple[str, ...], single: bool
 ) -> None:

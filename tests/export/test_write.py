@@ -52,7 +52,7 @@ def build_in_cpp(folder: Path) -> Path:
     [
         ("traffic", "car", True),
         pytest.param("traffic", "car", False, marks=pytest.mark.apart),
-        ("ship_safe", "ship_safe", True),
+        pytest.param("ship_safe", "ship_safe", True, marks=pytest.mark.apart),
     ],
 )
 def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: bool, tmp_path: Path) -> None:
@@ -127,7 +127,9 @@ def test_the_c_controller_advances_what_a_mission_adds(tmp_path: Path) -> None:
 
 
 @compiled
-@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize(
+    "sampling", [SAMPLINGS[0], *(pytest.param(each, marks=pytest.mark.apart) for each in SAMPLINGS[1:])]
+)
 def test_the_c_controller_tries_the_same_sample(sampling: str, tmp_path: Path) -> None:
     run = run_of("traffic", "car", tmp_path)
     system = run.task.system
