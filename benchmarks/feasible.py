@@ -18,8 +18,9 @@ from torch import Tensor
 from benchmarks.store import Key, Result, ResultStore, load
 from benchmarks.training import benchmark_order, judged_states, pack, unpack
 from stlc.cli.framework.output import say
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.evaluation.held_out import wilson
-from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT_SEED
 from stlc.controller.run.run import Run
 from stlc.controller.search.local_search import Searcher

@@ -14,7 +14,8 @@ from benchmarks.store import BENCHMARKS
 from benchmarks.timing import interleaved
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.controller.problem.task import Task, rank, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.objective import loss
@@ -128,7 +129,7 @@ def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
     def verdict() -> None:
         with torch.no_grad():
             judged = task.judge(states, plans.flatten(0, 1))
-            rank(judged.rho, task.cost(judged)).view(-1, count).argmax(1)
+            task.rank(judged, safety=False).view(-1, count).argmax(1)
 
     def gradient() -> None:
         value = loss(task, trainer.objective, x0, chosen).mean()

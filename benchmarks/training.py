@@ -15,13 +15,13 @@ from typing import Any
 
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
 from stlc.cli.framework.output import say
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.parallel import executor
 from stlc.controller.parallel.inputs import input_files
 from stlc.controller.parallel.jobs import Job
-from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
 from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED, Clock
 from stlc.controller.run.run import Run, spec_hash, system_hash
@@ -422,7 +422,7 @@ def collect(run: RunDir, *, cores: int | None = None) -> Result:
     """
     record = run.record()
     held = load_held_out(run)
-    solved = [] if held is None else [rho >= -TOLERANCE for rho in held.rho.tolist()]
+    solved = [] if held is None else [satisfied(rho) for rho in held.rho.tolist()]
     made = {key: record[key] for key in ("versions", "git", "hardware", "threads")}
     return {
         **record["result"],

@@ -34,6 +34,9 @@ from stlc.assurance.conformal import (
     parse_shift,
     tolerance_bound,
 )
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.semantics.kinds.exact import Exact
+from stlc.compile.semantics.tolerance import overall
 from stlc.jsontext import Num
 from stlc.monitor.judgement import RequirementVerdict, Status, Verdict
 
@@ -199,13 +202,14 @@ def together(judged: Sequence[Judged], weights: Mapping[str, float] | None = Non
     if len(judged) == 1:
         return replace(judged[0], name=ALL)
     with np.errstate(invalid="ignore"):
-        scaled = [each.robustness * factors.get(each.name, 1.0) for each in judged]
+        known = (factors.get(each.name, 1.0) for each in judged)
+        least = overall([each.robustness for each in judged], known, NUMPY, Exact())
     return Judged(
         ALL,
         "",
         np.logical_and.reduce([each.satisfied for each in judged]),
         np.logical_or.reduce([each.violated for each in judged]),
-        np.nan_to_num(np.minimum.reduce(scaled), nan=-np.inf, posinf=np.inf, neginf=-np.inf),
+        np.nan_to_num(least, nan=-np.inf, posinf=np.inf, neginf=-np.inf),
     )
 
 

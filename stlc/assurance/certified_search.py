@@ -19,8 +19,9 @@ import torch
 from torch import Tensor
 
 from stlc.assurance.verification.tubes import Tube, TubeModel
+from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir.support import columns_in
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
 from stlc.controller.guard.candidates import (
     POLICY,
     REPAIRED,
@@ -28,7 +29,7 @@ from stlc.controller.guard.candidates import (
     RobustnessMargins,
     best,
     finite,
-    rank,
+    first,
 )
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
@@ -156,7 +157,7 @@ class CertifiedSearch(GuardSearch):
         passes = found.satisfies
         rows = passes.nonzero()[:, 0]
         if len(rows):
-            passes[rows] = self._certifier.guaranteed(x[rows], found.plans[rows]) >= -TOLERANCE
+            passes[rows] = satisfied(self._certifier.guaranteed(x[rows], found.plans[rows]))
         return passes
 
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
@@ -186,17 +187,18 @@ class CertifiedSearch(GuardSearch):
         judged = Candidates.judged(self.task, x, plans, REPAIRED, cost=True)
         starts = x.repeat_interleave(choices, 0)
         low = self._certifier.guaranteed(starts, plans.flatten(0, 1)).view(agents, choices)
-        sure, usual = (low >= -TOLERANCE) & judged.is_safe, rank(judged)
+        sure, usual = satisfied(low) & judged.is_safe, judged.standing
         tier = torch.where(judged.is_safe, 1, 0)
         tier = torch.where(sure, torch.where(judged.satisfies, _CERTIFIED, 3), tier)
         rows = (tier < 3).all(1).nonzero()[:, 0]
         if len(rows):
             again = x[rows].repeat_interleave(choices, 0), plans[rows].flatten(0, 1)
             low[rows] = self._certifier.until_next(*again).view(-1, choices)
-            tier[rows] = torch.where((tier[rows] == 1) & (low[rows] >= -TOLERANCE), 2, tier[rows])
+            tier[rows] = torch.where((tier[rows] == 1) & satisfied(low[rows]), 2, tier[rows])
         bounded = (tier == 1) | (tier == 2)
         value = torch.where(tier == _CERTIFIED, -judged.cost, torch.where(bounded, low, usual))
-        choice = best(torch.ones_like(sure), (tier.to(x.dtype), value))
+        keys = (tier.to(x.dtype).t(), value.t())
+        choice = first(best(torch.ones_like(sure).t(), keys, TORCH))
         return judged.pick(choice), tier.gather(1, choice[:, None])[:, 0]
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stlc.assurance.drive_simulator import DriveSimulator
 from stlc.assurance.portfolio import Portfolio, Proposal
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied, violated
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, SimulationStep, Watch
 from stlc.controller.run.run import Run
@@ -55,7 +55,7 @@ class SearchedDrives:
     @property
     def failing(self) -> NDArray[np.bool_]:
         """True if each drive violates a requirement, (count, agents)."""
-        return np.asarray((self.margins < -TOLERANCE).any(2))
+        return np.asarray(violated(self.margins).any(2))
 
     @property
     def least(self) -> float:
@@ -211,7 +211,7 @@ def round_of(
     kept, ended = list[NDArray[np.float64]](), list[int]()
 
     def seen(recording: DeploymentRecording, margins: NDArray[np.float64]) -> None:
-        kept.append(wrong_states(recording, (margins < -TOLERANCE).any(2).reshape(-1), test.replan))
+        kept.append(wrong_states(recording, violated(margins).any(2).reshape(-1), test.replan))
         ended.append(int(simulator.inconclusive(recording).sum()))
 
     def watch(_step: SimulationStep) -> None:
@@ -246,7 +246,7 @@ def wrong_states(
         States, (k, n).
     """
     decided = np.arange(recording.steps) % replan == 0
-    wrong = ~(recording.policy_rho >= -TOLERANCE) & decided
+    wrong = ~satisfied(recording.policy_rho) & decided
     order = wrong.cumsum(1)
     chosen = wrong & (order <= np.where(failing, WRONG, WRONG // 4)[:, None])
     for row in np.flatnonzero(failing & wrong.any(1)):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.simulation import PARTS, Simulations
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import violated
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
 from stlc.controller.deployment.simulator import simulate as run_worlds
@@ -100,7 +100,7 @@ class DriveSimulator:
         inside = np.broadcast_to(_inside(verdict), (len(points) * self.setting.agents,))
         admissible: NDArray[np.bool_] = np.any(inside.reshape(len(points), -1), axis=1)
         open_ = np.array(verdict.requirements[requirement].statuses) == "inconclusive"
-        judged = (margins < -TOLERANCE) | ~open_.reshape(len(points), -1).any(1)
+        judged = violated(margins) | ~open_.reshape(len(points), -1).any(1)
         return Simulations(margins, admissible, judged)
 
     def drive(self, points: NDArray[np.float64], watch: Watch | None = None) -> DeploymentRecording:

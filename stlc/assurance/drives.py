@@ -12,7 +12,7 @@ from stlc.assurance.campaign import CertificateVerification, compared, seed_rang
 from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied, violated
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
@@ -89,7 +89,7 @@ def _judged_by_plans(task: Task, recording: DeploymentRecording) -> _Verdicts:
     """Verdicts by the specification of the plans; undecided where a drive ends before a window does."""
     found = executed_robustness(task, recording)
     judged = tuple(
-        Judged(rule.name, rule.unit, low >= -TOLERANCE, high < -TOLERANCE, low)
+        Judged(rule.name, rule.unit, satisfied(low), violated(high), low)
         for rule, (low, high) in ((rule, found[rule.name]) for rule in task.rules)
     )
     columns = dict(zip(task.system.names, np.moveaxis(recording.states, -1, 0).swapaxes(1, 2), strict=True))

@@ -19,7 +19,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import violated
 from stlc.controller.planning.traces import trace_of
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
@@ -263,7 +263,7 @@ def in_scope(task: Task, columns: Columns) -> NDArray[np.bool_]:
     scope = np.ones(next(iter(columns.values())).shape[1], dtype=np.bool_)
     for rule in task.compiled.assumptions:
         _, high = rule_bounds(rule, Record.of(columns, NUMPY), range(1), task.horizon, "open")
-        scope &= ~(high[0] < -TOLERANCE)
+        scope &= ~violated(high[0])
     return scope
 
 

@@ -30,7 +30,7 @@ from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.native import motion_of
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
-from stlc.dynamics.model.controls import raw_width
+from stlc.dynamics.model.controls import SQUASHES, raw_width
 from stlc.dynamics.model.step import commands
 from stlc.escape import c_comment, c_string
 from stlc.export.description import (
@@ -42,6 +42,7 @@ from stlc.export.description import (
     observation,
     state_images,
 )
+from stlc.runtime.decision import TIE
 from stlc.runtime.prefixes import generators
 
 if TYPE_CHECKING:
@@ -199,15 +200,10 @@ def squashed(controls: Sequence[ControlDecl]) -> list[str]:
     lines, at = [], 0
     for i, each in enumerate(controls):
         middle, half = literal((each.low + each.high) / 2), literal((each.high - each.low) / 2)
-        match each.squash:
-            case "tanh":
-                unit, width = f"tanhf(raw[{at}])", 1
-            case "clip":
-                unit, width = f"MIN(MAX(raw[{at}], -1.0f), 1.0f)", 1
-            case "angle":
-                unit, width = f"atan2f(raw[{at + 1}], raw[{at}] + 1e-6f) / (float)PI", 2
+        kind = SQUASHES[each.squash]
+        unit = kind.c.format(*(f"raw[{at + k}]" for k in range(kind.outputs)))
         lines.append(f"u[{i}] = (float){middle} + {unit} * (float){half};")
-        at += width
+        at += kind.outputs
     return lines
 
 
@@ -285,9 +281,15 @@ def header(task: Task, network: PlanProposer) -> str:
     parts = _numbers(task, network) | {
         "HEAD": HEAD,
         "PASSES": "\n".join([*passes(motion, judged), *_falling(motion, falling)]),
+        "DECISION": decision(),
         "ROOM": max(judged.size, falling.size, 1),
     }
     return _template("controller.h.txt").substitute({name: str(value) for name, value in parts.items()})
+
+
+def decision() -> str:
+    """Return the C functions that rank plans and choose among them: `stlc.runtime.decision` in C."""
+    return _template("decision.c.txt").substitute(TIE=repr(TIE)).rstrip()
 
 
 def main_of(task: Task) -> str:

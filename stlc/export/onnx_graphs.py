@@ -7,7 +7,7 @@ previous plans.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
@@ -17,12 +17,13 @@ from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numb
 from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_in
-from stlc.compile.semantics.tolerance import TOLERANCE, weighed
+from stlc.compile.semantics.kinds.exact import Exact
+from stlc.compile.semantics.tolerance import overall, satisfied, violated
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
-from stlc.controller.problem.task import TIE, Task
+from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
-from stlc.dynamics.model.controls import EPS, raw_width
+from stlc.dynamics.model.controls import raw_width, shares
 from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.description import (
@@ -33,6 +34,7 @@ from stlc.export.description import (
     observation,
     state_images,
 )
+from stlc.runtime.decision import rank
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -186,8 +188,7 @@ def proposed(task: Task, network: PlanProposer, state: Mapping[str, Value]) -> V
         index = ONNX_OPS.clamp(begun + steps, 0.0, task.horizon - 1.0).cast("int64")
         index = index.expand(*raw.shape, like=next(iter(state.values())))
         (raw,) = raw.sheet.emit("GatherElements", (raw, index), [raw.shape], raw.kind, {"axis": 2})
-    columns = iter(raw.transposed(3, 0, 1, 2).rows())
-    controls = {each.name: _squashed(each, columns) for each in task.system.decl.controls}
+    controls = _squashed(task.system.decl.controls, raw.transposed(3, 0, 1, 2).rows())
     if swapped is not None:
         mask = swapped.reshaped(1, BATCH, 1, 1)
         images = assigned(control_images(task), controls)
@@ -211,11 +212,11 @@ def _closed_loop(task: Task, network: ClosedLoopActor, state: Mapping[str, Value
     ) -> tuple[Sequence[Value], Sequence[Value]]:
         env = {name: value.on(sheet) for name, value in state.items()} | dict(zip(moving, now, strict=True))
         seen = joined([_observed(task, env), rows[0].expand(1, BATCH, like=now[0])])
-        columns = iter(_layers(network, seen.T.cast("float32")).T.rows())
-        actions = {}
-        for each in network.outputs:
-            action = _squashed(each, columns).cast("float64")
-            actions[each.name] = ONNX_OPS.clamp(action, each.low, each.high)
+        raw = _squashed(network.outputs, _layers(network, seen.T.cast("float32")).T.rows())
+        actions = {
+            each.name: ONNX_OPS.clamp(raw[each.name].cast("float64"), each.low, each.high)
+            for each in network.outputs
+        }
         env |= actions
         for program in programs:
             env.update(program(env, ONNX))
@@ -273,21 +274,12 @@ def _weights(like: Value, tensor: Tensor) -> Value:
     return like.sheet.constant(tensor.detach().numpy(force=True), "float32")
 
 
-def _squashed(control: ControlDecl, columns: Iterator[Value]) -> Value:
-    """Values of one control in physical units, from the next columns of the network's output.
-
-    An angle takes two columns, as the direction of a vector; any other control takes one.
-    """
-    first = next(columns)
-    match control.squash:
-        case "tanh":
-            unit = first.apply("Tanh")
-        case "clip":
-            unit = ONNX_OPS.clamp(first, -1.0, 1.0)
-        case "angle":
-            unit = ONNX_OPS.atan2(next(columns), first + EPS) / math.pi
-    scaled: Value = unit * ((control.high - control.low) / 2) + (control.low + control.high) / 2
-    return scaled
+def _squashed(controls: Sequence[ControlDecl], raw: Sequence[Value]) -> dict[str, Value]:
+    """Values of controls in physical units, by name, from the columns of the network's output."""
+    return {
+        each.name: share * ((each.high - each.low) / 2) + (each.low + each.high) / 2
+        for each, share in zip(controls, shares(raw, tuple(controls), ONNX), strict=True)
+    }
 
 
 # -------------------------------------------------------------------------------------------- verdicts
@@ -358,7 +350,8 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
     """
     if not rules:
         return like.sheet.constant([[math.inf]]).expand(1, BATCH, like=like)
-    least: Value = ONNX_OPS.join([weighed(each[rule.name], rule.factor, ONNX) for rule in rules], "min")
+    factors = (rule.factor for rule in rules)
+    least: Value = overall([each[rule.name] for rule in rules], factors, ONNX, Exact())
     return least
 
 
@@ -385,23 +378,6 @@ def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
     shape = tuple(1 if place in axes else length for place, length in enumerate(x.shape))
     (out,) = x.sheet.emit(op, (x, x.sheet.constant(axes, "int64")), [shape], x.kind, {"keepdims": 1})
     return out
-
-
-def rank(found: Verdicts) -> Value:
-    """Rank of plans, (1, batch); a plan with a larger rank is better.
-
-    The rank is equal to that of `stlc.controller.problem.task.rank`.
-    """
-    rho, cost = found.rho, found.cost
-    unknown = cost.apply("IsNaN", kind="bool")
-    paid = ONNX_OPS.clamp(ONNX_OPS.where(unknown, 0.0, cost), 0.0, None)
-    cheap = ONNX_OPS.where(unknown, 0.0, 1.0 / (1.0 + paid))
-    size = rho.apply("Abs")
-    poor = ONNX_OPS.where(ONNX_OPS.gt(math.inf, size), rho / (1.0 + size), -1.0) + cheap * TIE
-    poor = ONNX_OPS.where(ONNX_OPS.ge(found.safe, -TOLERANCE), poor, poor - 2.0)
-    good = ONNX_OPS.both(ONNX_OPS.ge(rho, -TOLERANCE), unknown.apply("Not"))
-    score: Value = ONNX_OPS.where(good, 1.0 + cheap, poor)
-    return score
 
 
 # ------------------------------------------------------------------------ cost
@@ -523,7 +499,7 @@ def following(task: Task, network: PlanProposer) -> dict[str, Value]:
     better = ONNX_OPS.ge(rest["rank"], policy["rank"])
     if task.pending_goals.items:
         better = ONNX_OPS.either(better, rest["deepened"])
-    kept = ONNX_OPS.both(better, ONNX_OPS.ge(rest["rho"], -TOLERANCE))
+    kept = ONNX_OPS.both(better, satisfied(rest["rho"]))
     chosen = {
         name: ONNX_OPS.where(kept.reshaped(BATCH, *[1] * (len(own.shape) - 1)), rest[name], own)
         for name, own in _shown(policy).items()
@@ -554,7 +530,7 @@ def _varied(task: Task, network: PlanProposer, state: Value, policy: Mapping[str
         plans = joined([plan, (plan + changes).apply("Max", low).apply("Min", high)], axis=1)
         table = _table(task, state.on(sheet), plans)
         better = _picked(table, _best(table["rank"]))
-        good = ONNX_OPS.ge(own["rho"], -TOLERANCE)
+        good = satisfied(own["rho"])
         return [
             ONNX_OPS.where(good.reshaped(BATCH, *[1] * (len(own[name].shape) - 1)), own[name], better[name])
             for name in names
@@ -564,7 +540,7 @@ def _varied(task: Task, network: PlanProposer, state: Value, policy: Mapping[str
         return [policy[name].on(sheet).apply("Identity") for name in names]
 
     least = _reduced("ReduceMin", policy["rho"], (0,))
-    fails = least.apply("Less", -TOLERANCE, kind="bool").reshaped()
+    fails = violated(least).reshaped()
     found = state.sheet.branched(fails, changed, as_proposed)
     return dict(zip(names, found, strict=True))
 
@@ -581,7 +557,8 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
     each = state.T.reshaped(len(names), BATCH, 1).expand(len(names), BATCH, count, like=state.T)
     starts = dict(zip(names, each.reshaped(len(names), BATCH).rows(), strict=True))
     found = judged(task, starts, plans.reshaped(BATCH, steps, controls))
-    rows = {"rank": rank(found), "rho": found.rho, "safe": found.safe, "cost": found.cost}
+    rows = {"rho": found.rho, "safe": found.safe, "cost": found.cost}
+    rows["rank"] = rank(found.rho, found.cost, found.safe, ONNX)
     if task.pending_goals.items:
         rows["deepened"] = deepened(task, found.states)
     table = {name: row.reshaped(BATCH, count) for name, row in rows.items()}

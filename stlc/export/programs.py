@@ -18,10 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.candidates import best, finite, grid_of
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.guard.candidates import finite, first, grid_of
 from stlc.controller.guard.safe_prefix import prefix_robustness
-from stlc.controller.problem.task import PlanVerdicts, Task, rank
+from stlc.controller.problem.task import PlanVerdicts, Task
+from stlc.runtime.decision import acceptable, continued, longest
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Deciding(nn.Module):
             return plan, rho, safe, each
         found = self._best(x, self.network.with_changes(plan))
         pairs = zip((plan, rho, safe, each), found, strict=True)
-        good = rho >= -TOLERANCE
+        good = satisfied(rho)
         plan, rho, safe, each = (
             torch.where(good.view(-1, *[1] * (own.dim() - 1)), own, other) for own, other in pairs
         )
@@ -68,7 +69,7 @@ class Deciding(nn.Module):
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
         flat = plans.reshape(-1, steps, controls)
         judged = judged_by_torch(self._task, starts, flat)
-        score = rank(judged.rho, self._task.cost(judged), judged.safe).view(-1, count)
+        score = self._task.rank(judged).view(-1, count)
         rows = (flat, judged.rho, judged.safe, judged.requirements)
         split = [row.reshape(-1, count, *row.shape[1:]) for row in rows]
         plan, rho, safe, each = _picked(split, score.argmax(1))
@@ -175,12 +176,11 @@ class Guarding(nn.Module):
         for length, prefixes in zip(self.grid.lengths, self._prefixes, strict=True):
             last = length == self.grid.lengths[-1]
             tried = self._tried(x, own, prefixes, falls=last)
-            good = tried.rho >= -TOLERANCE
-            allowed = torch.where(good.any(1, keepdim=True), good, tried.safe >= -TOLERANCE)
-            done = allowed.any(1)
-            pick = best(allowed, (tried.rho, -tried.cost))
+            rho, safe, cost = tried.rho.t(), tried.safe.t(), tried.cost.t()
+            done = acceptable(rho, safe, TORCH).any(0)
+            pick = first(continued(rho, safe, cost, TORCH))
             if tried.falls is not None:
-                pick = torch.where(done, pick, _safest(tried, tried.falls))
+                pick = torch.where(done, pick, first(longest(tried.falls.permute(2, 1, 0), rho, cost, TORCH)))
             rows = (tried.plans, tried.rho, tried.safe, tried.each)
             here = (*_picked(rows, pick), torch.where(done, 1, 2), torch.full_like(pick, length))
             found = here if not found else _earlier(decided, found, here)
@@ -223,20 +223,6 @@ class Guarding(nn.Module):
         if falls:
             rows.append(prefix_robustness(self._formulas, judged.columns).t())
         return [row.reshape(-1, count, *row.shape[1:]) for row in rows]
-
-
-def _safest(tried: _Tried, falls: Tensor) -> Tensor:
-    """Index, for each state, of the plan that keeps the safety requirements for the longest time.
-
-    `falls` (states, choices, T + 1) is the robustness of the safety requirements on every first part of each
-    plan in `tried`. Among plans that keep them equally long, the one with the highest robustness is chosen.
-    Ties are decided by the smaller safety violation (mean of `falls`, in which positive values count as 0),
-    then by the smaller cost.
-    """
-    samples = (falls >= -TOLERANCE).sum(2)
-    depth = falls.clamp(max=0.0).mean(2)
-    longest = samples == samples.amax(1, keepdim=True)
-    return best(longest, (tried.rho, depth, -tried.cost))
 
 
 def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:

@@ -16,7 +16,7 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.search import StagedSearch
-from stlc.controller.problem.task import Task, rank
+from stlc.controller.problem.task import Task
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.export.programs import without_deprecations
 from stlc.registry import GUARDS
@@ -150,7 +150,7 @@ def _compared(task: Task, x: Tensor, plan: Tensor, answer: Answer, within: Close
     width = (task.system.control_high - task.system.control_low).double()
     far = ((exported - plan).abs() / width).amax((1, 2))
     again = task.judge(x, exported)
-    score = [rank(one.rho, task.cost(one), one.safe) for one in (judged, again)]
+    score = [task.rank(one) for one in (judged, again)]
     same = far <= within.plan
     ties = ~same & ((score[0] - score[1]).abs() <= within.plan)
     pairs = ((answer.rho, again.rho), (answer.safe, again.safe), (answer.each, again.requirements))

@@ -12,10 +12,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.environments import MOST, Environments, Transition
 from stlc.controller.problem.environments import Reward as EpisodeReward
 from stlc.controller.problem.load import load_task, require_controls
-from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.world import ModelWorld
 from stlc.diagnostics import usage
 from stlc.gym.pictures import MODES, Picture, Pictures, RenderMode, snapshot

@@ -14,7 +14,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import Horizon
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics, semantics_of
-from stlc.compile.semantics.tolerance import TOLERANCE, End, weighed
+from stlc.compile.semantics.tolerance import TOLERANCE, End, overall
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.jsontext import Num
 from stlc.monitor.facts.extent import samples_read
@@ -460,7 +460,7 @@ class Verdict:
     def __repr__(self) -> str:
         status = self.scoped
         chosen = [each for each in self if each.overall == status] or list(self.requirements)
-        worst = min(chosen, key=lambda each: float(each.low.min()) * each.rule.factor)
+        worst = worst_of(chosen)
         count = f"{len(chosen)} of {len(self.requirements)}" if status != "satisfied" else f"{len(chosen)}"
         traces = f" on {self.traces:,} traces" if self.traces > 1 else ""
         return f"Verdict({status}: {count}{traces} · {worst.name} {worst.brief})"
@@ -688,12 +688,17 @@ class Verdict:
         return self.statuses.count("satisfied")
 
 
+def worst_of(found: Iterable[RequirementVerdict]) -> RequirementVerdict:
+    """Return the verdict with the least weighted lower bound on its robustness."""
+    return min(found, key=lambda each: float(each.low.min()) * each.rule.factor)
+
+
 def overall_robustness(
     found: Sequence[RequirementVerdict], shape: tuple[int, ...], semantics: Semantics | None = None
 ) -> Any:
     """Return the least `weight * robustness / scale` of requirements: a float, or an array of a shape."""
-    rows = [weighed(each.least[None], each.rule.factor, NUMPY) for each in found]
-    return _shaped((semantics or semantics_of()).join(rows, "min", NUMPY)[0], shape)
+    rows, factors = [each.least[None] for each in found], (each.rule.factor for each in found)
+    return _shaped(overall(rows, factors, NUMPY, semantics or semantics_of())[0], shape)
 
 
 def beside(moment: str, start: str) -> str:

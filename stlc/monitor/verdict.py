@@ -18,7 +18,7 @@ from stlc.compile.ir.traverse import numbers
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.semantics.semantics import Semantics, semantics_of
-from stlc.compile.semantics.tolerance import TOLERANCE, End, weighed
+from stlc.compile.semantics.tolerance import TOLERANCE, End, overall, satisfied, violated
 from stlc.diagnostics import SpecError, TraceError, usage
 from stlc.files import read_source
 from stlc.grammar import ast
@@ -357,8 +357,8 @@ def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
 def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
     """The least `weight * robustness / scale` over the requirements, in the shape of the signals."""
     ops = ready.signals.ops
-    rows = zip(ready.rules, _rows(ready, end, at), strict=True)
-    whole = ready.record.semantics.join([weighed(row, rule.factor, ops) for rule, row in rows], "min", ops)
+    factors = (rule.factor for rule in ready.rules)
+    whole = overall(_rows(ready, end, at), factors, ops, ready.record.semantics)
     return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
 
 
@@ -413,7 +413,7 @@ def _judge(
     if deciding is not rule:
         record = record_of(deciding, ready, part)
         least, most = outer(*rule_bounds(deciding, record, starts, ready.horizon, ends))
-    holds, fails = least >= -tolerance, most < -tolerance
+    holds, fails = satisfied(least, tolerance), violated(most, tolerance)
     start = part.first + starts.start
     where = (ready.signals.shape, part, ready.timeline, tolerance)
     return RequirementVerdict(rule, start, low, high, holds, fails, *where, subject=ready)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.runtime.decision import acceptable, continued, longest
 from stlc.runtime.facts import ControllerQuantity
 from stlc.runtime.graphs import Graphs, JudgedPlans, Numbers, joined
 
@@ -55,10 +55,8 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
     candidates = None
     for length in grid.lengths:
         candidates = joined([_candidates(graphs, x, own, length), *previous])
-        good = candidates.rho >= -TOLERANCE
-        allowed = good if good.any() else candidates.safe >= -TOLERANCE
-        if allowed.any():
-            pick = best(allowed, (candidates.rho, -candidates.cost))
+        if acceptable(candidates.rho, candidates.safe, NUMPY).any():
+            pick = int(continued(candidates.rho, candidates.safe, candidates.cost, NUMPY).argmax())
             return Found(candidates.of([pick]), BACKUP, length)
     if candidates is None:
         return Found(graphs.judged(x[None], own[None])[0], SAFEST, 0)
@@ -99,22 +97,7 @@ def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
             for plans in (candidates.plan[at : at + size] for at in range(0, len(candidates.plan), size))
         ]
     )
-    samples = (falls >= -TOLERANCE).sum(1)
-    depth = np.minimum(falls, 0.0).mean(1)
-    return best(samples == samples.max(), (candidates.rho, depth, -candidates.cost))
-
-
-def best(allowed: NDArray[np.bool_], keys: Sequence[Numbers]) -> int:
-    """Index of the best of the allowed choices.
-
-    `allowed`: mask of the choices, (choices,). `keys`: arrays of values, (choices,) each; larger is better. A
-    later key decides between choices that are equal in all earlier ones, up to `TOLERANCE`. NaN is the
-    smallest value.
-    """
-    for key in keys:
-        value = np.where(allowed & ~np.isnan(key), key, -np.inf)
-        allowed = allowed & (value >= value.max() - TOLERANCE)
-    return int(allowed.argmax())
+    return int(longest(falls.T, candidates.rho, candidates.cost, NUMPY).argmax())
 
 
 def finite(plans: Numbers, controls: Sequence[ControllerQuantity]) -> Numbers:

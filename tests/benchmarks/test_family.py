@@ -18,7 +18,8 @@ from benchmarks.table import Table
 from benchmarks.tables.family import COLUMNS, FAMILIES, Family, Row, section
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place
-from stlc.controller.problem.task import Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT_SEED
 from stlc.controller.run.run import Run
 from stlc.controller.training.launch import Launch, open_folder

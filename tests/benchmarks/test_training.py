@@ -41,9 +41,9 @@ from benchmarks.training import (
     unpack,
 )
 from stlc.cli.framework.app import main
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.parallel.jobs import Job, JobResult
-from stlc.controller.problem.task import satisfied
 from stlc.controller.run.config import HELD_OUT_SEED
 from stlc.controller.run.run import Run
 from stlc.controller.training.launch import Launch, open_folder

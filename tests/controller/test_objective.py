@@ -19,7 +19,8 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_resolved, resolve_for
 from stlc.compile.semantics.switch import Hard, Tanh
-from stlc.controller.problem.task import Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import VIOLATION, Objective, guided_objective, loss, paper_objective
 from stlc.diagnostics import SpecError
 from stlc.dynamics.load import parse_system

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from stlc import native
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.deployment.simulator import Setting
 from stlc.controller.evaluation.archive import save_trace_of
 from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.problem.native import NativeJudge
-from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder

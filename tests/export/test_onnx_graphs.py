@@ -15,7 +15,7 @@ from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import substitute
 from stlc.compile.semantics.switch import Hard
-from stlc.controller.problem.task import satisfied
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rolled

@@ -383,6 +383,23 @@ class FormOps(FloatConstants):
         """Arc tangent."""
         return _bounded(arctan(x), INTERVALS.atan(x.range))
 
+    def atan2(self, a: Operand, b: Operand) -> Forms:
+        """Direction of the point (b, a), from -pi to pi; all directions where the point may be near the cut.
+
+        Around the direction of the centre it is the arc tangent of the part across by the part along.
+        """
+        plain = self._by_range("atan2", a, b)
+        if not (isinstance(a, Forms) and isinstance(b, Forms)):
+            return plain
+        size = np.maximum(np.hypot(b.centre, a.centre), 1e-300)
+        cosine, sine = b.centre / size, a.centre / size
+        along = self.add(b.times(cosine), a.times(sine))
+        across = self.sub(a.times(cosine), b.times(sine))
+        turned = self.add(arctan(self.div(across, along)), Forms.point(np.arctan2(sine, cosine)))
+        bound = turned.range
+        good = (along.range.low > 0.0) & (bound.low > -np.pi) & (bound.high < np.pi)
+        return picked(good, turned, plain)
+
     def floor(self, x: Forms) -> Forms:
         """Next whole number below."""
         return self._rounded("floor", x, -0.5)

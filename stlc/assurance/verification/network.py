@@ -17,11 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from stlc.assurance.verification.forms import FORMS, SLACK, Floats, Forms, arctan, picked, tanh
+from stlc.assurance.verification.forms import FORMS, SLACK, Floats, Forms
 from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import usage
-from stlc.dynamics.model.controls import EPS, raw_width
+from stlc.dynamics.model.controls import raw_width, shares
 
 UNIT = 2.0**-24
 """Relative rounding error of one operation in float32."""
@@ -208,22 +208,12 @@ class PlanBounds:
 
     def _squashed(self, raw: Sequence[Forms]) -> list[Forms]:
         """Controls of one step in physical units."""
-        found, given = [], iter(raw)
         half, middle = 0.5 * (self._high - self._low), 0.5 * (self._high + self._low)
         error = (
             16.0 * UNIT * (np.abs(middle) + half)
         )  # functions within 4 units of the last place, and the map
-        for i, control in enumerate(self._controls):
-            first = next(given)
-            match control.squash:
-                case "tanh":
-                    share = tanh(first)
-                case "clip":
-                    share = FORMS.clamp(first, -1.0, 1.0)
-                case _:
-                    share = _direction(FORMS.add(first, EPS), next(given)).times(1.0 / np.pi)
-            found.append(share.times(half[i]).widened(middle[i], error[i]))
-        return found
+        found = shares(raw, self._controls, FORMS)
+        return [share.times(half[i]).widened(middle[i], error[i]) for i, share in enumerate(found)]
 
     def _inputs(self, observed: Sequence[Forms], symbols: int) -> Forms:
         x = joined(observed, symbols)
@@ -234,22 +224,6 @@ class PlanBounds:
             (x.rest + error) / self._spread,
         )
         return own_symbols(found)
-
-
-def _direction(x: Forms, y: Forms) -> Forms:
-    """Direction of the point (x, y), from -pi to pi; all directions where the point may be near the cut.
-
-    Around the direction of the centre it is the arc tangent of the part across by the part along.
-    """
-    plain = FORMS.atan2(y, x)
-    size = np.maximum(np.hypot(x.centre, y.centre), 1e-300)
-    cosine, sine = x.centre / size, y.centre / size
-    along = FORMS.add(x.times(cosine), y.times(sine))
-    across = FORMS.sub(y.times(cosine), x.times(sine))
-    turned: Forms = FORMS.add(arctan(FORMS.div(across, along)), Forms.point(np.arctan2(sine, cosine)))
-    bound = turned.range
-    good = (along.range.low > 0.0) & (bound.low > -np.pi) & (bound.high < np.pi)
-    return picked(good, turned, plain)
 
 
 def _array(tensor: torch.Tensor) -> Floats:

@@ -363,8 +363,8 @@ def _replayed(
 ) -> Answer[FalsifiedSystem | ReplayedCounterexample | ReplayedFinding]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
     from stlc.assurance.falsified import ReplayedCounterexample, StoredFinding
-    from stlc.compile.semantics.tolerance import TOLERANCE
-    from stlc.monitor.judgement import require_known
+    from stlc.compile.semantics.tolerance import violated
+    from stlc.monitor.judgement import require_known, status_of
     from stlc.trace import load_trace
 
     stored = _stored(path)
@@ -381,8 +381,8 @@ def _replayed(
     index = simulator.requirements.index(stored.requirement)
     outcome = simulator.simulate(point[None], index)
     margin, inside = float(outcome.margins[0]), bool(outcome.admissible[0])
-    violated, judged = inside and margin < -TOLERANCE, not inside or bool(outcome.judged[0])
-    verdict: Any = "violated" if violated else "satisfied" if judged else "inconclusive"
+    broken, judged = inside and violated(margin), not inside or bool(outcome.judged[0])
+    verdict: Any = status_of(broken, judged)
     if getattr(simulator, "findings", ()):
         before = StoredFinding(f"a violation of {stored.requirement}", "", given, stored.point)
         return findings.replayed(_plant_of(simulator, path), point, before)
@@ -397,7 +397,7 @@ def _replayed(
         same = "the trace is the same, bit for bit" if not different else f"different: {', '.join(different)}"
         emit(f"{stored.requirement}: {shown}, robustness {margin:.6g}; {same}")
 
-    return Answer(document, show, int(violated) if judged else INCONCLUSIVE)
+    return Answer(document, show, int(broken) if judged else INCONCLUSIVE)
 
 
 def _plant_of(simulator: _Simulator, path: Path) -> PlantSimulator:

@@ -17,7 +17,7 @@ from rich.text import Text
 from stlc.cli.check.text import percent, signed
 from stlc.cli.framework.output import table
 from stlc.compile.ir.traverse import margin_unit
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE, violated
 from stlc.controller.guard.candidates import SOURCES
 
 if TYPE_CHECKING:
@@ -155,12 +155,12 @@ class LiveView:
         room = width - label - sum(wide) - len("      │      ")
         half = min(max(room // 2, NARROW), HALF)
         found = []
-        for name, (value, agent, violated) in texts.items():
+        for name, (value, agent, count) in texts.items():
             high = float(margins[name].high.min())
             text = Text(f"  {name:<{label}}  ")
-            text.append(self._bar(name, high, half), style="red" if high < -TOLERANCE else "green")
+            text.append(self._bar(name, high, half), style="red" if violated(high) else "green")
             text.append(f"  {value:<{wide[0]}}  {agent:<{wide[1]}}")
-            text.append(f"  {violated}", style="red")
+            text.append(f"  {count}", style="red")
             text.rstrip()
             found.append(text)
         return found
@@ -215,7 +215,7 @@ class LiveView:
         units = (f"{column.name} {column.unit.text}".strip() for column in names)
         lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]
         for line, row in zip(lines[1:], rows, strict=True):
-            line.stylize("red" if least[row] < -TOLERANCE else "")
+            line.stylize("red" if violated(least[row]) else "")
         return lines
 
 

@@ -14,6 +14,7 @@ from stlc.cli.framework.options import parse_seeds
 from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics, table
 from stlc.diagnostics import usage
 from stlc.escape import operand, shell, visible
+from stlc.monitor.judgement import worst_of
 from stlc.registry import did_you_mean
 from stlc.units import parse_quantity, time_text
 
@@ -189,8 +190,7 @@ def _rows(plant: Plant, runs: Sequence[JudgedRun]) -> Iterator[tuple[str, ...]]:
         if run.verdict is None:
             yield str(run.seed), "FINDING", "", run.finding.reason if run.finding else "", point
             continue
-        factors, word = run.verdict.factors, run.verdict.scoped
-        worst = min(run.verdict, key=lambda each: float(each.low.min()) * factors[each.name])
+        word, worst = run.verdict.scoped, worst_of(run.verdict)
         low, high = (float(end.min()) for end in worst.margins)
         value = robustness_text(worst.statuses[0], low, high, float(worst.least[0]), worst.unit)
         yield str(run.seed), WORDS[word], worst.name, value, point

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from stlc.compile.namespace import Array, Ops
+    from stlc.compile.semantics.protocol import Semantics
 
 A = TypeVar("A")
 End: TypeAlias = Literal["open", "strict", "truncate"]
@@ -24,18 +30,34 @@ def tolerance_of(rho: Array) -> float:
     return FLOAT32_TOLERANCE if str(getattr(rho, "dtype", "")).endswith("float32") else TOLERANCE
 
 
-def satisfied(rho: A) -> A:
+@overload
+def satisfied(rho: float, tolerance: float | None = None) -> bool: ...
+@overload
+def satisfied(rho: NDArray[Any], tolerance: float | None = None) -> NDArray[np.bool_]: ...
+@overload
+def satisfied(rho: A, tolerance: float | None = None) -> A: ...
+def satisfied(rho: Any, tolerance: float | None = None) -> Any:
     """Return whether rho >= 0 up to rounding: rho >= -1e-6 in float64, rho >= -1e-5 in float32.
 
     Args:
-        rho: robustness, an array of any shape.
+        rho: robustness, a number or an array of any shape; NaN is not satisfied.
+        tolerance: another tolerance.
 
     Returns:
-        A boolean array of the same shape.
+        A boolean, or a boolean array of the same shape.
     """
-    values: Any = rho
-    verdict: A = values >= -tolerance_of(values)
-    return verdict
+    return rho >= -(tolerance_of(rho) if tolerance is None else tolerance)
+
+
+@overload
+def violated(rho: float, tolerance: float | None = None) -> bool: ...
+@overload
+def violated(rho: NDArray[Any], tolerance: float | None = None) -> NDArray[np.bool_]: ...
+@overload
+def violated(rho: A, tolerance: float | None = None) -> A: ...
+def violated(rho: Any, tolerance: float | None = None) -> Any:
+    """Return whether rho < 0 beyond rounding, as in `satisfied`; NaN is not violated either."""
+    return rho < -(tolerance_of(rho) if tolerance is None else tolerance)
 
 
 def weighed(rho: Array, factor: float, ops: Ops) -> Array:
@@ -54,4 +76,17 @@ def weighed(rho: Array, factor: float, ops: Ops) -> Array:
         return rho
     tolerance = tolerance_of(rho)
     least = ops.clamp(rho * factor, -tolerance, None)
-    return ops.where(ops.ge(rho, -tolerance), least, (rho + tolerance) * factor - tolerance)
+    return ops.where(satisfied(rho), least, (rho + tolerance) * factor - tolerance)
+
+
+def overall(each: Sequence[Array], factors: Iterable[float], ops: Ops, semantics: Semantics) -> Array:
+    """Overall robustness: the least weighed robustness of requirements.
+
+    Args:
+        each: robustness of each requirement, one or more arrays of a shape.
+        factors: weight / scale of each requirement.
+        ops: library of the arrays.
+        semantics: definition of the minimum.
+    """
+    rows = [weighed(row, factor, ops) for row, factor in zip(each, factors, strict=True)]
+    return semantics.join(rows, "min", ops)

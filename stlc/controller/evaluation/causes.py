@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 import torch
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.evaluation.executed import model_consistent
-from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import safety_task, solve
 from stlc.native import Stop, never
 

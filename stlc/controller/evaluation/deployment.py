@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.metrics import measure
@@ -185,7 +185,7 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
     known = np.full(recording.rho.shape, math.nan)
     if count:
         known.ravel()[np.linspace(0, known.size - 1, min(count, known.size)).astype(int)] = 1.0
-    open_ = np.isfinite(known) & ~(recording.rho >= -TOLERANCE)
+    open_ = np.isfinite(known) & ~satisfied(recording.rho)
     known[open_] = solvable(task, torch.from_numpy(recording.states[:, :-1][open_])).numpy()
     return known
 

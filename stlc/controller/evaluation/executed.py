@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied, violated
 from stlc.controller.deployment.batched import SURPRISE
-from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import viable as search_safe
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
     """
     starts = max(recording.steps + 1 - task.horizon, 0)
     margins = _margins_of_rules(task, recording)
-    rules = {name: low >= -TOLERANCE for name, (low, _) in margins.items()}
-    fails = {name: high < -TOLERANCE for name, (_, high) in margins.items()}
+    rules = {name: satisfied(low) for name, (low, _) in margins.items()}
+    fails = {name: violated(high) for name, (_, high) in margins.items()}
     safety = tuple(rule.name for rule in task.compiled.safety)
     found = viable
     if found is None:

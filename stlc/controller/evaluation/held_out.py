@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.problem.task import Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.search.feasibility import solve
 from stlc.controller.search.planner import PlanBudget, plan
@@ -131,7 +131,7 @@ def score(
         found = solve(task, *given, 1, tries=CEILING_TRIES, generator=generator, stop=enough).solved
         left = torch.nonzero(~found)[:, 0]
         if len(left) and task.native is not None and not enough():
-            found[left] = solve(task, states[chunk[left]], stop=enough).rho >= -TOLERANCE
+            found[left] = satisfied(solve(task, states[chunk[left]], stop=enough).rho)
         if number and enough():
             break
         known[chunk], searched[chunk] = found, True

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.rows import Rows
 from stlc.runtime.prefixes import PrefixGrid
 
@@ -88,12 +88,37 @@ class Candidates(Rows):
     @property
     def satisfies(self) -> Tensor:
         """Mask of the plans that satisfy the specification phi, (…) booleans."""
-        return self.rho >= -TOLERANCE
+        return satisfied(self.rho)
 
     @property
     def is_safe(self) -> Tensor:
         """Mask of the plans that satisfy phi_safe (the requirements tagged `@safety`), (…) booleans."""
-        return self.safe >= -TOLERANCE
+        return satisfied(self.safe)
+
+    @property
+    def standing(self) -> Tensor:
+        """Standing of the plans among those of a guard, (…); larger is better.
+
+        A plan is safe if it satisfies phi_safe (the requirements tagged `@safety`). The order, from best to
+        worst:
+
+        1. plans that satisfy phi; among these, a higher robustness is better
+        2. safe plans that begin with actions tried by the guard (a prefix) and that the policy continues:
+           they lead back to states on which the policy was trained
+        3. other safe plans
+        4. unsafe plans that a guard chose because they stay safe for the longest time
+        5. other unsafe plans, by the smaller of the robustness of phi and that of phi_safe
+        6. plans that were not judged
+        """
+        good, safe = self.satisfies, self.is_safe
+        within = torch.where(good | safe, self.rho, torch.minimum(self.rho, self.safe)).nan_to_num(
+            -1e9, 1e9, -1e9
+        )
+        finished = self.source == BACKUP
+        tier = torch.where(good, 8.0, torch.where(safe, torch.where(finished, 4.0, 2.0), -2.0))
+        tier = torch.where(~good & ~safe & (self.source == SAFEST), 0.0, tier)
+        tier = torch.where(self.source < 0, -4.0, tier)
+        return tier + within / (1.0 + within.abs())
 
     def pick(self, choice: Tensor) -> Candidates:
         """Select one of the several plans of each agent: (agents, choices) -> (agents,).
@@ -108,7 +133,7 @@ class Candidates(Rows):
 
         Each agent is decided separately.
         """
-        better = (rank(other) > rank(self.of(rows))).nonzero()[:, 0]
+        better = (other.standing > self.of(rows).standing).nonzero()[:, 0]
         self.put(rows[better], other.of(better))
 
     @classmethod
@@ -125,41 +150,9 @@ class Candidates(Rows):
         return Candidates(*(torch.cat(pair, 1) for pair in zip(self.parts, other.parts, strict=True)))
 
 
-def rank(plans: Candidates) -> Tensor:
-    """Rank of plans, (…); larger is better.
-
-    A plan is safe if it satisfies phi_safe (the requirements tagged `@safety`). The order, from best to
-    worst:
-
-    1. plans that satisfy phi; among these, a higher robustness is better
-    2. safe plans that begin with actions tried by the guard (a prefix) and that the policy continues: they
-       lead back to states on which the policy was trained
-    3. other safe plans
-    4. unsafe plans that a guard chose because they stay safe for the longest time
-    5. other unsafe plans, by the smaller of the robustness of phi and that of phi_safe
-    6. plans that were not judged
-    """
-    good, safe = plans.satisfies, plans.is_safe
-    within = torch.where(good | safe, plans.rho, torch.minimum(plans.rho, plans.safe)).nan_to_num(
-        -1e9, 1e9, -1e9
-    )
-    finished = plans.source == BACKUP
-    tier = torch.where(good, 8.0, torch.where(safe, torch.where(finished, 4.0, 2.0), -2.0))
-    tier = torch.where(~good & ~safe & (plans.source == SAFEST), 0.0, tier)
-    tier = torch.where(plans.source < 0, -4.0, tier)
-    return tier + within / (1.0 + within.abs())
-
-
-def best(allowed: Tensor, keys: Sequence[Tensor]) -> Tensor:
-    """Index of the best allowed choice in each row: (rows, choices) -> (rows,).
-
-    `allowed`: mask of the choices. `keys`: values (rows, choices), larger is better; a later key decides
-    between choices that are equal in all earlier ones. NaN is the smallest value.
-    """
-    for key in keys:
-        value = torch.where(allowed & ~key.isnan(), key, -torch.inf)
-        allowed = allowed & (value >= value.amax(1, keepdim=True) - TOLERANCE)
-    return allowed.to(torch.uint8).argmax(1)
+def first(chosen: Tensor) -> Tensor:
+    """Index of the first chosen plan of each agent: masks (choices, agents) -> (agents,)."""
+    return chosen.to(torch.uint8).argmax(0)
 
 
 def finite(plan: Tensor, task: Task) -> Tensor:

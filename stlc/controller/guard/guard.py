@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.guard.candidates import Candidates, Limits, finite
 from stlc.controller.guard.kind import GuardInputs
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.problem.rows import Rows
-from stlc.controller.problem.task import PlanVerdicts, Task, rank
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.registry import GUARDS
 from stlc.runtime.prefixes import PrefixGrid
 
@@ -141,7 +141,7 @@ class Guard:
             return decision
         taken = self.task.judge(x, decision.plan, states=False)  # without robustness margins
         policy_rho = self.task.judge(x, fresh, states=False).rho
-        return replace(decision, rho=taken.rho, safe=taken.safe >= -TOLERANCE, policy_rho=policy_rho)
+        return replace(decision, rho=taken.rho, safe=satisfied(taken.safe), policy_rho=policy_rho)
 
     @torch.no_grad()
     def endangered(self, x: Tensor, previous: GuardDecision, steps: int | Tensor) -> Tensor:
@@ -159,7 +159,7 @@ class Guard:
         if not (self.kind.monitors and formulas):
             return torch.zeros(len(x), dtype=torch.bool)
         columns = self.strict.system.rollout_columns(x.to(torch.float64), previous.plan.to(torch.float64))
-        return ~(robustness_until(formulas, columns, steps) >= -TOLERANCE)
+        return ~satisfied(robustness_until(formulas, columns, steps))
 
     @torch.no_grad()
     def prefer(self, options: Tensor, previous: GuardDecision | None = None) -> Tensor:
@@ -184,7 +184,7 @@ class Guard:
         return (score >= score.amax(1, keepdim=True)).to(torch.uint8).argmax(1)
 
     def _score(self, judged: PlanVerdicts) -> Tensor:
-        return rank(judged.rho, self.strict.cost(judged), judged.safe)
+        return self.strict.rank(judged)
 
     @torch.no_grad()
     def extended(self, x: Tensor, previous: GuardDecision, taken: Tensor) -> GuardDecision:
@@ -225,10 +225,10 @@ class Guard:
         if previous is None:
             return found
         rest = self.strict.judge(x, previous.plan)
-        better = rank(rest.rho, self.strict.cost(rest)) >= rank(judged.rho, self.strict.cost(judged))
+        better = self.strict.rank(rest) >= self.strict.rank(judged)
         if self.task.pending_goals.items:
             better |= self.task.pending_goals.deepened(rest.columns)
-        keep = (better & (rest.rho >= -TOLERANCE)).nonzero()[:, 0]
+        keep = (better & satisfied(rest.rho)).nonzero()[:, 0]
         before = Candidates(previous.plan, rest.rho, rest.safe, found.cost, previous.source, previous.t0)
         found.put(keep, before.of(keep))
         return found

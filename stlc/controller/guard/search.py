@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.guard.candidates import REPAIRED, SAFEST, Candidates, Deadline, Limits, finite, grid_of
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.stages import STAGES, Rejected, Setup
@@ -166,7 +166,7 @@ class RelaxedSearch(GuardSearch):
         `plan`: any plan from the states `x`; only its first sample, the present state, is judged.
         """
         columns = self.task.system.rollout_columns(x, plan)
-        return ~(robustness_until(self._formulas, columns, 0) >= -TOLERANCE)
+        return ~satisfied(robustness_until(self._formulas, columns, 0))
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
         """Run the stages (search methods) without margins for the agents in `lacking`.

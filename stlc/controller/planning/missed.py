@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from stlc.controller.problem.task import Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import StlcError
 

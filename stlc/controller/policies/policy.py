@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Literal, Self
 import torch
 from torch import Tensor, nn
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.environments import observe
-from stlc.controller.problem.task import PlanVerdicts, Task, rank, satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.model.controls import raw_width, squash, unsquash
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ class Policy(ABC):
             return plans[:, 0], self.task.judge(x0, plans[:, 0])
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
         rows = torch.arange(batch, device=x0.device)
-        best = rank(judged.rho, self.task.cost(judged), judged.safe).view(batch, count).argmax(1)
+        best = self.task.rank(judged).view(batch, count).argmax(1)
         return plans[rows, best], judged.of(rows * count + best)
 
 

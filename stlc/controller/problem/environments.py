@@ -14,8 +14,9 @@ from typing import Literal, TypeAlias, get_args
 import torch
 from torch import Tensor
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.native import NativeStep
-from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.diagnostics import usage
 
 Reward: TypeAlias = Literal["task", "robustness", "accuracy"]

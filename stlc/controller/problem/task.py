@@ -21,10 +21,11 @@ from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import is_state, nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_spec
 from stlc.compile.semantics.switch import Hard, Switch
-from stlc.compile.semantics.tolerance import satisfied as satisfied
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.native import check_plans
+from stlc.runtime.decision import rank
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,8 +43,6 @@ LONGEST = 500
 """Most steps of a plan that reaches beyond the horizon of the system, to the end of a mission."""
 MOST_VALUES = 32_000_000
 """Maximum number of values that torch holds while it judges plans: 256 MB in float64."""
-TIE = 1e-4
-"""Weight of the cost among violating plans, whose robustness is the same where a deadline cannot be met."""
 GUIDANCE = 0.1
 """Weight of the guidance cost towards the next goal among the performance terms."""
 GOALS = 3.0
@@ -397,6 +396,11 @@ class Task:
             gamma = self.system.decl.objective.gamma
             return cost + SHORTFALL * (gamma - judged.rho).clamp(0.0, gamma)
 
+    def rank(self, judged: PlanVerdicts, *, safety: bool = True) -> Tensor:
+        """Values that rank plans, (batch,), by `stlc.runtime.decision.rank`; `safety`: safe ones first."""
+        order: Tensor = rank(judged.rho, self.cost(judged), judged.safe if safety else None, TORCH)
+        return order
+
     def preference(self, judged: PlanVerdicts) -> Tensor:
         """Values that compare plans in a search, (batch,); larger is better, and 0 or more is satisfying.
 
@@ -454,25 +458,3 @@ class Task:
         env = {name: column[None] for name, column in zip(self.system.names, x.unbind(1), strict=True)}
         margins = evaluate([rule.alive for rule in self.rules], env, ops=TORCH)
         return torch.stack([margin[0].expand(len(x)) >= 0.0 for margin in margins]).all(0)
-
-
-def rank(rho: Tensor, cost: Tensor, safe: Tensor | None = None) -> Tensor:
-    """Values that rank plans: satisfying ones by cost, others by robustness; unsafe ones below all safe ones.
-
-    Args:
-        rho: robustness, any shape.
-        cost: performance terms, the same shape.
-        safe: robustness of phi_safe, the same shape; if None, safety is not considered.
-
-    Returns:
-        Values of the same shape; larger is better. A plan that satisfies the specification gets a value above
-        1, which decreases with its cost. Any other plan gets a value below 1, which increases with its
-        robustness; of two equally robust plans, the cheaper one gets more. If `safe` is given, 2 is
-        subtracted from the value of a plan that violates phi_safe.
-    """
-    cheap = torch.nan_to_num(1.0 / (1.0 + cost.clamp(min=0.0)))
-    poor = torch.where(torch.isfinite(rho), rho / (1.0 + rho.abs()), torch.full_like(rho, -1.0))
-    poor = poor + TIE * cheap
-    if safe is not None:
-        poor = torch.where(satisfied(safe), poor, poor - 2.0)
-    return torch.where(satisfied(rho) & ~torch.isnan(cost), 1.0 + cheap, poor)

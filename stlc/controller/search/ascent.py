@@ -22,7 +22,7 @@ from torch import Tensor
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.compile.semantics.tolerance import TOLERANCE, weighed
+from stlc.compile.semantics.tolerance import satisfied, weighed
 from stlc.controller.search.starts import extremes
 from stlc.native import ObjectiveSlopes
 
@@ -170,8 +170,8 @@ class GradientAscent:
         """
         rho = each.min(1)
         safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
-        below = np.where(safe >= -TOLERANCE, rho, safe - APART)
-        value: Numbers = np.where(rho >= -TOLERANCE, APART + rho, below)
+        below = np.where(satisfied(safe), rho, safe - APART)
+        value: Numbers = np.where(satisfied(rho), APART + rho, below)
         return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:

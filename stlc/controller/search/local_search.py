@@ -20,9 +20,10 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.c.emit import LANES
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.rows import Rows
-from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.problem.task import Task
 from stlc.native import Stop, cores, never
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.switch import Hard
-from stlc.controller.problem.task import Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import Objective, rolled, without_lost
 from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
 from stlc.dynamics.system import System

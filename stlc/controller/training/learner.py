@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
-from stlc.controller.problem.task import Task, rank, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import below
 from stlc.controller.run.run import load_weights
 from stlc.controller.search.feasibility import safety_task
@@ -420,7 +421,7 @@ class Trainer(Learner):
             first = torch.zeros(batch, dtype=torch.int64, device=self.device)
             return first, torch.zeros_like(first, dtype=torch.bool)
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
-        score = rank(judged.rho, self.task.cost(judged)).view(batch, count)
+        score = self.task.rank(judged, safety=False).view(batch, count)
         return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:

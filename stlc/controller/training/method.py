@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.parallel.ddp import ALONE, Ranks
-from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.training.config import TrainConfig, base_config
 from stlc.diagnostics import Diagnostic, RunError, StlcError

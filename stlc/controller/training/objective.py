@@ -10,7 +10,8 @@ from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough, Switch, Tanh
-from stlc.controller.problem.task import Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import Task
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

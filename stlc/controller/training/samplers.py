@@ -19,7 +19,8 @@ from typing import ClassVar, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.dynamics.uncertainty.disturbance import Events
 
 BLOCK = 8192

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.namespace import Array, Ops
 from stlc.dynamics.schema.names import ControlDecl
 
 EPS = 1e-6
@@ -16,25 +23,59 @@ NEAR_END = 0.98
 """Share of a control's half range up to which outputs stand for given controls."""
 
 
+@dataclass(frozen=True, slots=True)
+class SquashKind:
+    """Map from network outputs to [-1, 1], where ±1 are the ends of a control's range.
+
+    Attributes:
+        of: value from an array library and the outputs.
+        c: the same as C in float32.
+        outputs: number of outputs.
+    """
+
+    of: Callable[..., Array]
+    c: str
+    outputs: int = 1
+
+
+SQUASHES: Mapping[str, SquashKind] = MappingProxyType(
+    {
+        "tanh": SquashKind(lambda ops, x: ops.tanh(x), "tanhf({0})"),
+        "clip": SquashKind(lambda ops, x: ops.clamp(x, -1.0, 1.0), "MIN(MAX({0}, -1.0f), 1.0f)"),
+        "angle": SquashKind(
+            lambda ops, x, y: ops.div(ops.atan2(y, ops.add(x, EPS)), math.pi),
+            f"atan2f({{1}}, {{0}} + {EPS}f) / (float)PI",
+            outputs=2,
+        ),
+    }
+)
+"""`tanh` is smooth, `clip` cuts off at the ends; `angle` is the direction of a planar vector, without a
+discontinuity at the ends of the range."""
+
+
 def raw_width(controls: tuple[ControlDecl, ...]) -> int:
     """Number of network outputs per step: two (a planar vector) for an angle, one for any other control."""
-    return sum(2 if control.squash == "angle" else 1 for control in controls)
+    return sum(SQUASHES[control.squash].outputs for control in controls)
+
+
+def shares(raw: Iterable[Array], controls: tuple[ControlDecl, ...], ops: Ops) -> list[Array]:
+    """Controls on the scale [-1, 1], one array per control, from one array per network output."""
+    columns, kinds = iter(raw), (SQUASHES[control.squash] for control in controls)
+    return [kind.of(ops, *islice(columns, kind.outputs)) for kind in kinds]
 
 
 def squash(raw: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
     """Controls in physical units from network outputs: (…, raw_width) -> (…, m).
 
-    `tanh` (smooth) or `clip` (cut off at the ends) brings an output into [-1, 1], which is then scaled to the
-    range of the control. `angle` gives the direction of a planar vector, two outputs, without discontinuity
-    at the ends of the range.
+    A map of `SQUASHES` brings an output into [-1, 1], which is then scaled to the range of the control.
     """
     middle, half = _affine(controls, raw.dtype, raw.device)
     kinds = {control.squash for control in controls}
-    if kinds == {"tanh"}:
-        return torch.addcmul(middle, torch.tanh(raw), half)
-    if kinds == {"clip"}:
-        return torch.addcmul(middle, torch.clamp(raw, -1.0, 1.0), half)
-    return torch.addcmul(middle, torch.stack(_units(raw, controls), -1), half)
+    if len(kinds) == 1 and kinds != {"angle"}:
+        share = SQUASHES[kinds.pop()].of(TORCH, raw)
+    else:
+        share = torch.stack(shares(raw.unbind(-1), controls, TORCH), -1)
+    return torch.addcmul(middle, share, half)
 
 
 def unsquash(plans: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
@@ -53,25 +94,6 @@ def unsquash(plans: Tensor, controls: tuple[ControlDecl, ...]) -> Tensor:
             case "angle":
                 found += [torch.cos(torch.pi * unit), torch.sin(torch.pi * unit)]
     return torch.stack(found, -1)
-
-
-def _units(raw: Tensor, controls: tuple[ControlDecl, ...]) -> list[Tensor]:
-    """Map network outputs to controls on the scale [-1, 1], where ±1 are the ends of a control's range.
-
-    Returns one tensor per control.
-    """
-    columns = iter(raw.unbind(-1))
-    out: list[Tensor] = []
-    for control in controls:
-        first = next(columns)
-        match control.squash:
-            case "tanh":
-                out.append(torch.tanh(first))
-            case "clip":
-                out.append(torch.clamp(first, -1.0, 1.0))
-            case "angle":
-                out.append(torch.atan2(next(columns), first + EPS) / torch.pi)
-    return out
 
 
 @lru_cache(maxsize=64)

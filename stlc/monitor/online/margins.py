@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir.support import columns_in, history
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import satisfied, violated
 from stlc.monitor.instants import window_of
 from stlc.monitor.judgement import Status
 from stlc.monitor.online.history import ColumnHistory, Floats
@@ -98,12 +98,11 @@ class _Watched:
         low, high = (
             np.broadcast_to(end, shape) for end in self.tracker.live(range(self.next - begin, stop - begin))
         )
-        fails, holds = high < -TOLERANCE, low >= -TOLERANCE
+        fails, holds = violated(high), satisfied(low)
         whole = 0 if self.ahead is None else max(samples - self.ahead, 0)  # instants with complete windows
         shown = max(whole - 1 - self.next, 0) if self.everywhere else 0
-        violated = self.violated + fails.sum(0)
         undecided = np.logical_or.reduce(~fails & ~holds, axis=0)
-        self.last = Margin(low[shown:].min(0), high[shown:].min(0), violated, undecided)
+        self.last = Margin(low[shown:].min(0), high[shown:].min(0), self.violated + fails.sum(0), undecided)
         settled = min(whole, stop) - self.next
         if settled > 0:
             self.violated = self.violated + fails[:settled].sum(0)

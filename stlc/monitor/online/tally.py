@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.semantics.tolerance import satisfied, violated
 from stlc.monitor.judgement import Status
 from stlc.monitor.online.history import Floats
 
@@ -30,7 +31,7 @@ class JudgedInstants(NamedTuple):
     def of(bounds: Floats, tolerance: float) -> JudgedInstants:
         """From bounds on the robustness and on that which decides, (instants, 4)."""
         low, high, least, most = bounds.T
-        return JudgedInstants(low, high, least >= -tolerance, most < -tolerance)
+        return JudgedInstants(low, high, satisfied(least, tolerance), violated(most, tolerance))
 
     def followed_by(self, other: JudgedInstants, first: int = 0) -> JudgedInstants:
         """These instants, then those of `other` from number `first` on."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from stlc import native
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.c.emit import HEAD
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.tolerance import tolerance_of, weighed
+from stlc.compile.semantics.tolerance import satisfied, tolerance_of, weighed
 
 RHO = st.floats(-1e9, 1e9) | st.floats(-1e-5, 1e-5) | st.sampled_from([0.0, -1e-6, np.inf, -np.inf])
 FACTORS = st.floats(1e-9, 1e9)
@@ -46,3 +49,23 @@ def test_the_gradient_is_the_factor(value: float) -> None:
     weighed(rho, 1e-6, TORCH).sum().backward()
     assert rho.grad is not None
     assert rho.grad.tolist() == [1e-6]
+
+
+@pytest.fixture(scope="module")
+def in_c() -> ctypes.CDLL:
+    doors = """
+    int satisfied_(double rho) { return satisfied(rho); }
+    double weighed_(double rho, double factor) { return weighed(rho, factor); }
+    """
+    library = native.load(HEAD + doors)
+    if library is None:
+        pytest.skip("needs a C compiler")
+    library.weighed_.restype = ctypes.c_double
+    return library
+
+
+@given(RHO, FACTORS)
+def test_c_weighs_and_judges_alike(in_c: ctypes.CDLL, rho: float, factor: float) -> None:
+    assert bool(in_c.satisfied_(ctypes.c_double(rho))) == satisfied(rho)
+    found = in_c.weighed_(ctypes.c_double(rho), ctypes.c_double(factor))
+    assert found == float(weighed(np.array([rho]), factor, NUMPY)[0])

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import torch
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.evaluation.held_out import save_states, score
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
-from stlc.controller.problem.task import Task, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT_SEED
 from stlc.controller.search.feasibility import solvable
 from stlc.controller.training.config import TrainConfig, resolve_config

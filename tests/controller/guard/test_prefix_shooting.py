@@ -11,12 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from stlc.controller.guard.candidates import Limits, best, finite, grid_of
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.controller.guard.candidates import Limits, finite, first, grid_of
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.search import StagedSearch
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
+from stlc.runtime.decision import best
 from stlc.runtime.prefixes import PrefixGrid
 
 F64 = torch.float64
@@ -198,7 +200,7 @@ def test_keys_decide_in_order_and_then_the_first_choice() -> None:
     allowed = torch.tensor([[True, True, True, False], [True, True, True, True]])
     rho = torch.tensor([[1.0, 2.0, 2.0, 9.0], [3.0, 3.0, 3.0, 3.0]])
     cost = torch.tensor([[0.0, 5.0, 4.0, 0.0], [1.0, 1.0, 1.0, torch.nan]])
-    assert best(allowed, (rho, -cost)).tolist() == [2, 0]
+    assert first(best(allowed.t(), (rho.t(), -cost.t()), TORCH)).tolist() == [2, 0]
 
 
 # ------------------------------------------------------------------------ prefixes
@@ -232,7 +234,6 @@ def test_prefix_robustness_is_the_bound_over_continuations(car_task: Task, seed:
 
 
 def _torch() -> object:
-    from stlc.compile.backends.torch.ops import TORCH
 
     return TORCH
 

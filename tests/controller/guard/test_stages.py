@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stlc.controller.guard.candidates import BACKUP, REPAIRED, SAFEST, Candidates, rank
+from stlc.controller.guard.candidates import BACKUP, REPAIRED, SAFEST, Candidates
 from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.guard.search import StagedSearch
@@ -33,9 +33,9 @@ def test_one_order_of_preference() -> None:
     safe = torch.tensor([0.1, 0.2, 0.3, -2.0, -2.0, -torch.inf], dtype=torch.float64)
     source = torch.tensor([REPAIRED, BACKUP, REPAIRED, SAFEST, REPAIRED, -1])
     plans = Candidates(plan, rho, safe, torch.zeros(6), source, torch.zeros(6, dtype=torch.int64))
-    assert rank(plans).argsort(descending=True).tolist() == [0, 1, 2, 3, 4, 5]
+    assert plans.standing.argsort(descending=True).tolist() == [0, 1, 2, 3, 4, 5]
     better = replace(plans, rho=plans.rho + 0.01)
-    assert bool((rank(better) > rank(plans))[:4].all())
+    assert bool((better.standing > plans.standing)[:4].all())
 
 
 def test_what_is_not_handed_on_is_made_again(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,8 +6,9 @@ from copy import deepcopy
 
 import torch
 
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.policies.policy import VARIATIONS, BestOfKPolicy, PlanNetwork, variations
-from stlc.controller.problem.task import Task, rank, satisfied
+from stlc.controller.problem.task import Task
 
 
 def _policy(task: Task, plans: int, *, varied: bool = False) -> BestOfKPolicy:
@@ -26,10 +27,10 @@ def test_the_choice_is_the_best_of_the_candidates(car_task: Task) -> None:
     plans, judged = policy.plan_judged(x0)
     again = car_task.judge(x0, plans)
     assert torch.equal(judged.rho, again.rho)
-    chosen = rank(judged.rho, car_task.cost(judged), judged.safe)
+    chosen = car_task.rank(judged)
     for index in range(5):
         other = car_task.judge(x0, candidates[:, index])
-        assert (chosen >= rank(other.rho, car_task.cost(other), other.safe) - 1e-12).all()
+        assert (chosen >= car_task.rank(other) - 1e-12).all()
 
 
 def test_a_batch_equals_its_states_one_by_one(car_task: Task) -> None:
@@ -82,10 +83,10 @@ def test_the_best_variation_is_selected_where_every_plan_fails(car_task: Task) -
     assert all(torch.equal(column, again.columns[name]) for name, column in judged.columns.items())
     low, high = car_task.system.control_low.double(), car_task.system.control_high.double()
     some = (~good).nonzero()[:200, 0]
-    chosen = rank(judged.rho, car_task.cost(judged), judged.safe)[some]
+    chosen = car_task.rank(judged)[some]
     for change in varied.network.changes:
         other = car_task.judge(x0[some], (before[some] + change).clamp(low, high))
-        assert (chosen >= rank(other.rho, car_task.cost(other), other.safe) - 1e-12).all()
+        assert (chosen >= car_task.rank(other) - 1e-12).all()
     assert torch.equal(varied(x0), after)
 
 

@@ -10,11 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stlc
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import Effort
-from stlc.controller.problem.task import Task, rank, satisfied
+from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.monitor.verdict import Monitor
+from stlc.runtime.decision import rank
 
 
 def _plans(task: Task, n: int, seed: int) -> torch.Tensor:
@@ -75,8 +78,8 @@ def test_a_plan_with_nan_is_violated_and_never_preferred(car_task: Task) -> None
     assert judged.rho[0] == -torch.inf
     assert judged.safe[0] == -torch.inf
     assert torch.isfinite(judged.rho[1])
-    order = rank(judged.rho, car_task.cost(judged))
-    assert order[0] < rank(torch.tensor(-1e6), torch.tensor(0.0))
+    order = car_task.rank(judged, safety=False)
+    assert order[0] < rank(torch.tensor(-1e6), torch.tensor(0.0), None, TORCH)
 
 
 def test_satisfied_allows_for_rounding_but_not_for_more() -> None:
@@ -92,7 +95,7 @@ def test_satisfying_plans_come_first_then_cheap_ones_then_robust_ones(
     pairs: list[tuple[float, float]],
 ) -> None:
     rho, cost = torch.tensor(pairs, dtype=torch.float64).unbind(1)
-    best = int(rank(rho, cost).argmax())
+    best = int(rank(rho, cost, None, TORCH).argmax())
     good = satisfied(rho)
     if good.any():
         assert good[best]

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from stlc.cli.framework.app import main
-from stlc.controller.problem.task import PlanVerdicts, Task, satisfied
+from stlc.compile.semantics.tolerance import satisfied
+from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.run import task_of_run
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import STEEPEST, Trainer, _bounded_slopes, _finite_mean

@@ -22,7 +22,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
-from stlc.compile.semantics.tolerance import weighed
+from stlc.compile.semantics.tolerance import overall
 from stlc.signature import Signature
 
 
@@ -224,8 +224,9 @@ class RobustnessGraph:
         ops, rows = ops_of(each), each.T
         if not self.rules:
             return ops.full((each.shape[0],), math.inf, each)
-        items = [weighed(rows[i : i + 1], rule.factor, ops) for i, rule in enumerate(self.rules)]
-        return semantics_of(self.semantics, smoothing).join(items, "min", ops)[0]
+        items = [rows[i : i + 1] for i in range(len(self.rules))]
+        factors = (rule.factor for rule in self.rules)
+        return overall(items, factors, ops, semantics_of(self.semantics, smoothing))[0]
 
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None

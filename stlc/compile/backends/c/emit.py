@@ -49,11 +49,13 @@ VECTOR(sin) VECTOR(cos) VECTOR(exp) VECTOR(log)
 #define NAN_IN(a) ((double)((a) != (a)))
 #define STLC_TOLERANCE {TOLERANCE!r}
 
+static inline int satisfied(double rho) {{ return rho >= -STLC_TOLERANCE; }}
+
 /* Robustness times weight / scale, at least -STLC_TOLERANCE where it is itself: `weighed` in Python. */
 static inline double weighed(double rho, double factor) {{
   if (factor == 1.0) return rho;
-  return rho >= -STLC_TOLERANCE ? MAX(rho * factor, -STLC_TOLERANCE)
-                                : (rho + STLC_TOLERANCE) * factor - STLC_TOLERANCE;
+  return satisfied(rho) ? MAX(rho * factor, -STLC_TOLERANCE)
+                        : (rho + STLC_TOLERANCE) * factor - STLC_TOLERANCE;
 }}
 
 static inline double floored_mod(double a, double b) {{

@@ -250,6 +250,12 @@ class Value:
     def __rtruediv__(self, other: float) -> Value:
         return self.beside(other).apply("Div", self)
 
+    def __ge__(self, other: Value | float) -> Value:
+        return self.apply("GreaterOrEqual", other, kind="bool")
+
+    def __lt__(self, other: Value | float) -> Value:
+        return self.apply("Less", other, kind="bool")
+
     def __neg__(self) -> Value:
         return self.apply("Neg")
 

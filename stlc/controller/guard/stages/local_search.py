@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline, rank
+from stlc.controller.guard.candidates import REPAIRED, Candidates, Deadline
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import Searcher
@@ -59,7 +59,7 @@ def best_climbed(
     search.
     """
     found = climbed_from(searcher, x, starts, tries, task)
-    return found.pick(rank(found).argmax(1))
+    return found.pick(found.standing.argmax(1))
 
 
 def climbed_from(

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.guard.candidates import SAFEST, Candidates, Deadline, best
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.controller.guard.candidates import SAFEST, Candidates, Deadline, first
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
 from stlc.controller.guard.stages.prefix_shooting import PrefixShooting
+from stlc.runtime.decision import longest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -73,17 +74,15 @@ class LongestSafePrefix(GuardStage):
         agents, choices = candidates.rho.shape
         starts, plans = x.repeat_interleave(choices, 0), candidates.plans.flatten(0, 1)
         size = max(self.batch // self.task.horizon, 1)  # every prefix is a trajectory of its own
-        falls = torch.cat(
+        fallen = torch.cat(
             [
                 prefix_robustness(self._formulas, self.task.system.rollout_columns(start, plan))
                 for start, plan in zip(torch.split(starts, size), torch.split(plans, size), strict=True)
             ],
             1,
         )
-        samples = (falls >= -TOLERANCE).sum(0).view(agents, choices)
-        depth = falls.clamp(max=0.0).mean(0).view(agents, choices)
-        longest = samples == samples.amax(1, keepdim=True)
-        chosen = candidates.pick(best(longest, (candidates.rho, depth, -candidates.cost)))
+        falls = fallen.view(-1, agents, choices).transpose(1, 2)
+        chosen = candidates.pick(first(longest(falls, candidates.rho.t(), candidates.cost.t(), TORCH)))
         return replace(chosen, source=torch.full_like(chosen.source, SAFEST))
 
 

@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, best, finite
+from stlc.compile.backends.torch.ops import TORCH
+from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite, first
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
+from stlc.runtime.decision import continued
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,11 +64,10 @@ class PrefixShooting(GuardStage):
         for length in self.grid.lengths:
             left = []
             for group, candidates in self.candidates(rejected, rows, todo, length, deadline):
-                good = candidates.satisfies
-                allowed = torch.where(good.any(1, keepdim=True), good, candidates.is_safe)
-                done = allowed.any(1)
-                chosen = candidates.of(done)
-                found.put(group[done], chosen.pick(best(allowed[done], (chosen.rho, -chosen.cost))))
+                done = (candidates.satisfies | candidates.is_safe).any(1)
+                some = candidates.of(done)
+                choice = continued(some.rho.t(), some.safe.t(), some.cost.t(), TORCH)
+                found.put(group[done], some.pick(first(choice)))
                 left.append(group[~done])
                 if deadline.over or length == self.grid.lengths[-1]:
                     room -= int((~done).sum()) * candidates.rho.shape[1]

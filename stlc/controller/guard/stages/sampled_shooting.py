@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite, rank
+from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
 from stlc.controller.guard.stages.local_search import climbed_from
 from stlc.controller.search.local_search import Searcher
@@ -102,11 +102,11 @@ class SampledShooting(GuardStage):
             return found
         x = rejected.x[rows]
         tried = self.prefixes.finished(x)
-        picked = rank(tried).topk(min(self.limits.places, tried.rho.shape[1]), 1).indices
+        picked = tried.standing.topk(min(self.limits.places, tried.rho.shape[1]), 1).indices
         agents = torch.arange(len(rows), device=rows.device)
         best = tried.pick(picked[:, 0])
         climbed = climbed_from(self._searcher, x, tried.plans[agents[:, None], picked], self.limits.again)
-        place = rank(climbed).argmax(1)
+        place = climbed.standing.argmax(1)
         length = tried.prefix_length[agents, picked[agents, place]]
         climbed = climbed.pick(place)
         source = torch.full_like(climbed.source, BACKUP)
