@@ -19,14 +19,14 @@ IMPLEMENTATIONS = {
     "document with the fields of a record": 8,
     "online evaluator": 3,
     "arithmetic of bounds": 2,
-    "choice among plans": 2,
+    "choice among plans": 1,
     "rank of plans": 2,
     "improvement of a plan": 7,
     "name of a guard": 2,
-    "verdict by the tolerance": 71,
+    "verdict by the tolerance": 2,
     "until": 13,
     "smooth maximum of two": 3,
-    "overall robustness": 5,
+    "overall robustness": 2,
     "squash of a control": 2,
 }
 

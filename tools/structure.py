@@ -296,14 +296,17 @@ MEANINGS = (
     Meaning(
         "arithmetic of bounds", "compile/backends/array/interval.py", defined("Intervals|Forms|KnownRanges")
     ),
-    Meaning("choice among plans", "controller/guard/candidates.py", defined("best")),
-    Meaning("rank of plans", "controller/problem/task.py", defined("rank", "controller/")),
+    Meaning("choice among plans", "runtime/decision.py", defined("best")),
+    Meaning("rank of plans", "runtime/decision.py", written("_ / (1.0 + size)", "_ / (1.0 + _.abs())")),
     Meaning("improvement of a plan", "controller/guard/search.py", defined(_SEARCHES)),
     Meaning("name of a guard", "registry.py", written("'paper'", "'full'")),
     Meaning(
         "verdict by the tolerance",
         "compile/semantics/tolerance.py",
-        written("_ >= -TOLERANCE", "_ < -TOLERANCE", "_.ge(_, -TOLERANCE)"),
+        written(
+            *("_ >= -TOLERANCE", "_ < -TOLERANCE", "_.ge(_, -TOLERANCE)"),
+            *(f"_ {op} -(tolerance_of(_) if tolerance is None else tolerance)" for op in (">=", "<")),
+        ),
     ),
     Meaning("until", "compile/backends/array/windows.py", defined(r"\w*until\w*", "compile/backends/")),
     Meaning("smooth maximum of two", "compile/namespace.py", written("_.log1p(_.exp(_))")),

@@ -27,7 +27,6 @@ from stlc.controller.guard.candidates import (
     REPAIRED,
     Candidates,
     RobustnessMargins,
-    best,
     finite,
     first,
 )
@@ -35,6 +34,7 @@ from stlc.controller.guard.margins import with_margins
 from stlc.controller.guard.search import GuardSearch, RelaxedSearch, StagedSearch
 from stlc.diagnostics import usage
 from stlc.dynamics.model.samplers import seeded
+from stlc.runtime.decision import best
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
