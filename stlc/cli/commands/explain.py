@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.framework.manual import CodeList, Page, RequirementInWords, SpecInWords, read_page
 from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, JsonOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, table
 from stlc.cli.framework.program import command
@@ -56,7 +55,7 @@ def explain(
     """
     if guarantee:
         return _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_))
-    from stlc.cli.framework.manual import CodeList
+    from stlc.cli.framework.manual import CodeList, read_page
 
     if what is None:
         return Answer(CodeList(dict(CODES)), lambda: emit(table(list(CODES.items()), indent="")))

@@ -52,11 +52,11 @@ def there(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
 def test_the_newest_run_is_simulated_with_and_without_guard(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["simulate", "--backup", *SMALL, "--steps", "30", "--record", "trace.npz"]) == 0
+    assert main(["simulate", "--backup", *SMALL, "--steps", "16", "--record", "trace.npz"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert f"run {there.name}" in lines[0]
     assert "world traffic_grid.py" in lines[0]
-    assert "2 seeds x 4 agents x 30 steps" in lines[0]
+    assert "2 seeds x 4 agents x 16 steps" in lines[0]
     assert lines[1] == ""
     document = there.read_json("eval/simulate.json")
     drives = {name: guard["drives"] for name, guard in document["guards"].items()}
@@ -72,7 +72,7 @@ def test_the_newest_run_is_simulated_with_and_without_guard(
     assert lines[-1].split(maxsplit=1) == ["next", "stlc check trace.npz"]
     for path in (Path("trace.npz"), there.path / "trace.npz"):
         trace = load_trace(path)
-        assert (trace.traces, trace.samples) == (8, 31)
+        assert (trace.traces, trace.samples) == (8, 17)
         assert trace.meta.run == there.name
     document = there.read_json("eval/simulate.json")
     assert set(document["guards"]) == {"none", "paper"}
@@ -113,7 +113,7 @@ def test_a_trace_is_judged_by_the_constants_it_was_driven_with(
 def test_windows_are_shown_where_they_are_asked_for(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["simulate", there.name, *SMALL, "--steps", "30", "--windows"]) == 0
+    assert main(["simulate", there.name, *SMALL, "--steps", "16", "--windows"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.strip().startswith("plan accuracy") and "±" in line for line in lines)
     assert any("driven safely" in line for line in lines)
@@ -122,7 +122,7 @@ def test_windows_are_shown_where_they_are_asked_for(
 def test_safety_is_spoken_of_only_where_something_is_tagged(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["simulate", there.name, *SMALL, "--steps", "30", "--json"]) == 0
+    assert main(["simulate", there.name, *SMALL, "--steps", "16", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["result"]
     assert result["safety"]
     assert any("safely" in line for line in screen(result, windows=True))
@@ -149,7 +149,7 @@ def test_without_rules_drives_are_judged_as_plans_are(
 def test_what_was_driven_is_checked_by_the_rules_that_travel_with_it(
     there: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["simulate", there.name, *SMALL, "--steps", "30", "--json"]) == 0
+    assert main(["simulate", there.name, *SMALL, "--steps", "16", "--json"]) == 0
     drives = json.loads(capsys.readouterr().out)["result"]["guards"]["none"]["drives"]
     obeyed = drives["obeyed"] == drives["count"] == 8
     assert main(["check", str(there.path / "trace.npz"), "--json"]) == (0 if obeyed else 1)
@@ -316,16 +316,16 @@ def test_a_world_that_fails_on_the_way_leaves_a_trace(
 
 def test_margins_come_as_json_lines(there: RunDir, capsys: pytest.CaptureFixture[str]) -> None:
     """One object an agent and step, whose statuses at the end are those of `stlc check`."""
-    options = [*SMALL, "--steps", "30", "--backup", "--robustness", "m.jsonl", "--live"]
+    options = [*SMALL, "--steps", "16", "--backup", "--robustness", "m.jsonl", "--live"]
     assert main(["simulate", there.name, *options]) == 0
     captured = capsys.readouterr()
-    assert "step 30 / 30" in captured.err
+    assert "step 16 / 16" in captured.err
     lines = [json.loads(line) for line in Path("m.jsonl").read_text().splitlines()]
-    assert len(lines) == 31 * 8
+    assert len(lines) == 17 * 8
     wanted = load_schema("robustness-line")
     assert [misfits(line, wanted) for line in lines] == [[]] * len(lines)
     assert [(line["step"], line["seed"], line["agent"]) for line in lines] == [
-        (step, seed, agent) for step in range(31) for seed in (0, 1) for agent in range(4)
+        (step, seed, agent) for step in range(17) for seed in (0, 1) for agent in range(4)
     ]
     trace = load_trace(there.path / "trace.npz")
     decided = [["policy", "backup", "safest"].index(line["decided"].split()[0]) for line in lines[:-8]]
