@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.simulation import PARTS, Simulations
+from stlc.assurance.search_space import SearchSpace
+from stlc.assurance.simulation import PARTS, Simulations, Simulator
 from stlc.compile.semantics.tolerance import violated
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
@@ -33,7 +33,7 @@ SEEDS = 2**31
 
 
 @dataclass(frozen=True)
-class DriveSimulator:
+class DriveSimulator(Simulator):
     """Simulator of drives: one world per point, whose random numbers are read from the point.
 
     The last coordinate of a point chooses the seed of all numbers for which there are no further coordinates.
@@ -81,14 +81,6 @@ class DriveSimulator:
         """Names of the requirements on drives."""
         return tuple(each.name for each in self._verdict(self.drive(np.full((1, 1), 0.5))))
 
-    def seen(self, requirement: int) -> float:  # noqa: ARG002
-        """Return 1, since a drive has no input signals."""
-        return 1.0
-
-    def graded(self, requirement: int) -> bool:  # noqa: ARG002
-        """True: robustness of drives varies with their states."""
-        return True
-
     def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
         """Simulate `points`, (count, dim), and judge the drives by a requirement.
 
@@ -96,7 +88,7 @@ class DriveSimulator:
         verdict if one of them violates the requirement, or all have a verdict.
         """
         verdict = self._verdict(self.drive(points))
-        margins = self._margins_of_agents(verdict).min(1)[:, requirement]
+        margins = self._margins(verdict).min(1)[:, requirement]
         inside = np.broadcast_to(_inside(verdict), (len(points) * self.setting.agents,))
         admissible: NDArray[np.bool_] = np.any(inside.reshape(len(points), -1), axis=1)
         open_ = np.array(verdict.requirements[requirement].statuses) == "inconclusive"
@@ -120,7 +112,7 @@ class DriveSimulator:
 
         It is +inf where the assumptions of the specification do not hold: nothing is violated there.
         """
-        return self._margins_of_agents(self._verdict(recording))
+        return self._margins(self._verdict(recording))
 
     def inconclusive(self, recording: DeploymentRecording) -> NDArray[np.bool_]:
         """True for the agents of each simulation whose drive ended before its verdict, (count, agents)."""
@@ -128,26 +120,14 @@ class DriveSimulator:
         each: NDArray[np.bool_] = found.reshape(-1, self.setting.agents)
         return each
 
-    def _margins_of_agents(self, verdict: Verdict) -> NDArray[np.float64]:
+    def _margins(self, verdict: Verdict) -> NDArray[np.float64]:
         inside = _inside(verdict)
         each = np.stack([np.where(inside, judgement.high.min(0), np.inf) for judgement in verdict], 1)
         return each.reshape(-1, self.setting.agents, each.shape[1])
 
-    def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
-        """None: a drive has no gradient."""
-        return None
-
     def trace(self, points: NDArray[np.float64]) -> Trace:
         """Drives at `points`, (count, dim), as a trace with one row per agent."""
         return trace_of(self.run, self.drive(points), self._at(points), self._rules)
-
-    def at_half_step(
-        self,
-        points: NDArray[np.float64],  # noqa: ARG002
-        requirement: int,  # noqa: ARG002
-    ) -> Simulations | None:
-        """None: a world has the time step for which it was written, and the policy that of its training."""
-        return None
 
     def _verdict(self, recording: DeploymentRecording) -> Verdict:
         return verdict_on_runs(self._rules, self.run.task, recording)

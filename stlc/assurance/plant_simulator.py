@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
-from stlc.assurance.simulation import Simulations
+from stlc.assurance.simulation import Simulations, Simulator
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.traverse import nodes
@@ -53,7 +53,7 @@ class RepeatedSimulation:
 
 
 @dataclass(frozen=True)
-class PlantSimulator:
+class PlantSimulator(Simulator):
     """Simulator of a plant file.
 
     A simulation that fails gives no trace, so that it violates no requirement: its robustness is +inf, and it
@@ -129,10 +129,6 @@ class PlantSimulator:
             return 1.0
         return min((max(rule.reach for rule in read_by) + 1) * float(decl.dt) / float(decl.duration), 1.0)
 
-    def graded(self, requirement: int) -> bool:  # noqa: ARG002
-        """True: the outputs of a plant are real numbers."""
-        return True
-
     # ------------------------------------------------------------------------ simulation
 
     def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
@@ -154,10 +150,6 @@ class PlantSimulator:
             return None
         plant = self._finer.plant
         return _judged(self._finer.monitor, plant.simulate(plant.points_of(points)), requirement)
-
-    def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
-        """None: a black box has no gradient."""
-        return None
 
     @cached_property
     def _finer(self) -> PlantJudge | None:

@@ -47,7 +47,8 @@ class Simulations:
 class Simulator(Protocol):
     """Simulations of a closed system, as a function of points in the unit cube.
 
-    The outcome of a point depends on nothing but the point and the requirement, given by its index.
+    The outcome of a point depends on nothing but the point and the requirement, given by its index. The
+    defaults are those of a black box of real signals without inputs, at the time step that it has.
     """
 
     @property
@@ -66,20 +67,24 @@ class Simulator(Protocol):
     def requirements(self) -> Sequence[str]:
         """Names of the requirements."""
 
-    def seen(self, requirement: int) -> float:
+    def seen(self, requirement: int) -> float:  # noqa: ARG002
         """Share of the inputs' duration, at most 1, after which inputs no longer affect a requirement."""
+        return 1.0
 
-    def graded(self, requirement: int) -> bool:
+    def graded(self, requirement: int) -> bool:  # noqa: ARG002
         """True if the robustness varies with real signals, rather than with whole numbers."""
+        return True
 
     def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
         """Simulate `points`, (count, dim), and judge them by a requirement."""
 
-    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> Simulations | None:
+    def at_half_step(self, points: NDArray[np.float64], requirement: int) -> Simulations | None:  # noqa: ARG002
         """Outcomes at half the time step; None if the step cannot be changed."""
+        return None
 
-    def gradient(self, point: Point, requirement: int) -> Point | None:
+    def gradient(self, point: Point, requirement: int) -> Point | None:  # noqa: ARG002
         """Gradient of the exact robustness at a point, (dim,); None if there is none."""
+        return None
 
 
 class SimulatorSource(Protocol):
