@@ -28,11 +28,11 @@ from stlc.controller.evaluation.metrics import METRICS, measure
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
-from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
 from stlc.controller.search.planner import PLANNING_VERSION, PlanBudget, planner_named
+from stlc.controller.search.planner_policy import PlannerPolicy
 from stlc.diagnostics import UsageError
 from stlc.jsontext import plain
 from stlc.provenance import sha256

@@ -20,9 +20,9 @@ from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.tolerance import violated
-from stlc.controller.planning.traces import trace_of
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
+from stlc.controller.search.plan_traces import trace_of
 from stlc.controller.search.planner import PlanResult
 from stlc.diagnostics import usage
 from stlc.dynamics.quantiles import InitialPoints

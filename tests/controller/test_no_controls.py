@@ -9,10 +9,10 @@ import torch
 
 import stlc
 from stlc.cli.framework.app import main
-from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import solve
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
+from stlc.controller.search.planner_policy import PlannerPolicy
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.loop import train
 from stlc.diagnostics import UsageError

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from stlc.assurance.verification.tubes import DEVIATIONS, TubeModel
 from stlc.compile.semantics.tolerance import satisfied
-from stlc.controller.planning.missed import BetterPlanner, Missed
+from stlc.controller.search.missed import BetterPlanner, Missed
 from stlc.controller.search.planner import PlanResult
 from stlc.jsontext import Num
 

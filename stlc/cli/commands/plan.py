@@ -27,9 +27,9 @@ from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
     from stlc.assurance.verification.planned import Plans, PlanTubes
-    from stlc.controller.planning.policy import PlannerChoice
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner import PlanResult
+    from stlc.controller.search.planner_policy import PlannerChoice
 
 
 @command(
@@ -90,8 +90,8 @@ def plan(
     """
     from stlc.assurance.verification.planned import PlanTubes
     from stlc.assurance.verification.tubes import TubeModel
-    from stlc.controller.planning.traces import following, starts_of, trace_of
     from stlc.controller.problem.load import load_task
+    from stlc.controller.search.plan_traces import following, starts_of, trace_of
     from stlc.controller.search.planner import PlanBudget, PlanSearch, planner_named, prepared
     from stlc.stopping import leaving
     from stlc.trace import check_writable, save_trace
@@ -162,7 +162,7 @@ def _record(
 ) -> Plans:
     """Record of the result. If the search was not `stopped`, other planners are tried where it failed."""
     from stlc.assurance.verification.planned import PlanRobustness, Plans, PlanSeconds
-    from stlc.controller.planning.missed import better_planner, missed
+    from stlc.controller.search.missed import better_planner, missed
 
     rho, spent = result.rho, result.seconds
     bad = ~result.satisfied & ~result.infeasible

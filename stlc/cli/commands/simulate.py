@@ -50,9 +50,9 @@ if TYPE_CHECKING:
     from stlc.controller.evaluation.deployment import Deployment
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.guard.margins import MarginRequest
-    from stlc.controller.planning.policy import PlannerChoice
     from stlc.controller.policies.policy import Policy
     from stlc.controller.run.run import Run
+    from stlc.controller.search.planner_policy import PlannerChoice
     from stlc.dynamics.declaration.deployment import ScenarioDecl
     from stlc.plants.judge import PlantSimulation
 
@@ -324,8 +324,8 @@ def _deployed(order: _Order, name: str | None, *, writes: bool = True) -> Simula
     from stlc.cli.simulate.watch import Watching
     from stlc.controller.evaluation.rules import rules_of
     from stlc.controller.guard.kind import named_guard
-    from stlc.controller.planning.policy import planner_policy
     from stlc.controller.run.run import Run
+    from stlc.controller.search.planner_policy import planner_policy
 
     run, found = order.run, {}
     if name is not None:

@@ -16,8 +16,8 @@ from stlc.files import real
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
-    from stlc.controller.planning.policy import PlannerChoice
     from stlc.controller.run.config import Clock
+    from stlc.controller.search.planner_policy import PlannerChoice
 
 MOST_SEED = 2**63 - 1
 """Greatest seed of torch's random numbers."""
@@ -119,7 +119,7 @@ def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> Plann
 
     `pairs` are the values `NAME=VALUE` of `--option`. Raises UsageError (U101).
     """
-    from stlc.controller.planning.policy import PlannerChoice
+    from stlc.controller.search.planner_policy import PlannerChoice
 
     options = parse_pairs(pairs, "--option", "NAME=VALUE", "tries=500")
     return PlannerChoice(PLANNERS.chosen(name), options, parse_seconds(budget))

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from stlc.controller.evaluation.executed import model_consistent
-from stlc.controller.planning.traces import meta_of, trace_along
+from stlc.controller.search.plan_traces import meta_of, trace_along
 from stlc.files import atomic_path
 from stlc.rundir import TRACE, UNGUARDED
 from stlc.trace import Trace, save_trace

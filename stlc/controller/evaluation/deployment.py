@@ -20,8 +20,8 @@ from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, jud
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.policy import PlannerPolicy, SearchUse
 from stlc.controller.search.feasibility import solvable
+from stlc.controller.search.planner_policy import PlannerPolicy, SearchUse
 from stlc.controller.world import world_type
 from stlc.jsontext import Num, plain
 

@@ -6,8 +6,8 @@ import json
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from stlc.controller.planning.policy import PlannerChoice, PlannerPolicy, planner_of, planner_policy
 from stlc.controller.run.config import ResolvedConfig
+from stlc.controller.search.planner_policy import PlannerChoice, PlannerPolicy, planner_of, planner_policy
 from stlc.controller.training.config import TrainConfig, base_config
 from stlc.controller.training.method import Method
 from stlc.diagnostics import Diagnostic, RunError

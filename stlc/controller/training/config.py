@@ -18,8 +18,8 @@ from stlc.registry import METHODS, did_you_mean
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from stlc.controller.planning.policy import PlannerChoice
     from stlc.controller.problem.task import Task
+    from stlc.controller.search.planner_policy import PlannerChoice
 
 ENGINE_VERSION = 4
 """Version of the training engine; results of older versions are recomputed."""

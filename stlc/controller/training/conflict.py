@@ -21,9 +21,9 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.ranges import bounds
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.semantics.tolerance import TOLERANCE, violated
-from stlc.controller.planning.missed import better_planner, missed
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import ENOUGH, solve
+from stlc.controller.search.missed import better_planner, missed
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import Diagnostic, Label
 from stlc.native import Stop, never

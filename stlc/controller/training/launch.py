@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
-from stlc.controller.planning.policy import PlannerChoice, planner_of
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import Run, save_config, save_library, spec_hash, system_hash
 from stlc.controller.search.planner import prepared
+from stlc.controller.search.planner_policy import PlannerChoice, planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.controller.training.loop import Watch, prepare, run
 from stlc.diagnostics import usage

@@ -18,9 +18,9 @@ from stlc.assurance.verification.tubes import Tube, TubeModel
 from stlc.assurance.verification.verify import Verifier
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.traces import RANDOM, following
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork, Policy
 from stlc.controller.problem.task import Task
+from stlc.controller.search.plan_traces import RANDOM, following
 from stlc.controller.world import ModelWorld
 from stlc.diagnostics import SystemFileError
 from stlc.dynamics.load import parse_system

@@ -14,10 +14,10 @@ from stlc import Run, System
 from stlc.cli.framework.app import main
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.policy import PlannerChoice
 from stlc.controller.policies.policy import ModelRollout
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import load_config, save_config
+from stlc.controller.search.planner_policy import PlannerChoice
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.launch import Launch, open_folder, open_planner
 from stlc.diagnostics import RunError, SystemFileError, UsageError

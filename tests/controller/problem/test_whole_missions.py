@@ -12,11 +12,11 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, 
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.rules import judge_runs_by_plans
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.policy import FIRST, PlannerPolicy
 from stlc.controller.policies.policy import PlanNetwork
 from stlc.controller.problem.task import LONGEST, Task
 from stlc.controller.search.local_search import SearchResult, remainders
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
+from stlc.controller.search.planner_policy import FIRST, PlannerPolicy
 from stlc.controller.world import ModelWorld
 from stlc.dynamics.system import System
 from stlc.grammar.parser import parse

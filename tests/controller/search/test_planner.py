@@ -10,10 +10,10 @@ from helpers import planner_laws as laws
 from helpers.planner_laws import line_task, planned
 
 import stlc
-from stlc.controller.planning.policy import PlannerPolicy
-from stlc.controller.planning.traces import following, starts_of, trace_of
 from stlc.controller.problem.task import Task
+from stlc.controller.search.plan_traces import following, starts_of, trace_of
 from stlc.controller.search.planner import PlanBudget, PlanSearch, plan, planner_named
+from stlc.controller.search.planner_policy import PlannerPolicy
 from stlc.diagnostics import TraceError, UsageError
 from stlc.monitor.verdict import Monitor
 from stlc.registry import PLANNERS

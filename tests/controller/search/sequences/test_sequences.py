@@ -9,10 +9,10 @@ import pytest
 
 from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.guard.guard import Guard
-from stlc.controller.planning.policy import PlannerPolicy
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
+from stlc.controller.search.planner_policy import PlannerPolicy
 from stlc.controller.search.sequences.phases import Ask
 from stlc.controller.search.sequences.sequences import Sequences
 from stlc.controller.world import world_type

@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers.point import task
 
-from stlc.controller.planning.missed import STARTS, Missed, better_planner, missed
+from stlc.controller.search.missed import STARTS, Missed, better_planner, missed
 
 
 def test_the_requirement_that_most_best_plans_violate_comes_first(tmp_path: Path) -> None:

@@ -1,1 +1,0 @@
-"""Planning without training: search for a plan from each given initial state."""
