@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463704
+NODES = 463706
 CROSSINGS = 6.81
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {

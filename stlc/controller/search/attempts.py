@@ -43,9 +43,11 @@ LEAST = 1e-9
 """Small number that is added to every speed, so that its logarithm is finite."""
 SEEN = 0.1
 """Share of the library of random plans among which each schedule chooses, so that attempts differ."""
+BEGINNINGS, FIRST = 16, 1_000
+"""Number of random plans that a local search improves before the first attempt, the best of them, and number
+of the changed plans that it tries for each."""
 EVERY, BEST, TRIES = 6, 8, 500
-"""Number of steps after which a local search improves plans of the attempts, number of these plans, and of
-the changed plans that it tries for each."""
+"""Number of steps after which it improves plans of the attempts, and the same numbers for these."""
 ORDERED = 2
 """Of the attempts after the first ones, one in so many meets its conditions in the order of time."""
 AFRESH = 0.3
@@ -80,7 +82,10 @@ class Attempts:
                 return
             count = search.affordable(row, LIBRARY + 1) - 1
             library = torch.cat((search.start[row], random_plans(search.task, count, search.generator)))
-            search.offer(row, library[None])
+            rho = search.offer(row, library[None])[0]
+            if bool((search.open() == row).any()):
+                best = library[rho.argsort(descending=True)[:BEGINNINGS]]
+                _improve(search, row, best, FIRST)
         if not bool((search.open() == row).any()):
             return
         with search.charged(row):
@@ -107,7 +112,6 @@ class _Attempts:
     def __init__(self, search: PlanSearch, row: Tensor, library: Tensor, scheduler: GoalScheduler) -> None:
         self._search, self._row, self._library, self._scheduler = search, row, library, scheduler
         self._random = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
-        self._searcher = Searcher(search.task, search.generator, enough=search.budget.target or TOLERANCE)
         conditions, x0 = scheduler.conditions, search.states[row]
         states = search.task.rollout(x0.expand(len(library), -1), library).nan_to_num(0.0, 0.0, 0.0)
         newton = GaussNewton(search.task, conditions, spread_of(search.task, states))
@@ -133,7 +137,7 @@ class _Attempts:
         rho = search.offer(row, descent.plans[None])[0]
         if self._steps % EVERY == 0 and bool((search.open() == row).any()):
             best = descent.plans[rho.argsort(descending=True)[:BEST]]
-            self._polish(torch.cat((search.plans[row], best)))
+            _improve(search, row, torch.cat((search.plans[row], best)), TRIES)
         self._renew(descent.over.nonzero()[0])
 
     def _renew(self, index: NDArray[np.int64]) -> None:
@@ -169,11 +173,12 @@ class _Attempts:
         seen = torch.rand(missed.shape, generator=self._search.generator) < SEEN
         return self._library[torch.where(seen, missed, torch.inf).argmin(1)]
 
-    def _polish(self, plans: Tensor) -> None:
-        """Improve plans, (k, T, m), by local search."""
-        search, row = self._search, self._row
-        plans = plans[: search.allowed(row, len(plans))]
-        tries = max(1, search.affordable(row, TRIES * len(plans)) // len(plans))
-        x0 = search.states[row].expand(len(plans), -1).contiguous()
-        found = self._searcher.repair(x0, plans, plans[:0], tries=tries, stop=search.budget.stop)
-        search.offer(row, found.plans[None], evaluations=tries * len(plans))
+
+def _improve(search: PlanSearch, row: Tensor, plans: Tensor, tries: int) -> None:
+    """Improve plans, (k, T, m), by local search, with at most `tries` changed plans for each."""
+    plans = plans[: search.allowed(row, len(plans))]
+    tries = max(1, search.affordable(row, tries * len(plans)) // len(plans))
+    searcher = Searcher(search.task, search.generator, enough=search.budget.target or TOLERANCE)
+    x0 = search.states[row].expand(len(plans), -1).contiguous()
+    found = searcher.repair(x0, plans, plans[:0], tries=tries, stop=search.budget.stop)
+    search.offer(row, found.plans[None], evaluations=tries * len(plans))
