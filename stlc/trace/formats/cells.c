@@ -129,11 +129,12 @@ static int is_comment(const char *at) {
 
 /* All lines of `text`.
 
-   shape: bytes of text, cells of a line, rows there is room for, doubts there is room for, the mark, the point.
+   shape: bytes of text, cells of a line, rows there is room for, doubts there is room for, the mark, the point, and
+   whether each line ends with a line feed, has so many cells, and has something in them.
    places: for each column its place in `out`, -1 for one that is not wanted.
    out: (wanted, rows). doubts: how many, then row, place, first and last byte of each.
-   Gives the number of rows; -1 for a line with fewer cells or with more that are not blank, for a comment and for
-   quotes that are not closed; -2 for too many doubts. */
+   Gives the number of rows; -1 for a line with fewer cells or with more that are not blank (or otherwise than asked),
+   for a comment and for quotes that are not closed; -2 for too many doubts. */
 int64_t read_cells(const char *text, const int64_t *shape, const int64_t *places, double *out, int64_t *doubts) {
     int64_t width = shape[1], rows = shape[2], row = 0;
     reader r = {.at = text, .end = text + shape[0], .mark = (char)shape[4], .point = (char)shape[5], .fives = {1}};
@@ -158,7 +159,11 @@ int64_t read_cells(const char *text, const int64_t *shape, const int64_t *places
             }
             if (r.at == r.end || *r.at != r.mark) break;
         }
-        r.at++;
+        int fed = *r.at++ == '\n';
+        if (shape[6]) {
+            if (!fed && r.at < r.end && *r.at++ != '\n') return -1;
+            if (!told || column + 1 != width) return -1;
+        }
         if (!told) continue;
         if (column + 1 < width) return -1;
         row++;

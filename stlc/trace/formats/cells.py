@@ -1,14 +1,12 @@
 """Conversion of the cells of a table to numbers: of one cell, of a column, or of many lines at once.
 
-`value_of` says what is a number. Two faster readers give the same numbers: `cells.c` for large texts, if
-there is a C compiler (`stlc.native`), and NumPy for blocks of lines. Both reject texts with unusual cells. A
-slower reader then reads these texts.
+`value_of` says what is a number. `cells.c` gives the same numbers of large texts faster, if there is a C
+compiler (`stlc.native`). It rejects texts with unusual cells.
 """
 
 from __future__ import annotations
 
 import ctypes
-import io
 import math
 import re
 from collections.abc import Sequence
@@ -76,20 +74,6 @@ def numbers(cells: Sequence[str], *, comma: bool) -> tuple[Array, list[int]]:
     return np.array(values, dtype=np.float64), [i for i, value in enumerate(values) if value is None]
 
 
-def load(body: str, delimiter: str, columns: Sequence[int] | None = None) -> Array | None:
-    """Return the numbers of a block of lines, (lines, columns); None if a cell is not a plain number.
-
-    If `columns` is given, only the columns with these indices are read.
-    """
-    if not body.strip():
-        return None
-    body = body.replace(",", ".") if delimiter != "," else body
-    lines = io.TextIOWrapper(io.BytesIO(body.encode()), "utf-8")  # a StringIO is four times as large
-    with suppress(ValueError), lines:
-        return np.loadtxt(lines, delimiter=delimiter, comments=None, ndmin=2, usecols=columns)
-    return None
-
-
 @cache
 def _library() -> ctypes.CDLL | None:
     """The compiled library of `cells.c`; None if there is no C compiler."""
@@ -103,12 +87,13 @@ def _library() -> ctypes.CDLL | None:
 
 
 def read_lines(
-    data: bytes, start: int, width: int, delimiter: str, wanted: Sequence[int]
+    data: bytes, start: int, width: int, delimiter: str, wanted: Sequence[int], *, each: bool = False
 ) -> list[Array] | None:
     """Return the columns `wanted` of a table of numbers in UTF-8 from byte `start` on, (lines,) each.
 
     The table has `width` columns. If the delimiter is no comma, numbers may have decimal commas. Any line
-    ending is allowed. Lines of empty cells are left out; in others, empty cells are NaN. None is returned if
+    ending is allowed. Lines of empty cells are left out; in others, empty cells are NaN. If `each` is set,
+    each line must have `width` cells that are not all empty, and end with a line feed. None is returned if
     there is no C compiler, or if a line or a wanted cell is unusual.
     """
     library = _library()
@@ -119,7 +104,7 @@ def read_lines(
     rows = min(ends, len(text) // width) + 1
     most = rows * len(wanted) // _DOUBTS + 1
     point = "," if comma else "."
-    shape = np.array([len(text), width, rows, most, ord(delimiter), ord(point)], dtype=np.int64)
+    shape = np.array([len(text), width, rows, most, ord(delimiter), ord(point), each], dtype=np.int64)
     places = np.full(width, -1, dtype=np.int64)
     places[list(wanted)] = range(len(wanted))
     try:

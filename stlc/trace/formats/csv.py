@@ -24,7 +24,7 @@ from stlc.diagnostics import Diagnostic, TraceError
 from stlc.escape import spreadsheet
 from stlc.files import write_atomic
 from stlc.source import Span
-from stlc.trace.formats.cells import Array, bare, is_missing, load, number_of, numbers, read_lines
+from stlc.trace.formats.cells import Array, bare, is_missing, number_of, numbers, read_lines
 from stlc.trace.formats.layout import (
     BLANKS,
     COMMENT,
@@ -47,11 +47,11 @@ if TYPE_CHECKING:
 
 __all__ = ["chunks", "delimiter_of", "filled", "head_cells", "read", "size", "split_head", "write"]
 
-LARGE = 4_000_000
+LARGE = 1_000_000
 """Size in bytes from which on a file is parsed without decoding it to text."""
 
 _HEAD_BYTES = 1 << 16
-STRETCH = 1 << 18
+STRETCH = 1 << 15
 """Characters of a block of lines."""
 _FIRST = 4096
 """Characters of the first block, which tells which columns hold words."""
@@ -116,11 +116,6 @@ def _whole_rows(lines: Iterator[bytes], samples: int, delimiter: str) -> Iterato
             yield rows.raw.encode("latin-1")
         else:
             yield line
-
-
-def _is_plain(text: str) -> bool:
-    """True if there are no quotes and no comments in some lines, so that each line is a row."""
-    return not any(mark in text for mark in ('"', "#", "%", "//"))
 
 
 class _Body:
@@ -201,12 +196,10 @@ class _Body:
 
     def _block(self, begin: int, end: int) -> int:
         block = self.text[begin:end]
-        if self.mark != BLANKS and self._load(block):
-            return end
-        if _is_plain(block):
-            rows = [line.split(None if self.mark == BLANKS else self.mark) for line in block.split("\n")]
-        else:
+        if any(mark in block for mark in ('"', "#", "%", "//")):
             rows, end = self._rows(begin, end)
+        else:
+            rows = [line.split(None if self.mark == BLANKS else self.mark) for line in block.split("\n")]
         aligned = {k: self._aligned(row) for k, row in enumerate(rows) if self._is_filled(row)}
         if ragged := [k for k, row in aligned.items() if row is None]:
             self.wrong.setdefault(_RAGGED, []).append((begin, ragged[0], len(ragged)))
@@ -214,28 +207,6 @@ class _Body:
         for i in self.kept:
             self._take(i, [row[i] for row in full.values()], begin, list(full))
         return end
-
-    def _load(self, block: str) -> bool:
-        words = [i for i in self.kept if self.kinds.get(i)]
-        numbers = places = [i for i in self.kept if i not in words]
-        rows: list[list[str]] = []
-        values = None if words else load(block, self.mark)
-        if values is None or values.shape[1] != self.width:
-            if not numbers or len(self.kinds) < len(self.kept) or not _is_plain(block):
-                return False
-            lines = [line for line in block.split("\n") if line.strip()]
-            aligned = all(line.count(self.mark) == self.width - 1 for line in lines)
-            values = load(block, self.mark, numbers) if aligned else None
-            if values is None or len(values) != len(lines):
-                return False
-            rows = [line.split(self.mark) for line in lines] if words else []
-            places = list(range(len(numbers)))
-        for i, k in zip(numbers, places, strict=True):
-            self.kinds[i] = False
-            self.parts[i].append(values[:, k].copy())
-        for i in words:
-            self.parts[i].append(np.array([row[i].strip()[:MAX_LETTERS] for row in rows]))
-        return True
 
     def _rows(self, begin: int, end: int) -> tuple[list[list[str]], int]:
         found, rows = list[list[str]](), Rows(lines_of(self.text, begin), self.mark, begin)

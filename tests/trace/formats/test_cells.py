@@ -20,7 +20,7 @@ from stlc import native
 from stlc.diagnostics import StlcError
 from stlc.trace.formats import cells as trace_cells
 from stlc.trace.formats import csv as trace_csv
-from stlc.trace.formats.cells import load, numbers, read_lines, value_of
+from stlc.trace.formats.cells import numbers, read_lines, value_of
 from stlc.trace.formats.csv import read
 from stlc.trace.formats.jsonl import _DECODER
 from stlc.trace.recording import ALL, Recording, Wanted
@@ -58,7 +58,7 @@ DAMAGE = st.sampled_from(
 WANTED = st.sampled_from([ALL, ALL, Wanted(frozenset("a")), Wanted(frozenset("bc")), Wanted(frozenset())])
 
 
-@pytest.fixture(params=["kernel", "numpy"])
+@pytest.fixture(params=["kernel", "python"])
 def reader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every way of reading many lines."""
     if request.param != "kernel":
@@ -161,8 +161,6 @@ def require_floats(texts: list[str]) -> None:
 
     check("cell", [value_of(text) for text in texts])
     check("column", numbers(texts, comma=False)[0])
-    block = load("\n".join(texts), ",")
-    check("numpy", None if block is None else block[:, 0])
     plain = [text.lstrip("+") for text in texts]
     lawful = [text for text in plain if JSON_NUMBER.fullmatch(text)]
     of_json = _DECODER.decode(f"[{','.join(lawful)}]")
@@ -209,18 +207,6 @@ def test_large_tables_are_read_like_small_ones(choose: Callable[[int], None]) ->
         careful = outcome(data, wanted)
         choose(ALWAYS)
         assert outcome(data, wanted) == careful
-
-    agree()
-
-
-def test_blocks_that_numpy_reads_are_read_like_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    @given(texts(), WANTED)
-    @settings(deadline=None, max_examples=60)
-    def agree(data: bytes, wanted: Wanted) -> None:
-        usual = outcome(data, wanted)
-        with monkeypatch.context() as patch:
-            patch.setattr(trace_csv, "load", lambda *_: None)
-            assert outcome(data, wanted) == usual
 
     agree()
 
@@ -282,7 +268,9 @@ def test_memory_is_that_of_the_text_and_the_numbers(choose: Callable[[int], None
 
 
 @pytest.mark.bench
-def test_without_a_compiler_a_table_takes_as_long_as_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_a_table_takes_three_times_as_long_as_numpy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rows = [",".join(map(repr, row)) for row in np.random.default_rng(0).normal(size=(280_000, 9)).tolist()]
     data = "\n".join(["t,a,b,c,d,e,f,g,h", *rows]).encode()
     gaps = "\n".join(
@@ -298,4 +286,4 @@ def test_without_a_compiler_a_table_takes_as_long_as_numpy(monkeypatch: pytest.M
         read_text(text)
         spent = time.process_time() - begun
         print(f"{name}: {spent:.2f} s, {spent / by_numpy:.2f} times")  # noqa: T201
-        assert name != "numbers" or spent < 1.5 * by_numpy
+        assert name != "numbers" or spent < 3 * by_numpy
