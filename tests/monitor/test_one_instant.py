@@ -45,7 +45,7 @@ def test_it_is_judged_as_the_recording_is(name: str, end, at: int) -> None:
     for online in (pushed, fed):
         tally = online.finish()["r"]
         assert (tally.low, tally.high) == wanted.bounds
-        assert (tally.status, tally.instants, tally.worst) == (wanted.overall, 1, at)
+        assert (tally.status, tally.instants, tally.low_at, tally.high_at) == (wanted.overall, 1, at, at)
         cause, known = online.cause("r"), explain(verdict, "r")
         if cause is not None and known is not None:
             assert (cause.start, cause.sample, cause.because) == (known.start, known.sample, known.because)

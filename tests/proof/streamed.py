@@ -138,7 +138,7 @@ def check_end(case: Case, monitor: Monitor, online: Online, at: Any) -> None:
         assert wanted == tally, case
         return
     case.same((tally.low, tally.high), wanted.bounds, f"{end}, at the end")
-    found = (tally.status, tally.instants, tally.share)
+    found = (tally.status, tally.instants, tally.holds / tally.instants)
     assert found == (wanted.overall, wanted.instants, wanted.share), case
 
 

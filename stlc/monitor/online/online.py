@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, TypeAlias, final
+from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 
 from stlc.compile.backends.c.streams import Rule, streams_of
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import endless, farthest
-from stlc.compile.ir.traverse import map_children, numbers
+from stlc.compile.ir.support import endless
+from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import Diagnostic, TraceError, usage
@@ -25,7 +25,6 @@ from stlc.monitor.online.kernel import After, Starts, StreamKernel, Watching
 from stlc.monitor.online.recompute import RecomputeTracker, require_bounded, without_end
 from stlc.monitor.online.tally import Flags, JudgedInstants, RequirementSummary
 from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
-from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.signals import Gap, Need, arrange, needs_of
 from stlc.monitor.values import Ends, decisive
 from stlc.trace import Trace
@@ -35,8 +34,6 @@ Sample: TypeAlias = Mapping[str, Any]
 
 _BEYOND_FLOATS = 1 << 1023
 _ROWS = frozenset((list, tuple))
-_LATE = 4096
-"""Samples that are moved to the buffer of reasons at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,32 +81,6 @@ class How:
     reasons: bool = False
 
 
-class Watched(Protocol):
-    """A requirement and its running verdict.
-
-    A start is an instant at which the requirement is evaluated. It is counted when its value is final and its
-    windows are complete.
-    """
-
-    @property
-    def asked(self) -> Asked:
-        """The requirement, and where it is evaluated."""
-
-    @property
-    def tally(self) -> RequirementSummary:
-        """Summary of the counted starts."""
-
-    @property
-    def news(self) -> dict[int, Status]:
-        """Starts that the latest sample decided, in order, and their verdicts."""
-
-    def live(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at starts while the trace continues; at most the first of them is counted."""
-
-    def ended(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at starts that are not counted, once the trace has ended."""
-
-
 @final
 @dataclass(frozen=True, slots=True)
 class Asked:
@@ -139,15 +110,6 @@ class Asked:
         if not self.everywhere:
             return 0
         return (self.horizon or 0) if self.rule.windowed else self.rule.reach
-
-    @property
-    def ahead(self) -> int:
-        """Samples after a start until its value is final."""
-        window, formula = window_of(self.rule, self.horizon), self.rule.formula
-        if window is None and endless(formula):
-            return FAR
-        later = max((farthest(num).future for num in numbers(formula)), default=0)
-        return later + (self.rule.reach if window is None else window)
 
     def streamed(self, signals: Sequence[str]) -> Rule | None:
         """The requirement of a kernel; None if it has no transducers."""
@@ -189,22 +151,23 @@ class Streamed:
 
     @property
     def tally(self) -> RequirementSummary:
+        """Summary of the counted starts."""
         return self.kernel.tally(self.number)
 
     @property
     def news(self) -> dict[int, Status]:
+        """Starts that the latest sample decided, in order, and their verdicts."""
         return self.kernel.news(self.number)
 
     def live(self, starts: range) -> JudgedInstants:
+        """Bounds and verdicts at starts while the trace continues; at most the first of them is counted."""
         counted = starts.start < self.tally.next
         rest = starts[1:] if counted else starts
         found = self._look(rest, "growing" if self.asked.ending == "truncate" else "open")
-        known = range(rest.start, min(self.kernel.samples - self.asked.ahead, rest.stop))
-        if self.asked.ending == "truncate" and known:
-            found = self._look(known, "clipped").followed_by(found, len(known))
         return self.kernel.last(self.number).followed_by(found) if counted else found
 
     def ended(self, starts: range) -> JudgedInstants:
+        """Bounds and verdicts at starts that are not counted, once the trace has ended."""
         if self.asked.ending != "truncate":
             return self._look(starts, "ended")
         found = self._look(starts, "clipped")
@@ -222,8 +185,8 @@ class Recomputed:
 
     Attributes:
         asked: the requirement.
-        tally: as in `Watched`.
-        news: as in `Watched`.
+        tally: as of `Streamed`.
+        news: as of `Streamed`.
     """
 
     asked: Asked
@@ -282,9 +245,11 @@ class Recomputed:
         return min(map(self._values.needs, starts), default=self._values.samples)
 
     def live(self, starts: range) -> JudgedInstants:
+        """Return what `Streamed.live` does."""
         return self._judged(starts, RecomputeTracker.live)
 
     def ended(self, starts: range) -> JudgedInstants:
+        """Return what `Streamed.ended` does."""
         return self._judged(starts, RecomputeTracker.ended)
 
     def _judged(
@@ -294,6 +259,14 @@ class Recomputed:
             return JudgedInstants.of(np.zeros((0, 4)), 0.0)
         parts = [*bounds(self._values, starts), *bounds(self._truths or self._values, starts)]
         return JudgedInstants.of(np.concatenate(parts, axis=1), self.asked.tolerance)
+
+
+Watched: TypeAlias = Streamed | Recomputed
+"""A requirement and its running verdict.
+
+A start is an instant at which the requirement is evaluated. It is counted in `tally` when its value is
+final and its windows are complete. `news` are the starts that the latest sample decided, in order.
+"""
 
 
 class Online:
@@ -321,7 +294,6 @@ class Online:
         self._history = ColumnHistory()
         self._gaps: dict[str, Gap] = {}
         self._buffer = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
-        self._late: list[Sequence[float]] = []
         self._plain = self._kernel is not None and not self._recomputed and self._buffer is None
 
     def _ask(self, rule: CompiledRequirement, *, once: bool = False) -> Asked:
@@ -336,7 +308,7 @@ class Online:
         deciding = decisive(rule, self.how.tolerance, self.compiled.signature)
         return Asked(rule, deciding, begin, everywhere, horizon, ending, self.how.tolerance)
 
-    def _watch(self, asked: Sequence[Asked]) -> tuple[StreamKernel | None, list[Streamed | Recomputed]]:
+    def _watch(self, asked: Sequence[Asked]) -> tuple[StreamKernel | None, list[Watched]]:
         """Kernel of all requirements that have transducers, and what watches each requirement."""
         streamed = {
             i: rule for i, each in enumerate(asked) if (rule := each.streamed(self.signals)) is not None
@@ -364,44 +336,30 @@ class Online:
         try:
             row: Any = sample
             if type(sample) not in _ROWS and isinstance(sample, Mapping):
-                row = self._row(sample)
-            return self._kernel.push(row) if self._plain else self._pushed(row)  # type: ignore[union-attr]
-        except (TypeError, ValueError, OverflowError):
+                row = [sample[name] for name in self.signals]
+            return self._kernel.push(row) if self._plain else self.push_block([row])[0]  # type: ignore[union-attr]
+        except (KeyError, TypeError, ValueError, OverflowError):
             pass
         if isinstance(sample, Mapping):
-            return self._pushed([_number(sample, need) for need in self._needs])
+            return self.push_block([[_number(sample, need) for need in self._needs]])[0]
+        raise self._no_row() from None
+
+    def _no_row(self) -> TraceError:
         message = f"a sample is one number for each of {', '.join(self.signals)}"
-        raise TraceError(Diagnostic("E605", message)) from None
+        return TraceError(Diagnostic("E605", message))
 
-    def _row(self, sample: Sample) -> list[Any]:
-        try:
-            return [sample[name] for name in self.signals]
-        except KeyError:
-            return [_number(sample, need) for need in self._needs]
-
-    def _pushed(self, row: Sequence[float]) -> int:
-        decided = 0
-        if self._kernel is not None:
-            decided = self._kernel.push(row)
-        if self._recomputed:
-            numbers = np.array(row, dtype=np.float64).reshape(1, -1)
-            self._store(numbers)
-            for each in self._recomputed:
-                each.take(self._history)
-                decided += len(each.news)
-            self._forget()
-        if self._buffer is not None:
-            self._late.append(tuple(row))
-            if len(self._late) > _LATE:
-                self._fill()
-        return decided
-
-    def push_block(self, rows: Floats, *, pause: bool = False) -> tuple[int, int]:
+    def push_block(self, rows: Floats | Sequence[Any], *, pause: bool = False) -> tuple[int, int]:
         """Add samples, (count, signals); with `pause`, up to the first that decides a start.
 
         Returns:
             The number of starts that are decided, and the number of samples taken.
+
+        Raises:
+            TraceError: E605, the array has another shape.
         """
+        rows = np.asarray(rows, dtype=np.float64)
+        if rows.shape[1:] != (len(self.signals),):
+            raise self._no_row()
         if pause and (self._recomputed or self._kernel is None):
             rows = rows[:1]
         decided, taken = 0, len(rows)
@@ -412,10 +370,12 @@ class Online:
             for each in self._recomputed:
                 each.take(self._history)
                 decided += len(each.news)
-            self._forget()
+            self._history.forget(min(each.needs for each in self._recomputed))
         if self._buffer is not None:
-            self._fill()
-            self._keep(np.asarray(rows[:taken], dtype=np.float64))
+            self._buffer.take(self._columns(rows[:taken]), taken)
+            if self._buffer.full:
+                found = [(watched.asked.rule, self._worst(watched)) for watched in self._watched]
+                self._buffer.forget([(rule, worst) for rule, worst in found if worst is not None])
         return decided, taken
 
     def feed(self, signals: Mapping[str, Any] | Trace) -> int:
@@ -426,10 +386,13 @@ class Online:
         Raises:
             TraceError: the errors of `push`.
         """
+        return self.push_block(self.rows(signals))[0]
+
+    def rows(self, signals: Mapping[str, Any] | Trace) -> Floats:
+        """Return many samples as rows, (count, signals). Raises the errors of `push`."""
         laid = arrange(signals, self._needs, plain=True)
         columns = [np.asarray(laid.env[name]).reshape(-1) for name in self.signals]
-        rows = np.stack(columns, axis=1) if columns else np.zeros((laid.samples, 0))
-        return self.push_block(rows)[0]
+        return np.stack(columns, axis=1) if columns else np.zeros((laid.samples, 0))
 
     def _store(self, rows: Floats) -> None:
         """Store samples, (count, signals), for requirements that are evaluated anew."""
@@ -443,22 +406,6 @@ class Online:
     def _columns(self, rows: Floats) -> dict[str, Floats]:
         found = {name: rows[:, i : i + 1] for i, name in enumerate(self.signals)}
         return found or {"": np.zeros((len(rows), 1))}
-
-    def _forget(self) -> None:
-        self._history.forget(min(each.needs for each in self._recomputed))
-
-    def _fill(self) -> None:
-        """Move the latest samples to the buffer of reasons."""
-        if self._late:
-            self._keep(np.array(self._late, dtype=np.float64).reshape(len(self._late), -1))
-            self._late.clear()
-
-    def _keep(self, rows: Floats) -> None:
-        assert self._buffer is not None
-        self._buffer.take(self._columns(rows), len(rows))
-        if self._buffer.full:
-            found = [(watched.asked.rule, self._worst(watched)) for watched in self._watched]
-            self._buffer.forget([(rule, worst) for rule, worst in found if worst is not None])
 
     def verdicts(self) -> tuple[Decision, ...]:
         """Verdicts that the latest sample decided, in the order of the requirements."""
@@ -522,11 +469,10 @@ class Online:
 
         Raises UsageError (U101) for another start.
         """
-        watched = self._find(name)
-        if start not in self._pending(watched):
+        found = {at: (low, high) for at, low, high in self.open_starts(name)}
+        if start not in found:
             raise usage(f"`{name}` is not open at sample {start}")
-        judged = watched.live(range(start, start + 1))
-        return float(judged.low[0]), float(judged.high[0])
+        return found[start]
 
     def _pending(self, watched: Watched) -> range:
         if isinstance(watched, Recomputed):
@@ -564,11 +510,9 @@ class Online:
         if not self.samples:
             raise TraceError(Diagnostic("E605", "there are no samples"))
         if self.how.end == "strict":
-            findings = [
-                check_length(each.asked.rule, self.samples, self._starts(each), self.compiled.grid)
-                for each in self._watched
-            ]
-            if refused := [finding for finding in findings if finding is not None]:
+            grid = self.compiled.grid
+            found = (check_length(w.asked.rule, self.samples, self._starts(w), grid) for w in self._watched)
+            if refused := [*filter(None, found)]:
                 raise TraceError(*refused)
         return {watched.asked.rule.name: self._ended(watched) for watched in self._watched}
 
@@ -601,7 +545,6 @@ class Online:
         watched = self._find(name)
         if self._buffer is None or (worst := self._worst(watched)) is None:
             return None
-        self._fill()
         return self._buffer.cause(watched.asked.rule, worst)
 
     def _find(self, name: str) -> Watched:
@@ -618,9 +561,7 @@ def _number(sample: Sample, need: Need) -> float:
         return value
     if isinstance(value, int):
         return float(value) if abs(value) < _BEYOND_FLOATS else math.inf
-    names = (need.column.name, need.column.name.partition("[")[0])
-    given = {name: [sample[name]] for name in names if name in sample}
-    laid = arrange(given or {name: [0.0] for name in sample}, [need], plain=True)
+    laid = arrange({name: [each] for name, each in sample.items()}, [need], plain=True)
     if laid.samples != 1 or laid.shape:
         message = f"`{need.column.name}` is one number of a sample, and several are given"
         raise TraceError(Diagnostic("E605", message, need.span, note=(f"needed by: {', '.join(need.by)}",)))

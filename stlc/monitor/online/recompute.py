@@ -85,16 +85,13 @@ class RecomputeTracker:
     def live(self, starts: range) -> tuple[Floats, Floats]:
         """Least and greatest robustness over all continuations, (instants, traces) each."""
         middle = starts.start if self.ending == "open" else min(max(self.settled, starts.start), starts.stop)
-        parts = []
-        if middle > starts.start:
-            record, known = Record.of(self._signals, NUMPY), self._shifted(range(starts.start, middle))
-            parts.append(cut_bounds(self.rule, record, known, self.horizon, "truncate"))
-        if middle < starts.stop:
-            record, rest = (
-                Record.of(with_seen(self._signals), NUMPY),
-                self._shifted(range(middle, starts.stop)),
-            )
-            parts.append(growing_bounds(*self._bounds, record, rest, self.window))
+        known, rest, parts = range(starts.start, middle), range(middle, starts.stop), []
+        if known:
+            record = Record.of(self._signals, NUMPY)
+            parts.append(cut_bounds(self.rule, record, self._shifted(known), self.horizon, "truncate"))
+        if rest:
+            record = Record.of(with_seen(self._signals), NUMPY)
+            parts.append(growing_bounds(*self._bounds, record, self._shifted(rest), self.window))
         low, high = (np.concatenate(ends) for ends in zip(*parts, strict=True))
         return low, high
 
@@ -112,20 +109,13 @@ def require_bounded(rule: CompiledRequirement, window: int | None, *, everywhere
     """Check the work of one evaluation; `window` is the length of a planning window whose end moves.
 
     Raises:
-        UsageError: E313, every instant reads too many values that no other instant reads: those in a
-            `freeze`, or up to an `end` of its own.
+        UsageError: E313, every instant reads too many values in a `freeze`, which no other instant reads.
     """
-    spanned = _span(rule.formula) + (window or 0)
-    many = spanned if everywhere or endless(rule.formula) else 1
-    work, heaviest = max(
-        _own(rule.formula, many),
-        ((window or 0) * (spanned if everywhere else 1), rule.formula),
-        key=lambda own: own[0],
-    )
+    many = _span(rule.formula) + (window or 0) if everywhere or endless(rule.formula) else 1
+    work, heaviest = _own(rule.formula, many)
     if work > MOST:
-        freeze = isinstance(heaviest, ir.Freeze)
-        what = "every instant keeps values of its own" if freeze else "`end` moves"
-        message = f"a stream cannot judge `{rule.name}`: {what}, and {work:,} samples to look at"
+        what = f"every instant keeps values of its own, and {work:,} samples to look at"
+        message = f"a stream cannot judge `{rule.name}`: {what}"
         advice = ("shorten its intervals", "`stlc check SPEC TRACE` judges a recording")
         raise UsageError(Diagnostic("E313", message, heaviest.span or rule.span, help=advice))
 

@@ -33,9 +33,9 @@ class JudgedInstants(NamedTuple):
         low, high, least, most = bounds.T
         return JudgedInstants(low, high, satisfied(least, tolerance), violated(most, tolerance))
 
-    def followed_by(self, other: JudgedInstants, first: int = 0) -> JudgedInstants:
-        """These instants, then those of `other` from number `first` on."""
-        return JudgedInstants(*(np.concatenate([a, b[first:]]) for a, b in zip(self, other, strict=True)))
+    def followed_by(self, other: JudgedInstants) -> JudgedInstants:
+        """These instants, then those of `other`."""
+        return JudgedInstants(*(np.concatenate(both) for both in zip(self, other, strict=True)))
 
     def widened(self, where: Flags, other: JudgedInstants) -> JudgedInstants:
         """Bounds and verdicts that hold for both at the instants `where`."""
@@ -110,13 +110,3 @@ class RequirementSummary:
         if self.low == self.high or self.status == "satisfied":
             return self.low
         return self.high if self.status == "violated" else math.nan
-
-    @property
-    def worst(self) -> int:
-        """The instant of `high` if the requirement is violated, else the instant of `low`."""
-        return self.high_at if self.fails else self.low_at
-
-    @property
-    def share(self) -> float:
-        """Share of the counted instants at which the requirement certainly holds."""
-        return self.holds / self.instants if self.instants else math.nan

@@ -21,6 +21,7 @@ from stlc.compile.pipeline import Compiled
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.online.online import How, Online, Recomputed, Streamed
+from stlc.monitor.online.recompute import RecomputeTracker
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, bounds, decisive
 from stlc.monitor.verdict import Monitor
@@ -66,14 +67,15 @@ def check_stream(formula: ir.Formula, trace: dict[str, np.ndarray], how: How) ->
     """Compare a stream with the evaluator after each sample, and at its end."""
     rule = random_formulas.a_rule(formula)
     online = Online(compiled(), [rule], how)
-    watched, name = online._watched[0], rule.name
+    name, values = rule.name, RecomputeTracker(rule, None, "truncate")
     deciding = decisive(rule, how.tolerance, compiled().signature).formula
     everywhere, cut, said = online.repeats(name), how.end == "truncate", {}
     for k in range(len(trace["x"])):
         known = {each: x[: k + 1] for each, x in trace.items()}
         assert online.push({each: x[k, 0] for each, x in known.items()}) == len(online.verdicts())
         starts = range(k + 1 if everywhere else 1)
-        settled = k + 1 - watched.asked.ahead
+        values.grow(known, 0, k + 1)
+        settled = values.settled
         low, high = so_far(formula, known, starts, settled, cut=cut)
         for decision in online.verdicts():
             assert decision.start not in said
@@ -111,21 +113,23 @@ def test_a_stream_gives_what_the_whole_trace_gives(written, trace, end, toleranc
 
 
 @settings(max_examples=EXAMPLES // 2, deadline=None)
-@given(written=random_formulas.formulas(held=()), trace=random_formulas.traces(1, 14, 1))
-def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written, trace) -> None:
+@given(
+    random_formulas.formulas(held=()), random_formulas.traces(1, 14, 1), st.sampled_from(["open", "truncate"])
+)
+def test_frozen_values_and_other_samples_give_what_the_whole_trace_gives(written, trace, end) -> None:
     formula = simplify(lower(written, random_formulas.GRID, []))
     at = None if random_formulas.a_rule(formula).uses_end else "all"
-    check_stream(formula, trace, How(at))
+    check_stream(formula, trace, How(at, end))
 
 
 @settings(max_examples=EXAMPLES // 2, deadline=None)
-@given(written=random_formulas.formulas(), trace=random_formulas.traces(1, 14, 1))
-def test_without_a_compiler_a_stream_is_evaluated_anew(written, trace) -> None:
+@given(random_formulas.formulas(), random_formulas.traces(1, 14, 1), st.sampled_from(["open", "truncate"]))
+def test_without_a_compiler_a_stream_is_evaluated_anew(written, trace, end) -> None:
     formula = simplify(lower(written, random_formulas.GRID, []))
     at = None if random_formulas.a_rule(formula).uses_end else "all"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native, "load", lambda _: None)
-        online = check_stream(formula, trace, How(at))
+        online = check_stream(formula, trace, How(at, end))
     assert isinstance(online._watched[0], Recomputed)
 
 
