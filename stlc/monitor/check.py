@@ -280,12 +280,12 @@ def write_robustness(path: Path, verdict: Verdict, question: Question) -> None:
 
 
 def judge_lines(
-    lines: Iterator[bytes],
+    pieces: Iterator[bytes],
     question: Question,
     name: str,
     tell: Callable[[Decision, Online], object] | None,
 ) -> Verdict:
-    """Judge lines of samples, a table with a header or JSON, as they come.
+    """Judge lines of samples, a table with a header or JSON, as pieces of their text come.
 
     `name` names them in messages, and `tell` is told each verdict on an instant as soon as it is decided.
 
@@ -303,9 +303,9 @@ def judge_lines(
         raise usage(f"`--semantics` needs the whole trace, and the {name} is judged line by line")
     reading = reading_options(monitor, question)
     stream = SampleStream(name, reading)
-    uniform = on_grid(stream.moments(lines), reading, name)
-    known = monitor.online(How(), require=question.require, dt=uniform.dt).compiled.grid.dt
-    at = instant_of(question.at, f"the {name}", float(known or 0), uniform.t0, None)
+    uniform = on_grid(stream.samples(pieces), reading, name)
+    step = uniform.dt or monitor.compiled.grid.dt or 0
+    at = instant_of(question.at, f"the {name}", float(step), uniform.t0, None)
     how = How(at, question.end, question.tolerance, uniform.t0, reasons=True)
     online = monitor.online(how, require=question.require, dt=uniform.dt)
     return watched(online, uniform, stream.units, name, tell)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.monitor.facts.requirements import part_facts
@@ -17,7 +18,7 @@ from stlc.trace.resample import TimeRange
 
 if TYPE_CHECKING:
     from stlc.monitor.online.online import Decision, Online
-    from stlc.trace.live import Sample, Uniform
+    from stlc.trace.live import Samples, Uniform
     from stlc.trace.recording import Conversion
 
 CLOCK = "t"
@@ -81,15 +82,18 @@ def watched(
         TraceError: a sample lacks a signal, or a value or unit does not fit.
     """
     changes = _conversions(online, units, name)
-    for sample in uniform.samples:
+    for samples in uniform.samples:
         try:
-            decided = online.push(_in_units(sample, changes, online))
+            rows = _rows(samples, changes, online)
         except TraceError as error:
             where = f"sample {online.samples} of the {name}"
             raise TraceError(*(finding.with_note(where) for finding in error.diagnostics)) from None
-        if decided and tell is not None:
-            for decision in online.verdicts():
-                tell(decision, online)
+        while len(rows):
+            decided, taken = online.push_block(rows, pause=tell is not None)
+            rows = rows[taken:]
+            if decided and tell is not None:
+                for decision in online.verdicts():
+                    tell(decision, online)
     found = verdict_of(online, name)
     if not (aside := uniform.aside()):
         return found
@@ -107,30 +111,24 @@ def _conversions(online: Online, units: Mapping[str, str], name: str) -> dict[st
     Raises:
         TraceError: E605, a unit is invalid, or has another dimension than the declared one.
     """
-    from stlc.trace.recording import conversion
-    from stlc.units import celsius_advice, parse_unit
+    from stlc.trace.recording import conversion, unit_of
 
-    changes: dict[str, Conversion] = {}
-    for column in online.compiled.signature.columns:
-        if not units.get(column.name):
-            continue
-        try:
-            recorded = parse_unit(units[column.name])
-        except ValueError as error:
-            message = f"column `{column.name}` of the {name}: {error}"
-            advice = celsius_advice(units[column.name])
-            raise TraceError(Diagnostic("E605", message, help=advice)) from None
-        change = conversion(name, column, recorded)
-        if change is not None:
-            changes[column.name] = change
-    return changes
+    columns = [column for column in online.compiled.signature.columns if column.name in units]
+    recorded = {column: unit_of(name, column.name, units[column.name]) for column in columns}
+    found = {column.name: conversion(name, column, unit) for column, unit in recorded.items()}
+    return {signal: change for signal, change in found.items() if change is not None}
 
 
-def _in_units(sample: Sample, changes: Mapping[str, Conversion], online: Online) -> Sample:
-    """Return `sample` with its values converted to the units that the specification declares.
+def _rows(samples: Samples, changes: Mapping[str, Conversion], online: Online) -> NDArray[np.float64]:
+    """Return samples as rows, (samples, signals), in the units that the specification declares.
 
-    `changes` maps the name of a signal to the function that converts its values. If the sample has no time,
-    its time is added. This time follows from the time step and the number of samples before it.
+    `changes` maps the name of a signal to the function that converts its values. If the samples have no
+    signal `t`, it is their time, which follows from the time step and the number of samples before.
     """
-    converted = {name: change(sample[name]) for name, change in changes.items() if name in sample}
-    return {CLOCK: online.time(online.samples), **sample, **converted}
+    begin, found = online.samples, dict(samples.columns)
+    if CLOCK in online.signals or not found:
+        found = {CLOCK: np.array([online.time(begin + k) for k in range(samples.count)]), **found}
+    found |= {name: change(found[name]) for name, change in changes.items() if name in found}
+    if online.signals and found.keys() >= {*online.signals}:
+        return np.stack([found[name] for name in online.signals], axis=1)
+    return online.rows(found)

@@ -502,6 +502,11 @@ class StreamClock:
             raise _which(trace, best)
         return StreamClock(best[0], replace(setting, name=best[0]), units[best[0]])
 
+    def times(self, numbers: Floats) -> Floats | None:
+        """Return the times that numbers state, in seconds, once `seconds` has seen one; None before."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return None if self._origin is None else (numbers - float(self._origin)) * self._scale
+
     def seconds(self, value: object) -> float | None:
         """Return the time that a number or a text states, in seconds; None if it states none."""
         number = value_of(value) if isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""Reading of samples that arrive line by line, as a table with a header or as JSON.
+"""Reading of samples that arrive in pieces of text, as a table with a header or as JSON.
 
 The samples are on one time grid. Names, units, words and times in a line are interpreted as in a file
 (`stlc.trace.formats.csv`).
@@ -11,15 +11,16 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.jsontext import loads
 from stlc.trace.clocks import StreamClock
 from stlc.trace.enums import number_of_word
-from stlc.trace.formats.cells import bare, value_of
+from stlc.trace.formats.cells import bare, number_of, read_lines, value_of
 from stlc.trace.formats.csv import delimiter_of, filled, head_cells, split_head
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.recording import CLOCK, absent
@@ -37,22 +38,40 @@ from stlc.trace.time_grid import (
 from stlc.trace.trace import Reading
 from stlc.trace.tracks import OneTrace
 
-Sample = Mapping[str, float]
-"""Signal -> number; NaN where it is unknown. The components of a vector are `q[0]`, `q[1]`, …"""
+Floats = NDArray[np.float64]
 
+PIECE = 1 << 16
+"""Greatest size in bytes of a piece that is read at once."""
 MAX_LINE = 1_000_000
 
 _BEYOND_FLOATS = 2**1000
 _AT_ONCE = 4096
 _SLACK = 1e-9
+_TIME = ""
+"""Key of the time of a line; no signal is called so."""
+_SHORT = 2048
+"""Size in bytes of text that is read line by line if any of its lines is unusual."""
 
 
 @dataclass(frozen=True, slots=True)
-class TimedSample:
-    """A sample with its time in seconds; the time is None if the stream contains no times."""
+class Samples:
+    """Consecutive samples of the same signals, at least one.
 
-    time: float | None
-    sample: Sample
+    Attributes:
+        count: number of samples.
+        times: their times in seconds, (samples,); None if the stream contains no times.
+        columns: signal -> its numbers, (samples,); NaN where unknown. The components of a vector are `q[0]`,
+            `q[1]`, …
+    """
+
+    count: int
+    times: Floats | None
+    columns: Mapping[str, Floats]
+
+    def timed(self, times: Floats) -> Samples:
+        """Return as many of the first samples as there are `times`, which become theirs."""
+        columns = {name: values[: len(times)] for name, values in self.columns.items()}
+        return Samples(len(times), times, columns)
 
 
 @dataclass(slots=True)
@@ -70,53 +89,117 @@ class SampleStream:
     reading: Reading
     units: dict[str, str] = field(default_factory=dict)
     _delimiter: str = ","
+    _is_json: bool | None = None
     _heads: tuple[str, ...] = ()
     _clock: StreamClock | None = None
     _signals: dict[str, str] = field(default_factory=dict)
     _only: OneTrace = field(init=False)
+    _number: int = 0
 
     def __post_init__(self) -> None:
         self._only = OneTrace(self.name)
 
-    def moments(self, lines: Iterable[bytes]) -> Iterator[TimedSample]:
-        """Yield one sample per line; empty lines, and lines of empty cells, are skipped.
+    def samples(self, pieces: Iterable[bytes]) -> Iterator[Samples]:
+        """Yield one sample per line, those of a piece together; empty lines and cells make no sample.
+
+        A piece may end anywhere in a line, which the next one continues.
 
         Raises:
             TraceError: E601, a requested signal or time column is missing; E603, a line is not a sample, or a
                 word is not a value of its signal; E605, an invalid header, a wrong number of cells, or
-                several traces.
+                several traces. Samples of the lines before are yielded first.
         """
-        is_json: bool | None = None
-        for number, raw in enumerate(lines, 1):
-            if len(raw) > MAX_LINE:
-                raise self._bad(number, f"is longer than {MAX_LINE:,} bytes")
-            try:
-                text = raw.decode("utf-8-sig").strip()
-            except UnicodeDecodeError:
-                raise self._bad(number, "is not UTF-8") from None
-            if text and is_json is None:
-                is_json = text.startswith("{")
-            if text and is_json:
-                yield self._object(text, number)
-            elif text and not self._heads:
-                self._header(text, number)
-            elif filled(text, self._delimiter):
-                yield self._row(text, number)
+        rest = b""
+        for piece in pieces:
+            whole, end, rest = (rest + piece).rpartition(b"\n")
+            if end:
+                yield from self._of_lines(whole + end)
+            if len(rest) > MAX_LINE:
+                yield from self._line_by_line(rest)
+        if rest:
+            yield from self._of_lines(rest)
 
-    def _bad(self, number: int, what: str, code: str = "E603") -> TraceError:
-        return TraceError(Diagnostic(code, f"line {number} of the {self.name} {what}"))
+    def _of_lines(self, text: bytes) -> Iterator[Samples]:
+        """Yield the samples of whole lines; where some are unusual, those of each half."""
+        middle = text.find(b"\n", len(text) // 2) + 1
+        if (found := self._table(text)) is not None:
+            yield found
+        elif self._is_json or len(text) < _SHORT or middle in (0, len(text)):
+            yield from self._line_by_line(text)
+        else:
+            yield from self._of_lines(text[:middle])
+            yield from self._of_lines(text[middle:])
+
+    def _table(self, text: bytes) -> Samples | None:
+        """Samples of lines that are a table of numbers; None if any line or cell needs a closer look."""
+        heads, clock = self._heads, self._clock
+        if not heads or self._group(heads) is not None or b'"' in text or not text.isascii():
+            return None
+        places = {name: i for i, name in enumerate(heads)}
+        wanted = dict.fromkeys([*self._signals] if clock is None else [clock.name, *self._signals])
+        order = [places[name] for name in wanted]
+        columns = read_lines(text, 0, len(heads), self._delimiter, order, each=True) if order else None
+        if columns is None or (clock is None and np.isnan(columns).all(axis=0).any()):
+            return None
+        times = None if clock is None else clock.times(columns[0])
+        if clock is not None and (times is None or not np.isfinite(times).all()):
+            return None
+        self._number += len(columns[0])
+        found = dict(zip(wanted, columns, strict=True))
+        return Samples(len(columns[0]), times, {name: found[old] for old, name in self._signals.items()})
+
+    def _line_by_line(self, text: bytes) -> Iterator[Samples]:
+        found: list[dict[str, float]] = []
+        try:
+            for raw in text.removesuffix(b"\n").split(b"\n"):
+                self._number += 1
+                line = self._line(raw)
+                if line is None:
+                    continue
+                if found and line.keys() != found[0].keys():
+                    yield _together(found)
+                    found.clear()
+                found.append(line)
+        except TraceError:
+            if found:
+                yield _together(found)
+            raise
+        if found:
+            yield _together(found)
+
+    def _line(self, raw: bytes) -> dict[str, float] | None:
+        """The sample in a line, with its time under `_TIME`; None if it is empty, or the header."""
+        if len(raw) > MAX_LINE:
+            raise self._bad(f"is longer than {MAX_LINE:,} bytes")
+        try:
+            line = raw.decode("utf-8-sig").strip(" \r\n")
+        except UnicodeDecodeError:
+            raise self._bad("is not UTF-8") from None
+        text = line.strip()
+        if text and self._is_json is None:
+            self._is_json = text.startswith("{")
+        if text and self._is_json:
+            return self._object(text)
+        if text and not self._heads:
+            self._header(text)
+        elif filled(text, self._delimiter):
+            return self._row(line)
+        return None
+
+    def _bad(self, what: str, code: str = "E603") -> TraceError:
+        return TraceError(Diagnostic(code, f"line {self._number} of the {self.name} {what}"))
 
     # ------------------------------------------------------------------------ names
 
-    def _header(self, text: str, number: int) -> None:
+    def _header(self, text: str) -> None:
         self._delimiter = delimiter_of(text)
         cells = head_cells(text.removeprefix("#").strip(), self._delimiter)
         names, units = zip(*map(split_head, cells), strict=True)
         read = [name for name in names if self.reading.wanted.reads(name)]
         if len(set(read)) < len(read) or not all(read):
-            raise self._bad(number, "does not name every column, or names one twice", "E605")
+            raise self._bad("does not name every column, or names one twice", "E605")
         if all(value_of(name) is not None for name in names):
-            raise self._bad(number, "has numbers where the columns are named", "E605")
+            raise self._bad("has numbers where the columns are named", "E605")
         self._heads = names
         self.units = dict(zip(names, units, strict=True))
         self._named(name for name in names if name and name != self._group(names))
@@ -139,7 +222,8 @@ class SampleStream:
 
     def _reads(self, name: str) -> bool:
         is_clock = self._clock is not None and name == self._clock.name
-        return self.reading.wanted.reads(name) if self.reading.read is not None else not is_clock
+        wanted = self.reading.wanted.reads(name) if self.reading.read is not None else not is_clock
+        return wanted and name != _TIME
 
     def _group(self, names: Iterable[str]) -> str | None:
         """Name of the column that gives the trace of each line; None if there is none."""
@@ -148,27 +232,31 @@ class SampleStream:
 
     # ------------------------------------------------------------------------ values
 
-    def _row(self, text: str, number: int) -> TimedSample:
+    def _row(self, text: str) -> dict[str, float]:
         mark = self._delimiter
         cells = text.split(mark)
         if '"' in text:
-            cells = next(csv.reader([text], delimiter=mark, skipinitialspace=True))
+            try:
+                cells = next(csv.reader([text], delimiter=mark, skipinitialspace=True))
+            except csv.Error as error:
+                raise self._bad(f"is no row of cells: {error}") from None
         if len(cells) != len(self._heads):
             what = f"has {len(cells)} cells, the header names {len(self._heads)} columns"
-            raise self._bad(number, what, "E605")
-        found: dict[str, object] = {}
-        for name, cell in zip(self._heads, map(bare, cells), strict=True):
-            pointed = cell if mark == "," else cell.replace(",", ".")  # if that makes a number
-            found[name] = pointed if value_of(cell) is None and value_of(pointed) is not None else cell
-        return self._moment(found, number)
+            raise self._bad(what, "E605")
+        values = [number_of(cell, comma=mark != ",") for cell in cells]
+        texts = [
+            bare(cell) if value is None or math.isnan(value) else value
+            for cell, value in zip(cells, values, strict=True)
+        ]
+        return self._moment(dict(zip(self._heads, texts, strict=True)))
 
-    def _object(self, text: str, number: int) -> TimedSample:
+    def _object(self, text: str) -> dict[str, float]:
         try:
             found = loads(text)
         except (ValueError, RecursionError):
             found = None
         if not isinstance(found, dict):
-            raise self._bad(number, "is not a JSON object")
+            raise self._bad("is not a JSON object")
         flat: dict[str, object] = {}
         for name, value in found.items():
             many = isinstance(value, list)
@@ -178,9 +266,9 @@ class SampleStream:
         for name in flat:
             if name not in self._signals and name not in self.reading.names and self._reads(name):
                 self._signals[name] = name
-        return self._moment(flat, number)
+        return self._moment(flat)
 
-    def _moment(self, values: dict[str, object], number: int) -> TimedSample:
+    def _moment(self, values: dict[str, object]) -> dict[str, float]:
         group = self._group(values)
         if group is not None and (key := values.pop(group)) is not None:
             plain = _plain(key)
@@ -192,23 +280,22 @@ class SampleStream:
                 time = self._clock.seconds(value)
             if time is None or not math.isfinite(time):
                 shown = "no time" if value is None or value == "" else f"`{str(value)[:40]}` for a time"
-                raise self._bad(number, f"has {shown}")
-        found = {
-            signal: self._number(signal, values[name], number)
-            for name, signal in self._signals.items()
-            if name in values
-        }
-        return TimedSample(time, {signal: value for signal, value in found.items() if value is not None})
+                raise self._bad(f"has {shown}")
+        found = {} if time is None else {_TIME: time}
+        for name, signal in self._signals.items():
+            if name in values and (value := self._worth(signal, values[name])) is not None:
+                found[signal] = value
+        return found
 
-    def _number(self, signal: str, value: object, number: int) -> float | None:
+    def _worth(self, signal: str, value: object) -> float | None:
         """Return the number of a value; None if it is a word that no requirement needs."""
         found = math.nan if value is None else _plain(value)
         worth = (self.reading.words or {}).get(signal)
         if found is not None or worth is None:
             return found
         if worth and isinstance(value, str):
-            return number_of_word(f"line {number} of the {self.name}", signal, value, worth)
-        raise self._bad(number, f"has `{str(value)[:40]}` where a number is expected")
+            return number_of_word(f"line {self._number} of the {self.name}", signal, value, worth)
+        raise self._bad(f"has `{str(value)[:40]}` where a number is expected")
 
 
 def _plain(value: object) -> float | None:
@@ -216,6 +303,11 @@ def _plain(value: object) -> float | None:
     if isinstance(value, int):
         return float(value) if abs(value) < _BEYOND_FLOATS else math.inf
     return value_of(value) if isinstance(value, str) else value if isinstance(value, float) else None
+
+
+def _together(lines: list[dict[str, float]]) -> Samples:
+    columns = {name: np.array([line[name] for line in lines]) for name in lines[0]}
+    return Samples(len(lines), columns.pop(_TIME, None), columns)
 
 
 # --------------------------------------------------------------------------------- time
@@ -234,11 +326,11 @@ class Uniform:
 
     t0: float
     dt: float | None
-    samples: Iterator[Sample]
+    samples: Iterator[Samples]
     aside: Callable[[], int] = lambda: 0
 
 
-def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Uniform:
+def on_grid(samples: Iterator[Samples], reading: Reading, name: str) -> Uniform:
     """Return the samples of a stream on a uniform time grid; each one is yielded once it is known.
 
     The grid is the one that `stlc.trace.trace.trace_of` would use for a file with the same samples. The
@@ -250,62 +342,56 @@ def on_grid(moments: Iterator[TimedSample], reading: Reading, name: str) -> Unif
         TraceError: E601, the times of the samples are unknown; E602, the times are not uniform, or decrease;
             E605, there are no samples.
     """
-    first = next(moments, None)
+    first = next(samples, None)
     if first is None:
         raise TraceError(Diagnostic("E605", f"the {name} holds no samples"))
     if reading.resample is None and reading.max_gap is None:
-        return _steady(first, moments, reading.dt, name)
+        return _steady(first, samples, reading.dt, name)
     gridded = Gridded(name, reading)
-    samples = gridded.samples(first, moments)
-    head = next(samples, None)
-    assert head is not None
-    return Uniform(gridded.t0, gridded.dt, chain([head], samples), lambda: gridded.aside)
+    found = gridded.samples(chain([first], samples))
+    head = next(found)
+    return Uniform(gridded.t0, gridded.dt, chain([head], found), lambda: gridded.aside)
 
 
-def _steady(first: TimedSample, rest: Iterator[TimedSample], dt: float | None, name: str) -> Uniform:
+def _steady(first: Samples, rest: Iterator[Samples], dt: float | None, name: str) -> Uniform:
     if dt is not None:
         require_step(name, dt)
-    second = next(rest, None)
-    if first.time is None or second is None or second.time is None:
-        moments = chain([first] if second is None else [first, second], rest)
-        return Uniform(first.time or 0.0, dt, (moment.sample for moment in moments))
-    step = snapped(second.time - first.time) if dt is None else dt
+    begun = [first, *islice(rest, int(first.count == 1))]
+    times = [time for each in begun for time in ([] if each.times is None else each.times[:2].tolist())]
+    samples = chain(begun, rest)
+    if len(times) < 2:
+        return Uniform(times[0] if times else 0.0, dt, samples)
+    step = snapped(times[1] - times[0]) if dt is None else dt
     if not step > 0:
-        message = f"time in the {name} does not increase: {first.time:g} s, {second.time:g} s"
+        message = f"time in the {name} does not increase: {times[0]:g} s, {times[1]:g} s"
         raise TraceError(Diagnostic("E602", message))
     require_step(name, step)
-    return Uniform(first.time, step, _checked(first, second, rest, step, name, measured=dt is None))
+    return Uniform(times[0], step, _checked(samples, times[0], step, name, measured=dt is None))
 
 
 def _checked(
-    first: TimedSample,
-    second: TimedSample,
-    rest: Iterator[TimedSample],
-    step: float,
-    name: str,
-    *,
-    measured: bool,
-) -> Iterator[Sample]:
-    assert first.time is not None
-    yield first.sample
-    for number, moment in enumerate(chain([second], rest), 1):
-        now, wanted = moment.time, first.time + number * step
-        if now is None or not abs(now - wanted) <= TOLERANCE * step + _SLACK * abs(wanted):
-            found = "no time" if now is None else f"{now:.6g} s"
-            message = f"time in the {name} is not uniform: sample {number} has {found}, not {wanted:.6g} s"
-            help_ = _ways_out(now, wanted, step, measured=measured)
-            raise TraceError(Diagnostic("E602", message, help=help_))
-        yield moment.sample
-
-
-def _ways_out(now: float | None, wanted: float, step: float, *, measured: bool) -> tuple[str, ...]:
-    if now is None:
-        return ()
-    missed = (now - wanted) / step
-    if 0.5 < missed < math.inf and abs(missed - round(missed)) <= TOLERANCE:
-        return (gap_advice(step),)
-    advice = ("--dt TIME  says what the step is; without it the first two samples do",) if measured else ()
-    return (resample_advice(step), *advice)
+    samples: Iterator[Samples], t0: float, step: float, name: str, *, measured: bool
+) -> Iterator[Samples]:
+    count = 0
+    for each in samples:
+        assert each.times is not None
+        wanted = t0 + np.arange(count, count + each.count) * step
+        with np.errstate(over="ignore"):
+            wrong = ~(np.abs(each.times - wanted) <= TOLERANCE * step + _SLACK * np.abs(wanted))
+        bad = int(np.argmax(np.append(wrong, True)))
+        if bad:
+            yield each.timed(each.times[:bad])
+        count += bad
+        if bad == each.count:
+            continue
+        now, due = float(each.times[bad]), float(wanted[bad])
+        message = f"time in the {name} is not uniform: sample {count} has {now:.6g} s, not {due:.6g} s"
+        missed, help_ = (now - due) / step, [resample_advice(step)]
+        if 0.5 < missed < math.inf and abs(missed - round(missed)) <= TOLERANCE:
+            help_ = [gap_advice(step)]
+        elif measured:
+            help_.append("--dt TIME  says what the step is; without it the first two samples do")
+        raise TraceError(Diagnostic("E602", message, help=tuple(help_)))
 
 
 @dataclass(slots=True)
@@ -313,18 +399,18 @@ class _Buffer:
     """Samples of one signal that are still needed for values between them."""
 
     between: Between
-    times: list[float] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
+    times: Floats = field(default_factory=lambda: np.zeros(0))
+    values: Floats = field(default_factory=lambda: np.zeros(0))
 
     def forget(self, before: float) -> None:
         """Drop samples that values at time `before` or later do not need."""
         there = int(np.searchsorted(self.times, before, side="right")) - 1
         if there > 0:
-            del self.times[:there], self.values[:there]
+            self.times, self.values = self.times[there:], self.values[there:]
 
     def known_until(self, now: float, limit: float) -> float:
         """Return the time in seconds up to which values can no longer change, once `now` is reached."""
-        last = self.times[-1] if self.times else -math.inf
+        last = float(self.times[-1]) if len(self.times) else -math.inf
         return now if now - last > limit else last
 
 
@@ -350,67 +436,77 @@ class Gridded:
     _done: int = 0
     _came: int = 0
     _last: float = -math.inf
+    _waiting: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def samples(self, first: TimedSample, rest: Iterator[TimedSample]) -> Iterator[Sample]:
-        """Yield the samples on the time grid one by one; none is yielded before the time step is known."""
+    def samples(self, recorded: Iterator[Samples]) -> Iterator[Samples]:
+        """Yield the samples on the time grid; none is yielded before the time step is known."""
         given = self.reading.resample or self.reading.dt
-        waits = self.reading.max_gap is None or given is None  # the first samples tell the usual step
-        waiting: list[float] = []
-        for moment in chain([first], rest):
-            waiting.append(self._take(moment))
-            if math.isnan(self.dt):
-                if len(waiting) < FIRST and waits:
-                    continue
-                self._begin(waiting, given)
-            self._count(waiting)
-            until = [each.known_until(self._last, self._limit) for each in self._buffers.values()]
-            yield from self._before(min(until, default=self._last), self._last)
+        least = FIRST if self.reading.max_gap is None or given is None else 1  # they tell the usual step
+        for times in self._taken(recorded):
+            self._waiting = np.append(self._waiting, times)
+            if math.isnan(self.dt) and len(self._waiting) >= least:
+                self._begin(self._waiting[:least], given)
+            if not math.isnan(self.dt):
+                yield from self._known()
         if math.isnan(self.dt):
-            self._begin(waiting, given)
-        self._count(waiting)
-        yield from self._before(math.inf, self._last)
+            self._begin(self._waiting, given)
+            yield from self._known()
+        yield from self._before(math.inf)
 
-    def _count(self, times: list[float]) -> None:
-        """Count the times that lie between two instants of the grid, and forget them."""
-        while times:
-            steps = (times.pop() - self.t0) / self.dt
-            self.aside += not math.isfinite(steps) or abs(steps - round(steps)) > ROUNDING
-
-    def _take(self, moment: TimedSample) -> float:
-        time = moment.time
-        if time is None:
-            if self.reading.dt is None:
+    def _taken(self, recorded: Iterator[Samples]) -> Iterator[Floats]:
+        """Take samples and yield their times, up to the first that is invalid, which raises TraceError."""
+        for each in recorded:
+            if each.times is not None:
+                times = each.times
+            elif self.reading.dt is not None:
+                times = self.reading.dt * np.arange(self._came, self._came + each.count, dtype=np.float64)
+            else:
                 raise TraceError(Diagnostic("E601", f"the {self.name} has no `t`", help=(NO_CLOCK, NO_STEP)))
-            time = self._came * self.reading.dt
-        if time < self._last:
-            message = f"time in the {self.name} runs backwards: {self._last:g} s, {time:g} s"
-            raise TraceError(Diagnostic("E602", message))
-        self.t0 = self.t0 if self._came else time
-        require_span(self.name, self.t0, time)
-        self._came, self._last = self._came + 1, time
-        for signal, value in moment.sample.items():
-            if signal not in self._buffers:
-                base, kinds, between = signal.partition("[")[0], self.reading.kinds, self.reading.between
-                held = (kinds.get(signal) or kinds.get(base) or "real") != "real"
-                usual = Between("hold" if held else "linear")
-                self._buffers[signal] = _Buffer(between.get(signal) or between.get(base) or usual)
-            if not math.isnan(value):
-                self._buffers[signal].times.append(time)
-                self._buffers[signal].values.append(value)
-        return time
+            self.t0 = self.t0 if self._came else float(times[0])
+            before = np.append(self._last, times[:-1])
+            with np.errstate(over="ignore"):
+                wrong = ~((times >= before) & np.isfinite(times - self.t0))
+            bad = int(np.argmax(np.append(wrong, True)))
+            self._came, self._last = self._came + bad, float(np.append(self._last, times)[bad])
+            for signal, values in each.timed(times[:bad]).columns.items():
+                buffer, known = self._buffer(signal), ~np.isnan(values)
+                buffer.times = np.append(buffer.times, times[:bad][known])
+                buffer.values = np.append(buffer.values, values[known])
+            yield times[:bad]
+            if bad < each.count:
+                if times[bad] < before[bad]:
+                    message = f"time in the {self.name} runs backwards: {before[bad]:g} s, {times[bad]:g} s"
+                    raise TraceError(Diagnostic("E602", message))
+                require_span(self.name, self.t0, float(times[bad]))
 
-    def _begin(self, times: list[float], given: float | None) -> None:
-        first = np.array(times, dtype=np.float64)
+    def _buffer(self, signal: str) -> _Buffer:
+        if signal not in self._buffers:
+            base, kinds, between = signal.partition("[")[0], self.reading.kinds, self.reading.between
+            held = (kinds.get(signal) or kinds.get(base) or "real") != "real"
+            usual = Between("hold" if held else "linear")
+            self._buffers[signal] = _Buffer(between.get(signal) or between.get(base) or usual)
+        return self._buffers[signal]
+
+    def _begin(self, first: Floats, given: float | None) -> None:
         self.dt = given or snapped(usual_step(first[:FIRST]))
         require_step(self.name, self.dt)
         self._limit = longest_gap(self.dt, first, self.reading.max_gap)
 
-    def _before(self, stop: float, end: float) -> Iterator[Sample]:
-        """Yield the next samples on the grid before the time `stop`, and up to the time `end`, in seconds."""
+    def _known(self) -> Iterator[Samples]:
+        """Yield the samples on the grid that can no longer change, and count those recorded beside it."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            steps = (self._waiting - self.t0) / self.dt
+            self.aside += int(np.count_nonzero(~(np.abs(steps - np.round(steps)) <= ROUNDING)))
+        self._waiting = self._waiting[:0]
+        until = [each.known_until(self._last, self._limit) for each in self._buffers.values()]
+        yield from self._before(min(until, default=self._last))
+
+    def _before(self, stop: float) -> Iterator[Samples]:
+        """Yield the next samples on the grid before the time `stop` in seconds, and up to the latest one."""
         if stop == -math.inf:
             return
         slack = ROUNDING * self.dt
-        most = (min(stop, end) - self.t0 + slack) / self.dt + 1
+        most = (min(stop, self._last) - self.t0 + slack) / self.dt + 1
         if most > MAX_SAMPLES:
             message = f"the {self.name} spans more than {MAX_SAMPLES:,} steps of {self.dt:g} s"
             raise TraceError(Diagnostic("E605", message, help=("a larger step",)))
@@ -420,14 +516,12 @@ class Gridded:
             grid = grid[grid + slack < stop]
             if not len(grid):
                 return
+            end = max(self._last, float(grid[-1]))
             columns = {}
             for name, each in self._buffers.items():
-                times, values = np.array(each.times, np.float64), np.array(each.values, np.float64)
-                track = track_of(times, values, each.between, self._limit, max(end, float(grid[-1])))
+                track = track_of(each.times, each.values, each.between, self._limit, end)
                 columns[name] = track.around(grid, slack)[0]
             self._done += len(grid)
             for each in self._buffers.values():
                 each.forget(self.t0 + self.dt * self._done)
-            rows = np.array(list(columns.values())).T.tolist() if columns else [[]] * len(grid)
-            for row in rows:
-                yield dict(zip(columns, row, strict=True))
+            yield Samples(len(grid), grid, columns)

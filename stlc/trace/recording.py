@@ -224,8 +224,8 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
     )
 
 
-def unit_of(path: Path, name: str, text: str) -> Unit:
-    """Parse the unit that a file gives for a column. Raises TraceError (E605) for an invalid unit."""
+def unit_of(path: Path | str, name: str, text: str) -> Unit:
+    """Parse the unit that a recording gives for a column. Raises TraceError (E605) for an invalid unit."""
     try:
         return parse_unit(text) if text else DIMENSIONLESS
     except ValueError as error:

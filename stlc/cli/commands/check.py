@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -31,6 +31,8 @@ from stlc.files import has_wildcard, matching_traces, real, write_atomic
 from stlc.jsontext import plain
 
 if TYPE_CHECKING:
+    from io import BufferedReader
+
     from stlc.assurance.certificate import Assessment, BoundedVerdict, JudgedFiles, Unjudged
     from stlc.cli.check.evidence import Repetition
     from stlc.cli.check.many import Outcome
@@ -195,11 +197,12 @@ def _of_stream(question: Question, *, talk: bool) -> Outcome:
     """
     from stlc.cli.check.many import Outcome
     from stlc.monitor.check import judge_lines
-    from stlc.trace.live import MAX_LINE
+    from stlc.trace.live import PIECE
 
     begun = time.perf_counter()
-    raw = iter(lambda: sys.stdin.buffer.readline(MAX_LINE + 1), b"")
-    verdict = judge_lines(raw, question, NAME, _tell if talk else None)
+    lines = cast("BufferedReader", sys.stdin.buffer)
+    pieces = iter(lambda: lines.read1(PIECE), b"")  # what has come, at least a byte
+    verdict = judge_lines(pieces, question, NAME, _tell if talk else None)
     return Outcome(NAME, verdict, time.perf_counter() - begun)
 
 
