@@ -35,16 +35,7 @@ from stlc.dynamics.schema.record import (
     values_of,
     word,
 )
-from stlc.dynamics.schema.yaml_nodes import (
-    Entry,
-    Node,
-    Scalar,
-    Sequence,
-    as_bool,
-    as_float,
-    as_int,
-    load_yaml,
-)
+from stlc.dynamics.schema.yaml_nodes import Entry, Node, Scalar, Sequence, load_yaml
 from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
 from stlc.files import read_source
 from stlc.plants.kinds import KINDS, ControllerLayout, Layout, PlantKind, Port
@@ -623,7 +614,7 @@ def _plain(value: Any) -> Any:
         case Sequence():
             return [_plain(item) for item in value.items]
         case Scalar():
-            for meaning in (as_bool(value), as_int(value), as_float(value)):
+            for meaning in (value.boolean, value.integer, value.number):
                 if meaning is not None:
                     return meaning
             return None if value.is_null else value.text

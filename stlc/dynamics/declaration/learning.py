@@ -34,7 +34,7 @@ from stlc.dynamics.schema.record import (
     word,
 )
 from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
-from stlc.dynamics.schema.yaml_nodes import Node, Scalar, as_int
+from stlc.dynamics.schema.yaml_nodes import Node, Scalar
 from stlc.grammar import ast
 from stlc.registry import METHODS
 from stlc.signature import Column
@@ -260,7 +260,7 @@ def _mirror(cx: Context, node: Node, label: str) -> dict[str, Any]:
 
 
 def _integers(cx: Context, node: Node, label: str) -> tuple[int, ...] | None:
-    single = isinstance(node, Scalar) and as_int(node) is not None
+    single = isinstance(node, Scalar) and node.integer is not None
     items = (node,) if single else cx.reader.items(node, label)
     values = [cx.reader.integer(item, f"an entry of {label}", high=65_536) for item in items]
     return tuple(value for value in values if value is not None) or None

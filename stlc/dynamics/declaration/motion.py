@@ -29,7 +29,7 @@ from stlc.dynamics.schema.record import (
     number,
     values_of,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, as_bool
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
 from stlc.registry import closest
 from stlc.signature import Column
@@ -249,7 +249,7 @@ def read_latches(node: Node | None, cx: Context) -> tuple[Assign, ...]:
     found: list[Assign] = []
     for index, item in enumerate(node.items if isinstance(node, ListNode) else ()):
         once = item.get("once") if isinstance(item, Mapping) else None
-        if not isinstance(once, Scalar) or as_bool(once) is not True or not isinstance(item, Mapping):
+        if not isinstance(once, Scalar) or once.boolean is not True or not isinstance(item, Mapping):
             continue
         written_name = item.get("name")
         name = written_name.text if isinstance(written_name, Scalar) else f"jump {index + 1}"

@@ -16,7 +16,7 @@ from stlc.dynamics.declaration.columns import unit_text
 from stlc.dynamics.schema.names import Context
 from stlc.dynamics.schema.reader import first_line
 from stlc.dynamics.schema.record import EXPRESSION, OF, key, raw, read, word
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, as_float
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
 from stlc.units import DIMENSIONLESS, Unit
 
@@ -147,7 +147,7 @@ def _row(node: Node, unit: Unit, where: str, cx: Context) -> Row:
     """Read a list of numbers in `unit`; `where` names the list in messages."""
     found: list[float] = []
     for item in cx.reader.items(node, where):
-        value = as_float(item) if isinstance(item, Scalar) else None
+        value = item.number if isinstance(item, Scalar) else None
         value = cx.plain.here.constant(item, f"a number in {where}", unit) if value is None else value
         found.append(0.0 if value is None else value)
     return tuple(found)

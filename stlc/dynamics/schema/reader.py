@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from stlc.diagnostics import Diagnostic, Findings, Label, SystemFileError, tell
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, as_bool, as_float, as_int
+from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.escape import unseen
 from stlc.registry import closest
 from stlc.source import Source, Span
@@ -189,7 +189,7 @@ class Reader:
 
     def integer(self, node: Node | None, where: str, *, low: int = 1, high: int = 10**9) -> int | None:
         """Read an integer between `low` and `high`. `where` names it in messages."""
-        value = as_int(node) if isinstance(node, Scalar) else None
+        value = node.integer if isinstance(node, Scalar) else None
         above = value is not None and value > high
         bounds = f"between {low} and {high}" if above else f"of at least {low}"
         value = value if value is not None and low <= value <= high else None
@@ -197,13 +197,13 @@ class Reader:
 
     def number(self, node: Node | None, where: str, *, low: float = 0.0) -> float | None:
         """Read a finite number of at least `low`. `where` names it in messages."""
-        value = as_float(node) if isinstance(node, Scalar) else None
+        value = node.number if isinstance(node, Scalar) else None
         value = value if value is not None and value >= low else None
         return self._valid(node, where, f"a number of at least {low:g}", value)
 
     def flag(self, node: Node | None, where: str) -> bool | None:
         """Read `true` or `false`. `where` names the value in messages."""
-        value = as_bool(node) if isinstance(node, Scalar) else None
+        value = node.boolean if isinstance(node, Scalar) else None
         return self._valid(node, where, "`true` or `false`", value)
 
     def option(

@@ -65,6 +65,24 @@ class Scalar:
         """True if the value is null: empty, `~` or `null`."""
         return self.style == "plain" and self.text in {"", "~", "null", "Null", "NULL"}
 
+    @property
+    def boolean(self) -> bool | None:
+        """The truth value of `true` or `false`; None for any other text."""
+        if self.style != "plain":
+            return None
+        return True if self.text in _TRUE else False if self.text in _FALSE else None
+
+    @property
+    def integer(self) -> int | None:
+        """The value of a decimal integer of 300 digits at most; None for any other text."""
+        return int(self.text) if self.style == "plain" and _INT.match(self.text) else None
+
+    @property
+    def number(self) -> float | None:
+        """The value of a finite decimal number; None for any other text, such as `.nan` or `.inf`."""
+        value = float(self.text) if self.style == "plain" and _FLOAT.match(self.text) else math.inf
+        return value if math.isfinite(value) else None
+
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
@@ -126,24 +144,6 @@ _FALSE = frozenset({"false", "False", "FALSE"})
 _HALF = re.compile("[\ud800-\udfff]")
 _INT = re.compile(r"[-+]?[0-9]{1,300}\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
-
-
-def as_bool(node: Scalar) -> bool | None:
-    """Return the truth value of `true` or `false`; None for any other text."""
-    if node.style != "plain":
-        return None
-    return True if node.text in _TRUE else False if node.text in _FALSE else None
-
-
-def as_int(node: Scalar) -> int | None:
-    """Return the value of a decimal integer of 300 digits at most; None for any other text."""
-    return int(node.text) if node.style == "plain" and _INT.match(node.text) else None
-
-
-def as_float(node: Scalar) -> float | None:
-    """Return the value of a finite decimal number; None for any other text, such as `.nan` or `.inf`."""
-    value = float(node.text) if node.style == "plain" and _FLOAT.match(node.text) else math.inf
-    return value if math.isfinite(value) else None
 
 
 # ---------------------------------------------------------------------------- reading

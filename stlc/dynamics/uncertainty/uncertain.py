@@ -24,7 +24,7 @@ from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.sections import SystemKeys, motion_of
 from stlc.dynamics.schema.names import Names, NumberChanges, base_name
 from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
-from stlc.dynamics.schema.yaml_nodes import Node, Scalar, as_bool
+from stlc.dynamics.schema.yaml_nodes import Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
@@ -135,7 +135,7 @@ def _fixed_places(found: SystemKeys) -> Iterator[_Place]:
         for name, entry in _entries(held):
             for key in keys:
                 node, clamp, most = (entry.get(each) for each in (key, "clamp", "at_most"))
-                free = section == "state" and not (isinstance(clamp, Scalar) and as_bool(clamp))
+                free = section == "state" and not (isinstance(clamp, Scalar) and clamp.boolean)
                 if node is not None and not free and not (key == "by" and most is not None):
                     yield _Place(node, f"`{key}` of `{name}`")
 

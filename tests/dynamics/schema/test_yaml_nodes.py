@@ -12,16 +12,7 @@ from hypothesis import strategies as st
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.schema import yaml_nodes
-from stlc.dynamics.schema.yaml_nodes import (
-    Mapping,
-    Node,
-    Scalar,
-    Sequence,
-    as_bool,
-    as_float,
-    as_int,
-    load_yaml,
-)
+from stlc.dynamics.schema.yaml_nodes import Mapping, Node, Scalar, Sequence, load_yaml
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
@@ -116,12 +107,12 @@ def test_scalars_mean_what_yaml_1_2_says(
     text: str, integer: int | None, number: float | None, truth: bool | None
 ) -> None:
     value = scalar(load(f"a: {text}").get("a"))
-    assert (as_int(value), as_float(value), as_bool(value)) == (integer, number, truth)
+    assert (value.integer, value.number, value.boolean) == (integer, number, truth)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_every_finite_float_comes_back(value: float) -> None:
-    assert as_float(scalar(load(f"a: {value!r}").get("a"))) == value
+    assert scalar(load(f"a: {value!r}").get("a")).number == value
 
 
 @pytest.mark.parametrize("text", ["", "~", "null", "Null"])
