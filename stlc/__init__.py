@@ -11,7 +11,10 @@ The names of the library are imported when they are first used:
 
 from __future__ import annotations
 
+import inspect
+import sys
 from importlib import import_module
+from operator import attrgetter
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from stlc.assurance.verification.tubes import tube
+    from stlc.controller.explain import explain
     from stlc.controller.problem.task import Task
     from stlc.controller.run.run import Run
     from stlc.controller.search.planner import PlanResult, plan
@@ -30,19 +34,17 @@ if TYPE_CHECKING:
     from stlc.grammar import ast
     from stlc.monitor.check import check
     from stlc.monitor.judgement import RequirementVerdict, Verdict
+    from stlc.monitor.linted import lint
     from stlc.monitor.verdict import Monitor
     from stlc.trace import Trace
     from stlc.view.plotted import plot
+    from stlc.view.report import report
     from stlc.view.trained import train
 
-    def compile(spec: ast.Spec, system: System) -> Task:
-        """Compile a specification for a system; see `_CallablePackage.__call__`.
-
-        At run time, this name is the package `stlc.compile`, which can be called like a function.
-        """
-
+    compile = Task.of
 else:
     import stlc.compile as compile
+    import stlc.lint as lint
 
 __all__ = [
     "Monitor",
@@ -58,10 +60,13 @@ __all__ = [
     "__version__",
     "check",
     "compile",
+    "explain",
+    "lint",
     "load",
     "parse",
     "plan",
     "plot",
+    "report",
     "train",
     "tube",
 ]
@@ -78,21 +83,32 @@ _HOMES = {
     "Trace": "stlc.trace:Trace",
     "Verdict": "stlc.monitor.judgement:Verdict",
     "check": "stlc.monitor.check:check",
+    "explain": "stlc.controller.explain:explain",
     "plan": "stlc.controller.search.planner:plan",
     "plot": "stlc.view.plotted:plot",
+    "report": "stlc.view.report:report",
     "train": "stlc.view.trained:train",
     "tube": "stlc.assurance.verification.tubes:tube",
 }
+_CALLED = {
+    "stlc.compile": "stlc.controller.problem.task:Task.of",
+    "stlc.lint": "stlc.monitor.linted:lint",
+}
+"""Packages that can be called like the function that has their name."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'stlc' has no attribute '{name}'")
-    module, _, attribute = _HOMES[name].partition(":")
-    with explained():
-        value = getattr(import_module(module), attribute)
-    globals()[name] = value
+    value = globals()[name] = _found(_HOMES[name])
     return value
+
+
+def _found(place: str) -> Any:
+    """Import what is at `module:name`."""
+    module, _, attribute = place.partition(":")
+    with explained():
+        return attrgetter(attribute)(import_module(module))
 
 
 def __dir__() -> list[str]:
@@ -123,24 +139,17 @@ def parse(text: str, name: str = "<text>") -> ast.Spec:
 
 
 class _CallablePackage(ModuleType):
-    """Class of the package `stlc.compile`, which makes the package callable as a function.
+    """Class of a package that is called as a function: Python looks up `__call__` in classes."""
 
-    Python looks up `__call__` in the class of an object, so the package gets this class.
-    """
+    def __call__(self, *given: Any, **options: Any) -> Any:
+        """Call the function of the package's name."""
+        return _found(_CALLED[self.__name__])(*given, **options)
 
-    def __call__(self, spec: ast.Spec, system: System) -> Task:
-        """Compile the specification for the system; return the task, for training, planning and simulation.
-
-        The states of the system are extended by the timers that the specification needs.
-
-        Raises:
-            SpecError: the specification is invalid, or does not fit the system.
-            NotInstalledError: R301, the extra `train` is not installed.
-        """
-        with explained():
-            from stlc.controller.problem.task import Task
-
-        return Task.of(spec, system)
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """Signature of this function, for notebooks and `help`."""
+        return inspect.signature(_found(_CALLED[self.__name__]))
 
 
-compile.__class__ = _CallablePackage
+for _name in _CALLED:
+    sys.modules[_name].__class__ = _CallablePackage

@@ -30,6 +30,10 @@ LIBRARY = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1]
 SYSTEMS, SPECS = LIBRARY / "examples", LIBRARY / "specs"
 """Folders of the installed systems and specifications, which refer to each other by `../`."""
 
+SPEC_SUFFIXES = (".stl", ".stlc")
+STDIN = "-"
+"""Name of the standard input, where a file may be one."""
+
 _SYSTEM_SUFFIXES = ("", ".yaml", ".yml")
 _MESH = re.compile(r"\s*(solid\b[^\n]*)\n\s*(facet|endsolid)\b")
 
@@ -49,7 +53,7 @@ def read_source(path: Path | str, root: str = "") -> Source:
             larger than `MAX_BYTES`.
     """
     name = str(path)
-    if name == "-":
+    if name == STDIN:
         return decoded("<stdin>", sys.stdin.buffer.read(MAX_BYTES + 1))
     path = Path(path)
     try:
@@ -295,6 +299,35 @@ def find_spec(name: Path | str) -> Path:
     return next((there for folder in (LIBRARY, SPECS) if (there := folder / path).is_file()), path)
 
 
+def spec_files(names: Sequence[str]) -> tuple[str, ...]:
+    """Paths of specification files, in order and without duplicates; a folder stands for all files below it.
+
+    Raises:
+        UsageError: U102, a folder contains no specification; U101, `names` is empty.
+    """
+    if not names:
+        raise usage("which file?", "a .stl file, a folder, or - for a pipe")
+    return tuple(dict.fromkeys(path for name in names for path in _specs_below(name)))
+
+
+def _specs_below(name: str) -> Iterator[str]:
+    folder = Path(name)
+    if name == STDIN or not folder.is_dir():
+        yield name
+        return
+    found = sorted(
+        path for path in folder.rglob("*") if path.suffix in SPEC_SUFFIXES and _in_sight(path, folder)
+    )
+    if not found:
+        raise UsageError(Diagnostic("U102", f"there is no specification in `{name}`"))
+    yield from map(str, found)
+
+
+def _in_sight(path: Path, folder: Path) -> bool:
+    """True if `path` is not hidden: no file or folder name below `folder` begins with a dot."""
+    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+
+
 def find_trace(name: str, runs: Path = Path("runs")) -> Path:
     """Find the trace called `name`: a file at that path, else in the folder of the newest run below `runs`.
 
@@ -311,6 +344,18 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
         advice = f"name its traces: '{Path(name) / '*'}'"
         raise UsageError(Diagnostic("U102", f"`{name}` is a folder, not a trace", help=(advice,)))
     raise UsageError(_no_such("trace", name, folders))
+
+
+def seen_at(name: str, runs: Path = Path("runs")) -> Path:
+    """Return the path of a trace file called `name`.
+
+    It is `name` itself if that file exists, else the file of that name in the newest run below `runs`.
+    """
+    path = find_trace(name, runs)
+    if path == Path(name):
+        return path
+    path = path.resolve()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def has_wildcard(name: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from itertools import zip_longest
 from typing import Any
 
 from stlc.escape import html
@@ -13,7 +14,7 @@ _RED = ' style="color:#c0261c"'
 
 
 def html_table(
-    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], marked: Sequence[bool]
+    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], marked: Sequence[bool] = ()
 ) -> str:
     """Return a table as HTML for a notebook; all texts are escaped, and `marked` rows are red."""
     left = ' style="text-align:left"'
@@ -21,7 +22,7 @@ def html_table(
     def line(cells: Sequence[str], tag: str, style: str = "") -> str:
         return f"<tr{style}>{''.join(f'<{tag}{left}>{html(each)}</{tag}>' for each in cells)}</tr>"
 
-    lines = [line(row, "td", _RED if bad else "") for row, bad in zip(rows, marked, strict=True)]
+    lines = [line(row, "td", _RED if bad else "") for row, bad in zip_longest(rows, marked)]
     return f"<table><caption>{html(title)}</caption>{line(header, 'th')}{''.join(lines)}</table>"
 
 

@@ -18,10 +18,10 @@ import typer
 from benchmarks.__main__ import PROGRAM as MEASURE
 from stlc.cli.framework.app import PROGRAM as STLC
 from stlc.cli.framework.app import main
-from stlc.cli.framework.manual import read_page
 from stlc.diagnostics import CODES
 from stlc.dynamics.declaration.sections import SystemKeys
 from stlc.dynamics.schema.record import reference
+from stlc.grammar.manual import read_page
 from stlc.plants.declaration import PlantKeys
 
 ROOT = Path(__file__).resolve().parent.parent

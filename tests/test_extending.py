@@ -73,11 +73,12 @@ def failures(tmp_path_factory) -> dict[str, str]:
 
 
 def test_the_page_has_an_example_of_each_extension():
-    assert len(CHECKS) == 17
+    assert len(CHECKS) == 18
     assert len(FILES) == 16
     changed = [name for name, _ in DIFFS if name.endswith(".py")]
-    # an operator, a trace format, a function, a strategy, a kind of plant; 2 for an option, 6 for a node
-    assert len(changed) == 13
+    # an operator, a trace format, a function, a strategy, a kind of plant, a figure; 2 for an option, 6 for a
+    # node
+    assert len(changed) == 14
 
 
 def test_an_extension_needs_the_files_that_the_page_promises():

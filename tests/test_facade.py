@@ -53,10 +53,12 @@ def test_an_unknown_name_is_an_attribute_error():
         "import stlc.compile.ir.nodes, stlc",
         "from stlc.compile.ir import nodes as ir; import stlc",
         "import stlc; stlc.SpecError; import stlc.compile.ir.typed",
+        "import stlc.lint.lint, stlc",
     ],
 )
 def test_the_package_compile_can_be_called_whatever_came_first(statement):
-    check = "assert callable(stlc.compile) and stlc.compile.__path__; from stlc.compile.ir import nodes"
+    check = "assert callable(stlc.compile) and callable(stlc.lint) and stlc.compile.__path__"
+    check += "; from stlc.compile.ir import nodes"
     modules_after(f"{statement}; {check}; nodes.Const(1.0)")
 
 
@@ -122,3 +124,13 @@ def test_a_training_that_makes_no_sense_is_refused(options, tmp_path, monkeypatc
     with pytest.raises(stlc.StlcError, match="U101"):
         stlc.train(task, **options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_systems_tasks_and_plans_are_shown_in_notebooks():
+    pytest.importorskip("torch")
+    system = stlc.System.load(SYSTEM)
+    task = stlc.compile(stlc.load(SPEC), system)
+    assert system._repr_html_().count("<tr>") == 1 + len(system.names) + len(system.control_names)
+    assert "give_way" in task._repr_html_()
+    found = stlc.plan(task, system.sample(2, seed=0), budget=0.5)
+    assert repr(found).startswith("PlanResult(2 of 2 plans satisfy it, least robustness ")

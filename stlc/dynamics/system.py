@@ -35,6 +35,7 @@ from stlc.dynamics.scenario import truth, under
 from stlc.files import find_system
 from stlc.native import check_plans
 from stlc.source import Source
+from stlc.tabular import html_table
 
 HARD = Hard()
 PROBED = 1000
@@ -84,6 +85,16 @@ class System:
 
     def __repr__(self) -> str:
         return f"System({self.facts})"
+
+    def _repr_html_(self) -> str:
+        states = [
+            (each.name, each.role, each.unit.text, each.low, each.high) for each in self.signature.columns
+        ]
+        controls = [
+            (each.name, "control", each.unit.text, each.low, each.high) for each in self.decl.controls
+        ]
+        rows = [tuple("" if cell is None else f"{cell}" for cell in row) for row in (*states, *controls)]
+        return html_table(self.facts, ("signal", "role", "unit", "least", "greatest"), rows)
 
     def __deepcopy__(self, memo: object) -> Self:
         """Return the system itself, which is immutable."""

@@ -20,6 +20,7 @@ from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.escape import shell
 from stlc.files import require_regular
 from stlc.signature import Kind, Signature
+from stlc.tabular import frame
 from stlc.trace.clocks import ClockSetting, clocked
 from stlc.trace.enums import Words, in_numbers, wordless
 from stlc.trace.formats.registry import (
@@ -96,6 +97,15 @@ class Trace:
     def __repr__(self) -> str:
         size = f"{self.traces} x {self.samples} samples of {len(self.signature)} signals"
         return f"Trace({self.name}: {size}, dt {self.dt:g} s)"
+
+    def to_frame(self) -> Any:
+        """Return a data frame of pandas or polars: times and signals, and which trace if there are several.
+
+        Raises MissingError (R301) if neither package is installed.
+        """
+        several = {"trace": np.repeat(np.arange(self.traces), self.samples)} if self.traces > 1 else {}
+        signals = {name: values.ravel() for name, values in self.data.items()}
+        return frame({**several, "t": np.tile(self.times, self.traces), **signals})
 
     @property
     def file(self) -> str:

@@ -9,18 +9,22 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from stlc.activity import PULSE
 from stlc.controller.guard.kind import named_guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
+from stlc.controller.run.run import Run, folder_of
 from stlc.escape import operand, shell
 from stlc.files import write_atomic
-from stlc.rundir import RunDir
+from stlc.foreign import driving
+from stlc.rundir import RUNS, RunDir
 from stlc.version import __version__
 from stlc.view import require_drawing
-from stlc.view.contents import RunContents, read_contents, untagged
+from stlc.view.contents import RunContents, read_contents, simulation_of, untagged
 from stlc.view.curves import draw_curves
 from stlc.view.deployment import deployment_section, deployment_tiles
 from stlc.view.held_out import draw_failures, unsolved_text
@@ -39,7 +43,7 @@ from stlc.view.html import (
     with_code,
     yaml_html,
 )
-from stlc.view.learning import Commands, clause, driven_lines, learning_on_record
+from stlc.view.learning import Commands, Learning, clause, driven_lines, learning_of_run, learning_on_record
 from stlc.view.player import player_section, script
 from stlc.view.recorded import map_section, recorded_section
 from stlc.view.words import (
@@ -53,6 +57,54 @@ from stlc.view.words import (
 )
 
 REPORT = "report.html"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Report:
+    """Report of a run: its page, and the verdict on the training; None if the run has none."""
+
+    JSON: ClassVar = "run=run.shown report=shown verdict?=learning"
+
+    run: RunDir
+    learning: Learning | None
+
+    def __repr__(self) -> str:
+        return f"Report({self.shown})"
+
+    @property
+    def shown(self) -> str:
+        """Path of the page, relative to the present folder where possible."""
+        return f"{self.run.shown}/{REPORT}"
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Sentences on the drives and on the training."""
+        simulation, learning = simulation_of(self.run) or {}, self.learning
+        driven = satisfied_sentence(simulation) if simulation else ""
+        lines = [driven] if driven else driven_lines(self.run.record().get("result") or {})
+        if learning is not None:
+            helps = (f"what helps: {advice}" for advice in learning.advice)
+            lines += [f"{learning.level}: {learning.sentence}", *filter(None, (learning.worst,)), *helps]
+        return tuple(lines)
+
+
+def report(run: Run | Path | str = "latest", *, python: bool = False, runs: Path = RUNS) -> Report:
+    """Write a self-contained page with the pictures of a run into its folder.
+
+    Args:
+        run: the run, or its folder, number, words or specification, or `latest`.
+        python: whether Python that the run names may draw its scenes.
+        runs: folder of all runs.
+
+    Raises:
+        UsageError: R101, there is no such run.
+        MissingError: R301, matplotlib or Pillow is missing; R201, the page cannot be written.
+        RunError: R101, the folder is damaged.
+    """
+    folder = folder_of(run, runs)
+    with PULSE.doing("drawing the report"), driving(python):
+        write_report(folder)
+    return Report(folder, learning_of_run(folder, Commands.of(folder.shown, folder.record())))
 
 
 def write_report(run: RunDir) -> Path:

@@ -8,14 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from stlc.editor.textmate import textmate
+from helpers.tools import load_tool
+
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, UNARY_TEMPORAL
 from stlc.units import SYMBOLS
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 EXTENSION = ROOT / "editors/vscode"
 FILE = EXTENSION / "syntaxes/stlc.tmLanguage.json"
-GRAMMAR = textmate()
+GRAMMAR = load_tool("textmate").textmate()
 
 
 def test_the_file_is_made_from_the_words_of_the_language(request):

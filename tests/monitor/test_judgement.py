@@ -44,6 +44,14 @@ def test_a_frame_has_a_row_for_each_requirement_and_trace():
     assert frame["robustness"].tolist() == [-1.0, 0.5, 1.0, 1.0]
 
 
+def test_polars_is_used_where_pandas_is_missing(verdict, monkeypatch):
+    polars = pytest.importorskip("polars")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    assert isinstance(verdict.to_frame(), polars.DataFrame)
+    told = stlc.check("signal x\nrequire low: x < 3", polars.DataFrame({"t": [0.0, 0.1], "x": [1.0, 4.0]}))
+    assert told.satisfied
+
+
 def test_without_a_package_for_frames_the_error_names_one(verdict, monkeypatch):
     for name in ("pandas", "polars"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -642,3 +642,12 @@ def test_times_that_are_too_far_apart(tmp_path: Path, reading: Reading) -> None:
     (tmp_path / "a.csv").write_text("t,x\n-1e308,1\n1e308,1\n")
     with pytest.raises(TraceError, match="too long to be measured"):
         load_trace(tmp_path / "a.csv", reading)
+
+
+def test_a_frame_has_a_row_for_each_sample():
+    pytest.importorskip("pandas")
+    data = {"x": np.array([[1.0, 2.0], [3.0, 4.0]])}
+    frame = Trace(Signature((Column("x"),)), 0.5, data, 1.0).to_frame()
+    assert frame["trace"].tolist() == [0, 0, 1, 1]
+    assert frame["t"].tolist() == [1.0, 1.5, 1.0, 1.5]
+    assert frame["x"].tolist() == [1.0, 2.0, 3.0, 4.0]

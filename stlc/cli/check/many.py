@@ -15,7 +15,7 @@ from stlc.cli.check.text import WORDS, robustness_of
 from stlc.cli.framework.output import table
 from stlc.diagnostics import CODES, Diagnostic, MissingError, StlcError, usage
 from stlc.escape import operand, visible
-from stlc.files import find_trace, require_folder
+from stlc.files import require_folder, seen_at
 
 if TYPE_CHECKING:
     from stlc.controller.parallel.workers import LostCall
@@ -148,18 +148,6 @@ def overall(outcomes: Sequence[Outcome]) -> Status:
     if "violated" in found:
         return "violated"
     return "satisfied" if found - {"out of scope"} == {"satisfied"} else "inconclusive"
-
-
-def seen_at(name: str, runs: Path) -> Path:
-    """Return the path of a trace file called `name`.
-
-    It is `name` itself if that file exists, else the file of that name in the newest run below `runs`.
-    """
-    path = find_trace(name, runs)
-    if path == Path(name):
-        return path
-    path = path.resolve()
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def all_outcomes(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.certify.text import GuardOption, bounds_lines, checked_share, floored, raised
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
@@ -27,7 +28,7 @@ from stlc.cli.framework.options import (
     parse_overrides,
     parse_seeds,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, RunError, usage
 from stlc.escape import file_part, operand, shell, visible

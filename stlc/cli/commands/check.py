@@ -12,22 +12,21 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.certify.text import CertifyOption, bounds_lines, require_claim
 from stlc.cli.check import options as given
 from stlc.cli.framework.options import (
-    SPEC_SUFFIXES,
-    STDIN,
     ClusterOption,
     FailUnderOption,
     JsonOption,
     require_no_jobs,
     require_separate,
 )
-from stlc.cli.framework.output import PULSE, QUIET, Answer, emit, say, show_diagnostics, wants_color
+from stlc.cli.framework.output import QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import visible
-from stlc.files import has_wildcard, matching_traces, real, write_atomic
+from stlc.files import SPEC_SUFFIXES, STDIN, has_wildcard, matching_traces, real, write_atomic
 from stlc.jsontext import plain
 
 if TYPE_CHECKING:

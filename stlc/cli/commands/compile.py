@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides, spec_files
+from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 
@@ -46,6 +46,8 @@ def compile_(
     from stlc.diagnostics import usage
 
     if show == "ast" or show == "dot":
+        from stlc.files import spec_files
+
         return _trees(spec_files(files), show)
     if len(files) > 1:
         advice = ("stlc compile SPEC", "stlc compile SPEC SPEC --show ast")

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stlc.cli.check import options as given
-from stlc.cli.framework.options import SPEC_SUFFIXES, STDIN, JsonOption, parse_overrides
-from stlc.cli.framework.output import Answer, emit, table
+from stlc.cli.framework.options import JsonOption
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import CODES, usage
-from stlc.registry import did_you_mean
+from stlc.cli.framework.render import render_place
+from stlc.escape import visible
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.manual import CodeList, Page, RequirementInWords, SpecInWords
     from stlc.controller.guard.coverage import Chance, Guarantee
-    from stlc.monitor.explain.tree import Explanation
-
-_CODE = re.compile(r"[A-Za-z]\d{3}")
+    from stlc.grammar.manual import CodeList, Page, RequirementInWords, SpecInWords
+    from stlc.monitor.explain.tree import ExplainedViolation, Explanation
+    from stlc.monitor.judgement import Verdict
 
 
 @command(
@@ -53,40 +52,40 @@ def explain(
     shows how operators bind. A specification is translated into English, requirement by requirement. For a
     trace, each violation is traced back to the sub-formula, the instant, the signal and its value.
     """
-    if guarantee:
-        return _guarantee(what or "latest", reading.runs, parse_overrides(reading.set_))
-    from stlc.cli.framework.manual import CodeList, read_page
+    from stlc.controller.explain import explain as explained
+    from stlc.grammar.manual import CodeList, Page, SpecInWords
 
-    if what is None:
-        return Answer(CodeList(dict(CODES)), lambda: emit(table(list(CODES.items()), indent="")))
-    if _CODE.fullmatch(what):
-        what = what.upper()
-        if what not in CODES:
-            advice = did_you_mean(what, CODES, "stlc explain  lists the codes")
-            raise usage(f"there is no code `{what}`", *advice)
-    page = read_page(what) if what in CODES or what == "precedence" else None
-    if page is not None:
-        shown = "\n".join([page.title, "", *_plain_lines(page.text)]).rstrip()
-        return Answer(page, lambda: emit(shown))
-    if what == STDIN or Path(what).suffix in SPEC_SUFFIXES:
-        return _spec(what, reading.require or [])
-    from stlc.cli.check.causes import explain_trace
-    from stlc.files import has_wildcard
-    from stlc.rundir import recorded_trace
-
-    trace = what if has_wildcard(what) else str(recorded_trace(what, reading.runs))
-    return explain_trace(trace, reading.question(at=at), reading.runs, talk=not json)
+    question = reading.question(at=at)
+    options = {each.name: getattr(question, each.name) for each in fields(question)}
+    found: Any = explained(what, guarantee=guarantee, runs=reading.runs, **options)
+    match found:
+        case CodeList():
+            shown = table(list(found.codes.items()), indent="")
+        case Page():
+            shown = "\n".join([found.title, "", *_plain_lines(found.text)]).rstrip()
+        case SpecInWords():
+            shown = "\n\n".join("\n".join(_in_words(each)) for each in found.requirements)
+            shown = shown or f"{found.spec} requires nothing"
+        case _ if guarantee:
+            shown = "\n".join(_guarantee_lines(found))
+        case _:
+            return _violations(found, talk=not json)
+    return Answer(found, lambda: emit(shown))
 
 
-def _spec(name: str, wanted: list[str]) -> Answer[SpecInWords]:
-    """Translate requirements of a specification into English: those in `wanted`, or all if it is empty."""
-    from stlc.cli.framework.manual import in_words
-    from stlc.files import find_spec, read_source
-    from stlc.grammar.parser import parse
+def _violations(found: Explanation, *, talk: bool) -> Answer[Any]:
+    """Answer with the violations of a recording; with `talk`, remarks go to the standard error."""
+    from stlc.cli.check.many import EXIT_CODES, SATISFIED
 
-    found = in_words(parse(read_source(find_spec(name))), name, wanted)
-    text = "\n\n".join("\n".join(_in_words(each)) for each in found.requirements)
-    return Answer(found, lambda: emit(text or f"{name} requires nothing"))
+    verdict = found.verdict
+    if talk:
+        for line in verdict.notes:
+            say(line)
+        show_diagnostics(verdict.warnings)
+    text = "\n\n".join("\n".join(_violation_lines(each, verdict)) for each in found.causes)
+    nothing = f"{visible(verdict.about.trace)}: nothing is violated ({verdict.overall})"
+    code = EXIT_CODES.get(verdict.overall, SATISFIED)
+    return Answer(found, lambda: emit(text or nothing, styled=True), code, verdict.warnings)
 
 
 def _in_words(requirement: RequirementInWords) -> Iterator[str]:
@@ -96,6 +95,27 @@ def _in_words(requirement: RequirementInWords) -> Iterator[str]:
     yield fill(requirement.sentence, 96, initial_indent="  ", subsequent_indent="  ")
     for name, meaning in requirement.where.items():
         yield fill(f"{name}: {meaning}", 96, initial_indent="    where ", subsequent_indent="          ")
+
+
+def _violation_lines(found: ExplainedViolation, verdict: Verdict) -> Iterator[str]:
+    """Lines of output about one violation: the formula in the source, and the tree of causes.
+
+    The tree leads from the requirement to the sub-formulas, instants and signal values that decide its value.
+    """
+    from stlc.cli.check.text import in_unit
+
+    cause = found.cause
+    of = f" in trace {cause.trace}" if verdict.traces > 1 else ""
+    margin = in_unit(f"{found.tree[0].robustness:+.6g}", cause.rule.unit or cause.unit)
+    yield f"{visible(cause.name)} is violated{of}, judged from {cause.started}: robustness {margin}"
+    advice = [("because", cause.because)]
+    yield render_place(cause.place, cause.labels, advice, color=wants_color(sys.stdout)).rstrip("\n")
+    yield ""
+    for step in found.tree:
+        shown = f", {', '.join(step.readings)}" if step.readings else ""
+        margin = in_unit(f"{step.robustness:+.6g}", step.unit)
+        line = f"{step.short}    is {str(step.holds).lower()} {step.when}{shown}, robustness {margin}"
+        yield f"  {'  ' * step.depth}{visible(line)}"
 
 
 def _plain_lines(text: str) -> Iterator[str]:
@@ -115,24 +135,6 @@ def _plain_lines(text: str) -> Iterator[str]:
 
 
 # -------------------------------------------------------------------------- guarantees
-
-
-def _guarantee(run: str, runs: Path, overrides: Mapping[str, str]) -> Answer[Guarantee]:
-    """Compute lower bounds on the probability that the backup policy of a run finds a satisfying plan.
-
-    The backup policy tries many candidates for the first steps of a plan (its prefix); the candidates form a
-    grid. The main assumption is that some unknown prefix leads to a satisfying plan, and so do all prefixes
-    within a given radius of it. There is one bound for each length of the prefix and each radius. The
-    returned record lists all assumptions. `runs` is the folder of all runs, and `overrides` gives new values
-    of constants.
-    """
-    from stlc.controller.guard.coverage import guarantee
-    from stlc.controller.run.run import task_of_run
-    from stlc.rundir import RunDir
-
-    folder = RunDir.open(run, runs)
-    found = guarantee(folder.name, task_of_run(folder, overrides))
-    return Answer(found, lambda: emit("\n".join(_guarantee_lines(found))))
 
 
 def _guarantee_lines(told: Guarantee) -> list[str]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.certify.text import GuardOption
 from stlc.cli.check.many import INCONCLUSIVE
 from stlc.cli.falsify import findings
@@ -29,7 +30,7 @@ from stlc.cli.framework.options import (
     parse_seconds,
     require_no_jobs,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics
+from stlc.cli.framework.output import Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, MissingError, SpecError, UsageError, usage
 from stlc.files import read_source

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, spec_files
+from stlc.cli.framework.options import JsonOption, SpecsArgument
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, SpecError
+from stlc.files import STDIN, read_source, spec_files, write_atomic
 
 if TYPE_CHECKING:
     from stlc.cli.framework.documents import FormattedFiles
@@ -45,7 +46,6 @@ def fmt(
     differently. Formatting a second time changes nothing. Exit code: 0, or 1 if --check or --diff found a
     difference.
     """
-    from stlc.files import read_source, write_atomic
     from stlc.grammar.format.format import format_text
 
     names = spec_files(files or ["."])

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stlc.cli.framework.options import STDIN, JsonOption, SpecsArgument, SystemOption, spec_files
+from stlc.cli.framework.options import JsonOption, SpecsArgument, SystemOption
 from stlc.cli.framework.output import Answer, emit, emit_json, say, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import CODES, Diagnostic, SpecError, SystemFileError, UsageError, usage
+from stlc.diagnostics import CODES, Diagnostic, usage
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
-from stlc.source import Source, Span
+from stlc.files import STDIN, spec_files
+from stlc.source import Span
 from stlc.version import __version__
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.documents import LintedFiles
-    from stlc.lint.lint import Selection, Surroundings
+    from stlc.monitor.linted import Lint
 
 Format = Literal["text", "json", "github", "sarif"]
 
@@ -53,7 +51,7 @@ def lint(
     ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Look again whenever a file changes.")] = False,
     json: JsonOption = False,
-) -> Answer[LintedFiles]:
+) -> Answer[Lint]:
     """Report errors and warnings in specifications.
 
     Checks syntax, types, units, parentheses, unused names, and requirements that require little. With a
@@ -61,49 +59,18 @@ def lint(
     it. Exit code: 0 no errors, 1 warnings and --strict, 3 errors.
     `stlc explain CODE` says what a code means.
     """
-    from stlc.files import find_spec, read_source, write_atomic
-    from stlc.lint.lint import Selection
-    from stlc.lint.lint import fix as repair
-    from stlc.lint.lint import lint as lint_text
+    from stlc.monitor.linted import lint as lint_files
 
     names = spec_files(files or ["."])
-    for option, wanted in (("--watch", watch), ("--fix", fix)):
-        if wanted and STDIN in names:
-            raise usage(f"`{option}` needs files, not the standard input")
+    if watch and STDIN in names:
+        raise usage("`--watch` needs files, not the standard input")
 
-    selection = Selection(_codes(select), _codes(ignore))
-
-    def linted() -> Answer[LintedFiles]:
-        repairs, findings = 0, list[Diagnostic]()
-        for name in names:
-            try:
-                source = read_source(name if fix else find_spec(name))
-            except SpecError as error:
-                findings += error.diagnostics
-                continue
-            try:
-                within = _surroundings(system, source)
-            except (SystemFileError, UsageError) as error:
-                if system is not None:
-                    raise
-                findings += error.diagnostics
-                within = None
-            look = partial(lint_text, within=within, selection=selection)
-            if fix:
-                repaired = repair(source, look)
-                if repaired.count:
-                    write_atomic(source.name, repaired.source.text)
-                repairs += repaired.count
-                source, found = repaired.source, repaired.findings
-            else:
-                found = look(source)
-            findings += found
-            if trace is not None and not any(finding.severity == "error" for finding in found):
-                findings += _on_trace(source, trace, system, selection)
-        errors = any(finding.severity == "error" for finding in findings)
-        result: LintedFiles = {"files": list(names), "findings": len(findings), "fixed": repairs}
-        code = INVALID if errors else FOUND if strict and findings else CLEAN
-        return Answer(result, lambda: _show(format_, result, findings, code), code, findings)
+    def linted() -> Answer[Lint]:
+        found = lint_files(
+            names, fix=fix, select=_codes(select), ignore=_codes(ignore), system=system, trace=trace
+        )
+        code = INVALID if found.invalid else FOUND if strict and found.findings else CLEAN
+        return Answer(found, lambda: _show(format_, found, code), code, found.findings)
 
     if not watch:
         return linted()
@@ -113,49 +80,16 @@ def lint(
     raise typer.Exit
 
 
-def _on_trace(source: Source, trace: Path, system: str | None, selection: Selection) -> Iterator[Diagnostic]:
-    """Yield what a recording does not test of a specification, and what looks odd in it."""
-    from stlc.grammar.parser import parse
-    from stlc.monitor.facts.findings import findings_on
-
-    yield from (each for each in findings_on(parse(source), trace, system) if selection.wants(each.code))
-
-
 def _codes(text: str | None) -> tuple[str, ...]:
     return tuple(code.strip().upper() for code in (text or "").split(",") if code.strip())
 
 
-def _surroundings(system: str | None, source: Source) -> Surroundings | None:
-    """Load the system `system`, or else the one that `source` names, to check the specification with it.
-
-    Return None if there is none, or if the specification cannot be read.
-    """
-    from stlc.grammar.parser import parse
-
-    if system is None:
-        try:
-            system = parse(source).system
-        except SpecError:
-            return None
-    if system is None:
-        return None
-    from stlc.compile.ir.discretize import Grid
-    from stlc.compile.pipeline import Purpose
-    from stlc.dynamics.load import load_system_decl
-    from stlc.files import find_system
-    from stlc.lint.lint import Surroundings
-
-    decl = load_system_decl(find_system(system, Path(source.name)))
-    purpose: Purpose = "check" if decl.judges_by(Path(source.name)) else "train"
-    return Surroundings(decl.interface(), Grid(decl.dt, decl.horizon), purpose)
-
-
-def _show(format_: Format, result: LintedFiles, findings: Sequence[Diagnostic], code: int) -> None:
+def _show(format_: Format, result: Lint, code: int) -> None:
     """Print the findings in the format of `--format`; a JSON document also contains the exit code `code`."""
+    findings = result.findings
     match format_:
         case "json":
-            ok = code == CLEAN
-            emit_json("lint/1", ok=ok, exit_code=code, diagnostics=findings, result=result)
+            emit_json("lint/1", ok=code == CLEAN, exit_code=code, diagnostics=findings, result=result)
         case "github":
             if findings:
                 emit(github(findings))
@@ -168,24 +102,17 @@ def _show(format_: Format, result: LintedFiles, findings: Sequence[Diagnostic], 
                 from stlc.cli.framework.render import render_text
 
                 emit(render_text(findings, color=wants_color(sys.stdout)).rstrip("\n") + "\n", styled=True)
-            say(_summary(result, findings))
+            say(_summary(result))
 
 
-def _summary(result: LintedFiles, findings: Sequence[Diagnostic]) -> str:
+def _summary(result: Lint) -> str:
     """Last line of the output: the numbers of findings and of files, and what to do next."""
-    count = Counter(finding.severity for finding in findings)
-    files = _several(len(result["files"]), "file")
-    fixed = f"fixed {_several(result['fixed'], 'finding')}; " if result["fixed"] else ""
-    if not findings:
-        return f"{fixed}{files}, nothing to say"
-    found = ", ".join(_several(count[kind], kind) for kind in ("error", "warning", "fact") if count[kind])
-    repairable = sum(finding.fix is not None and finding.fix.same for finding in findings)
+    from stlc.monitor.linted import several
+
+    fixed = f"fixed {several(result.fixed, 'finding')}; " if result.fixed else ""
+    repairable = sum(finding.fix is not None and finding.fix.same for finding in result.findings)
     more = f"; {repairable} can be repaired: stlc lint --fix" if repairable else ""
-    return f"{fixed}{found} in {files}{more}"
-
-
-def _several(number: int, word: str) -> str:
-    return f"{number} {word}" if number == 1 else f"{number} {word}s"
+    return f"{fixed}{result.brief}{more}"
 
 
 # ------------------------------------------------------- findings for other programs

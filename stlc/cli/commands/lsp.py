@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stlc.cli.framework.output import PULSE
+from stlc.activity import PULSE
 from stlc.cli.framework.program import command
 
 

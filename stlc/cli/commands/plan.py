@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.framework.options import (
     FailUnderOption,
     MethodOptionsOption,
@@ -20,7 +21,7 @@ from stlc.cli.framework.options import (
     planner_choice,
     require_separate,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
 from stlc.registry import PLANNERS

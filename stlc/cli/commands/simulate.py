@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.certify.text import CertifyOption, bounds_lines, require_claim
 from stlc.cli.framework.options import (
     AgentsOption,
@@ -33,7 +34,7 @@ from stlc.cli.framework.options import (
     planner_choice,
     require_separate,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.diagnostics import Diagnostic, RunError, usage

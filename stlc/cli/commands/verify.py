@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.certify.text import floored
 from stlc.cli.framework.completion import run_names
 from stlc.cli.framework.options import (
@@ -22,7 +23,7 @@ from stlc.cli.framework.options import (
     parse_clock,
     parse_seconds,
 )
-from stlc.cli.framework.output import PULSE, Answer, emit, show_diagnostics, table
+from stlc.cli.framework.output import Answer, emit, show_diagnostics, table
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, usage
 from stlc.escape import visible

@@ -49,22 +49,10 @@ class CreatedFiles(TypedDict):
     files: list[str]
 
 
-class LintedFiles(TypedDict):
-    files: list[str]
-    findings: int
-    fixed: int
-
-
 class PlottedTrace(TypedDict):
     trace: str
     picture: str
     shown: list[int]
-
-
-class WrittenReport(TypedDict):
-    run: str
-    report: str
-    verdict: NotRequired[Learning]
 
 
 class ListedRun(TypedDict):

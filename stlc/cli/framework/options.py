@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import re
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stlc.cli.framework.completion import requirement_names, run_names
-from stlc.diagnostics import Diagnostic, UsageError, usage
-from stlc.files import real
+from stlc.diagnostics import usage
+from stlc.files import STDIN, real
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
@@ -159,10 +159,6 @@ def parse_pairs(pairs: Sequence[str] | None, option: str, form: str, example: st
     return values
 
 
-SPEC_SUFFIXES = (".stl", ".stlc")
-STDIN = "-"
-
-
 def require_separate(
     written: Iterable[tuple[str, Path | str | None]], read: Iterable[Path | str | None]
 ) -> None:
@@ -198,35 +194,6 @@ def _identity(path: Path | str | None) -> object:
     except (OSError, ValueError):  # no path: reading or writing it says why
         return None
     return (found.st_dev, found.st_ino) if stat.S_ISREG(found.st_mode) else None
-
-
-def spec_files(names: Sequence[str]) -> tuple[str, ...]:
-    """Paths of specification files, in order and without duplicates; a folder stands for all files below it.
-
-    Raises:
-        UsageError: U102, a folder contains no specification; U101, `names` is empty.
-    """
-    if not names:
-        raise usage("which file?", "a .stl file, a folder, or - for a pipe")
-    return tuple(dict.fromkeys(path for name in names for path in _below(name)))
-
-
-def _below(name: str) -> Iterator[str]:
-    folder = Path(name)
-    if name == STDIN or not folder.is_dir():
-        yield name
-        return
-    found = sorted(
-        path for path in folder.rglob("*") if path.suffix in SPEC_SUFFIXES and _shown(path, folder)
-    )
-    if not found:
-        raise UsageError(Diagnostic("U102", f"there is no specification in `{name}`"))
-    yield from map(str, found)
-
-
-def _shown(path: Path, folder: Path) -> bool:
-    """True if `path` is not hidden: no file or folder name below `folder` begins with a dot."""
-    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
 # --------------------------------------------------------- durations, counts, seeds

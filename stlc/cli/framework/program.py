@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -22,11 +22,12 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.errors import report as report_error
 from stlc.cli.framework.help import CommandHelp, ProgramHelp
 from stlc.cli.framework.options import JsonOption
-from stlc.cli.framework.output import COLOR, PULSE, QUIET, Answer, ColorMode, emit, noticing, silence
+from stlc.cli.framework.output import COLOR, QUIET, Answer, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, PluginError, UsageError
 from stlc.foreign import driving
 from stlc.registry import Registry
@@ -271,7 +272,7 @@ class Program:
                     finding = Diagnostic("U101", f"there is no command `{name}`", help=(self.moved[name],))
                     raise UsageError(finding)
                 words = [*front, *rest]
-                with PULSE.beating():
+                with nullcontext() if QUIET.get() else PULSE.beating():
                     code = self.parser(name).main(args=words, prog_name=self.name, standalone_mode=False)
                 if stopped and code == INTERRUPTED:  # the parser turns Ctrl-C into an exit code
                     code = report_error(SystemExit(stopped[0]), rest)

@@ -25,9 +25,9 @@ RESULTS: dict[str, tuple[str, ...]] = {
     ),
     "doctor": (f"{_DOCUMENTS}:InstallationReport",),
     "explain": (
-        "stlc.cli.framework.manual:CodeList",
-        "stlc.cli.framework.manual:Page",
-        "stlc.cli.framework.manual:SpecInWords",
+        "stlc.grammar.manual:CodeList",
+        "stlc.grammar.manual:Page",
+        "stlc.grammar.manual:SpecInWords",
         "stlc.monitor.explain.tree:Explanation",
         "stlc.controller.guard.coverage:Guarantee",
     ),
@@ -39,10 +39,10 @@ RESULTS: dict[str, tuple[str, ...]] = {
     ),
     "fmt": (f"{_DOCUMENTS}:FormattedFiles",),
     "init": (f"{_DOCUMENTS}:CreatedFiles",),
-    "lint": (f"{_DOCUMENTS}:LintedFiles",),
+    "lint": ("stlc.monitor.linted:Lint",),
     "plan": ("stlc.assurance.verification.planned:Plans",),
     "plot": (f"{_DOCUMENTS}:PlottedTrace",),
-    "report": (f"{_DOCUMENTS}:WrittenReport",),
+    "report": ("stlc.view.report:Report",),
     "runs": tuple(
         f"{_DOCUMENTS}:{name}" for name in ("RunList", "RunComparison", "RunContent", "RemovedRuns")
     ),

@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from stlc.cli.framework.output import PULSE, say, show_diagnostics
+from stlc.activity import PULSE
+from stlc.cli.framework.output import say, show_diagnostics
 from stlc.diagnostics import StlcError
 
 PERIOD = 0.3

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stlc.activity import PULSE
 from stlc.cli.check.text import WORDS, in_unit, robustness_text
 from stlc.cli.framework.options import parse_seeds
-from stlc.cli.framework.output import PULSE, Answer, emit, say, show_diagnostics, table
+from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.diagnostics import usage
 from stlc.escape import operand, shell, visible
 from stlc.monitor.judgement import worst_of

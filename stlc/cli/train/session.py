@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import typer
 
+from stlc.activity import PULSE
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
-from stlc.cli.framework.output import PULSE, Answer, console, say, show_diagnostics
+from stlc.cli.framework.output import Answer, console, say, show_diagnostics
 from stlc.cli.train.progress import TrainingDisplay, final_screen
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch

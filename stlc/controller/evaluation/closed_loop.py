@@ -266,21 +266,6 @@ def closed_loop(run: Run, left: Callable[[], float], most: int = DRIVES, *, extr
     return replace(nothing, shares=shares, judge=judge, left_out=trial.left_out(shares))
 
 
-def fresh_share(run: Run, guard: str, runs: int) -> Share:
-    """Simulate at least `runs` runs under one guard, without time limit, from the seeds of `stlc simulate`.
-
-    Raises:
-        SystemFileError: a method of the world raises an exception or returns wrong values.
-        SpecError: the rules (specification of closed-loop runs) do not fit the system.
-    """
-    trial = _Trial(run, rules_of(run), lambda: 1e9, runs, 0)
-    agents = trial.test.agents
-    seeds = tuple(range(-(-runs // agents)))
-    judged = trial._judged(trial._simulated(guard, seeds, agents, share=1.0))
-    safe = None if judged.safe is None else int(judged.safe.sum())
-    return Share(guard, len(judged.viable), int(judged.obeyed.sum()), safe)
-
-
 class _Trial:
     """Closed-loop simulation of one policy under all guards, in progress."""
 

@@ -26,6 +26,7 @@ from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_o
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.native import check_plans
 from stlc.runtime.decision import rank
+from stlc.tabular import html_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -174,6 +175,12 @@ class Task:
 
     def __repr__(self) -> str:
         return f"Task({self.compiled.name} on {self.system.facts})"
+
+    def _repr_html_(self) -> str:
+        rules = self.compiled.requirements
+        rows = [(rule.name, ", ".join(rule.tags), " ".join((rule.doc or "").split())) for rule in rules]
+        title = f"{self.compiled.name} on {self.system.facts}"
+        return html_table(title, ("requirement", "tags", "says"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:

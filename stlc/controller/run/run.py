@@ -22,6 +22,7 @@ from stlc.plugins import variable
 from stlc.provenance import sha256
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir
+from stlc.tabular import html_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -90,6 +91,11 @@ class Run:
             told = f"{result['accuracy']:.3f} of {result['held_out']:,} held-out starts"
         return f"Run({name}: {told})"
 
+    def _repr_html_(self) -> str:
+        found = (self.dir.record().get("result") or {}).get("requirements") or {}
+        rows = [(name, f"{share:.1%}") for name, share in found.items()]
+        return html_table(repr(self), ("requirement", "satisfied by plans"), rows)
+
     def guard(self, name: str = GUARDS.default) -> GuardedLoop:
         """Return a guard for a loop of one's own, which is called with a state at each step, in NumPy.
 
@@ -121,6 +127,11 @@ class Run:
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
         """Plans of the policy from states (B, n), and their verdicts."""
         return self.policy.plan_judged(x0)
+
+
+def folder_of(run: Run | Path | str, runs: Path = RUNS) -> RunDir:
+    """Folder of a run, or of the one that is called so below `runs`; see `RunDir.open`."""
+    return run.dir if isinstance(run, Run) else RunDir.open(run, runs)
 
 
 def task_of_run(

@@ -53,7 +53,7 @@ class PlanBudget:
     stop: Stop = never
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class PlanResult(Rows):
     """Plans from given initial states, judged exactly in float64.
 
@@ -73,6 +73,10 @@ class PlanResult(Rows):
     infeasible: Tensor
     seconds: Tensor
     evaluations: Tensor
+
+    def __repr__(self) -> str:
+        good, count = int(self.satisfied.sum()), len(self.rho)
+        return f"PlanResult({good:,} of {count:,} plans satisfy it, least robustness {self.rho.min():.4g})"
 
     @property
     def satisfied(self) -> Tensor:
@@ -310,7 +314,7 @@ def plan(
     x0: Tensor,
     method: str = "search",
     *,
-    budget: PlanBudget | None = None,
+    budget: float | PlanBudget | None = None,
     seed: int = 0,
     start: Tensor | None = None,
     progress: Callable[[PlanSearch], None] | None = None,
@@ -322,7 +326,8 @@ def plan(
         task: specification and system.
         x0: initial states, (B, n) or (n,), in the order of `task.system.names`.
         method: name of a planner, or path of its file.
-        budget: limits of the search; by default `SECONDS` of processor time per initial state.
+        budget: processor time per initial state in seconds, or further limits of the search; by default
+            `SECONDS`.
         seed: seed of the planner's random numbers.
         start: initial guesses of plans, (B, T, m).
         progress: function that receives the search after each round.
@@ -343,6 +348,7 @@ def plan(
     if states.dim() != 2 or states.shape[1] != len(names):
         raise usage(f"initial states of {tuple(given.shape)} are not (B, {len(names)})", ", ".join(names))
     solver = prepared(planner_named(PLANNERS.chosen(method), **options), task)
-    search = PlanSearch(task, states, budget or PlanBudget(), seed=seed, start=start, progress=progress)
+    limits = PlanBudget(budget) if isinstance(budget, int | float) else budget or PlanBudget()
+    search = PlanSearch(task, states, limits, seed=seed, start=start, progress=progress)
     solver(search)
     return search.result

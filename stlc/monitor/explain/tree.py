@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from stlc.compile.ir.traverse import margin_unit
 from stlc.jsontext import Num
@@ -71,21 +71,24 @@ class ExplainedViolation:
         return self.cause.timeline.time(self.cause.violated - self.cause.first)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Explanation:
-    """Violations of a recording, and their causes."""
+    """Violations of a recording, and their causes; `verdict` is what was judged."""
 
-    JSON: ClassVar = "trace verdict=overall causes"
+    JSON: ClassVar = "trace=verdict.about.trace verdict=verdict.overall causes"
 
-    trace: str
-    overall: Literal["satisfied", "violated", "inconclusive", "out of scope"]
+    verdict: Verdict
     causes: tuple[ExplainedViolation, ...]
+
+    def __repr__(self) -> str:
+        causes = (f"{each.cause.name} because {each.cause.because}" for each in self.causes)
+        return f"Explanation({'; '.join(causes) or self.verdict.overall})"
 
 
 def explanation(verdict: Verdict) -> Explanation:
     """Explain every violation of a verdict that was not told."""
     found = (ExplainedViolation(cause, tuple(_steps(cause))) for cause in verdict.causes.values())
-    return Explanation(verdict.about.trace, verdict.overall, tuple(found))
+    return Explanation(verdict, tuple(found))
 
 
 def _steps(cause: Cause) -> Iterator[Step]:

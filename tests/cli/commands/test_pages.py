@@ -17,9 +17,9 @@ from helpers.exported import exported
 from helpers.several import ENVIRONMENT, free_port
 
 from stlc.cli.framework.app import main
-from stlc.cli.framework.manual import FOLDER, Example, Page, read_page
 from stlc.controller.training.config import TrainConfig
 from stlc.diagnostics import CODES, StlcError
+from stlc.grammar.manual import FOLDER, Example, Page, read_page
 from stlc.grammar.tables import load_parser
 from stlc.rundir import RunDir
 

@@ -13,7 +13,7 @@ from stlc.grammar import ast
 from stlc.grammar.english import Meanings
 from stlc.registry import did_you_mean
 
-FOLDER = Path(__file__).parents[2] / "pages"
+FOLDER = Path(__file__).parents[1] / "pages"
 _FENCE = re.compile(r"^```(?P<language>\w*)(?P<notes>[^\n]*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

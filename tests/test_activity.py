@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 import time
+from contextlib import nullcontext
 
 import pytest
 
-from stlc.cli.framework.output import QUIET, Pulse, emit
+from stlc.activity import Pulse
+from stlc.cli.framework.app import main
+from stlc.cli.framework.output import emit
 
 
 class Terminal(io.StringIO):
@@ -50,12 +53,12 @@ def test_in_a_log_lines_are_written(pulse: Pulse, monkeypatch: pytest.MonkeyPatc
     assert set(lines) == {"drawing, 0 s"}
 
 
-def test_nothing_is_said_while_waiting_or_where_remarks_are_left_out(
-    pulse: Pulse, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_said_while_waiting(pulse: Pulse, monkeypatch: pytest.MonkeyPatch) -> None:
     assert said(pulse, io.StringIO(), monkeypatch, "") == ""
-    token = QUIET.set(True)
-    try:
-        assert said(pulse, Terminal(), monkeypatch, "drawing") == ""
-    finally:
-        QUIET.reset(token)
+
+
+def test_a_quiet_program_does_not_show_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[bool] = []
+    monkeypatch.setattr(Pulse, "beating", lambda _: shown.append(True) or nullcontext())
+    assert [main([*words, "explain", "E203"]) for words in ((), ("--quiet",))] == [0, 0]
+    assert shown == [True]
