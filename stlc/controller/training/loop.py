@@ -318,6 +318,8 @@ class _Past:
                 system.
         """
         saved, record = None, folder.record()
+        if not record.keys() >= {"status", "seed", "spec_hash"}:
+            raise RunError(folder.damaged("run.json", ValueError("it does not say what was trained")))
         if not never_saved(folder) or "schedule" not in record:
             saved = load_checkpoint(folder, spec_hash=spec_hash(folder), system_hash=system_hash(folder))
         facts: Mapping[str, Any] = record if saved is None else saved.facts

@@ -171,6 +171,14 @@ def test_resuming_a_finished_run_says_so(car_task: Task, tmp_path: Path) -> None
     with pytest.raises(RunError) as caught:
         resume(folder)
     assert caught.value.diagnostics[0].code == "R103"
+    record = folder.path / "run.json"
+    told = record.read_text()
+    for damaged in ("{}", '{"status": "finished", "seed": 0}'):
+        record.write_text(damaged)
+        with pytest.raises(RunError, match=r"run\.json` is damaged"):
+            resume(folder)
+        assert record.read_text() == damaged
+    record.write_text(told)
     assert resume(folder, steps=8).run.dir.record()["steps"] == 8
 
 
