@@ -149,7 +149,7 @@ PROBES = (
     ),
     Probe(
         "status of a requirement",
-        "monitor/judgement.py",
+        "compile/semantics/tolerance.py",
         'return "violated" if violated else "satisfied" if satisfied else "inconclusive"',
         'return "inconclusive" if violated else "satisfied" if satisfied else "inconclusive"',
         RECORDED,

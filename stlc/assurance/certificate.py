@@ -36,9 +36,9 @@ from stlc.assurance.conformal import (
 )
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.kinds.exact import Exact
-from stlc.compile.semantics.tolerance import overall
+from stlc.compile.semantics.tolerance import Status, overall
 from stlc.jsontext import Num
-from stlc.monitor.judgement import RequirementVerdict, Status, Verdict
+from stlc.monitor.judgement import RequirementVerdict, Verdict
 
 FORMAT = "stlc-certificate/1"
 ALL = "all requirements"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import Horizon
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics, semantics_of
-from stlc.compile.semantics.tolerance import TOLERANCE, End, overall
+from stlc.compile.semantics.tolerance import TOLERANCE, End, Status, overall, status_of
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.jsontext import Num
 from stlc.monitor.facts.extent import samples_read
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from stlc.monitor.explain.report import Cause
     from stlc.monitor.uncertain import Uncertainty
 
-Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
 Bools: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.int64]
 R = TypeVar("R", bound=Any)
@@ -728,11 +727,6 @@ def unknown_requirement(name: str, names: Sequence[str]) -> UsageError:
     help_ = (f"did you mean `{near}`?",) if near else ()
     note = (f"requirements: {', '.join(names)}",)
     return UsageError(Diagnostic("U101", f"there is no requirement `{name}`", help=help_, note=note))
-
-
-def status_of(violated: bool, satisfied: bool) -> Status:
-    """Return the status of what is violated, satisfied, or neither."""
-    return "violated" if violated else "satisfied" if satisfied else "inconclusive"
 
 
 def _known(status: Status) -> bool | None:

@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from stlc.cli.check.text import WORDS, robustness_of
 from stlc.cli.framework.output import table
+from stlc.compile.semantics.tolerance import status_of
 from stlc.diagnostics import CODES, Diagnostic, MissingError, StlcError, usage
 from stlc.escape import operand, visible
 from stlc.files import require_folder, seen_at
 
 if TYPE_CHECKING:
+    from stlc.compile.semantics.tolerance import Status
     from stlc.controller.parallel.workers import LostCall
     from stlc.monitor.check import Question
     from stlc.monitor.facts.fact import Fact
-    from stlc.monitor.judgement import RequirementVerdict, Status, Verdict
+    from stlc.monitor.judgement import RequirementVerdict, Verdict
 
 SATISFIED, VIOLATED, INVALID, INCONCLUSIVE = 0, 1, 3, 4
 EXIT_CODES: dict[Status, int] = {
@@ -145,9 +147,7 @@ def overall(outcomes: Sequence[Outcome]) -> Status:
     Files to which the specification does not apply do not count.
     """
     found = {outcome.status for outcome in outcomes if not outcome.errors}
-    if "violated" in found:
-        return "violated"
-    return "satisfied" if found - {"out of scope"} == {"satisfied"} else "inconclusive"
+    return status_of("violated" in found, found - {"out of scope"} == {"satisfied"})
 
 
 def all_outcomes(

@@ -13,9 +13,10 @@ from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
 from stlc.escape import operand, shell, visible
 
 if TYPE_CHECKING:
+    from stlc.compile.semantics.tolerance import Status
     from stlc.monitor.explain.report import Cause
     from stlc.monitor.facts.fact import Fact
-    from stlc.monitor.judgement import RequirementVerdict, Status, Verdict
+    from stlc.monitor.judgement import RequirementVerdict, Verdict
 
 WORDS: dict[Status, str] = {
     "satisfied": "satisfied",

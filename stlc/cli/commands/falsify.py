@@ -364,8 +364,8 @@ def _replayed(
 ) -> Answer[FalsifiedSystem | ReplayedCounterexample | ReplayedFinding]:
     """Simulate a stored counterexample again, and compare it with its trace, bit for bit."""
     from stlc.assurance.falsified import ReplayedCounterexample, StoredFinding
-    from stlc.compile.semantics.tolerance import violated
-    from stlc.monitor.judgement import require_known, status_of
+    from stlc.compile.semantics.tolerance import status_of, violated
+    from stlc.monitor.judgement import require_known
     from stlc.trace import load_trace
 
     stored = _stored(path)

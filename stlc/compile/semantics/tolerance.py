@@ -1,4 +1,4 @@
-"""Tolerance of verdicts, and the robustness of requirements weighed without a change of their verdicts."""
+"""Verdicts from robustness: tolerance, status, and weighed robustness that has the same verdicts."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 A = TypeVar("A")
 End: TypeAlias = Literal["open", "strict", "truncate"]
 """Verdict on a trace that is too short: bounds over all continuations, an error, or that of cut windows."""
+Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
+"""Outcome of a requirement; out of scope if an assumption does not hold."""
 TOLERANCE = 1e-6
 """A requirement counts as satisfied if its robustness is >= -TOLERANCE, in float64.
 
@@ -58,6 +60,11 @@ def violated(rho: A, tolerance: float | None = None) -> A: ...
 def violated(rho: Any, tolerance: float | None = None) -> Any:
     """Return whether rho < 0 beyond rounding, as in `satisfied`; NaN is not violated either."""
     return rho < -(tolerance_of(rho) if tolerance is None else tolerance)
+
+
+def status_of(violated: bool, satisfied: bool) -> Status:
+    """Return the status of what is violated, satisfied, or neither."""
+    return "violated" if violated else "satisfied" if satisfied else "inconclusive"
 
 
 def weighed(rho: Array, factor: float, ops: Ops) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
+from stlc.compile.semantics.tolerance import status_of
 from stlc.controller.evaluation.causes import Lost, losses
 from stlc.controller.evaluation.executed import MOST_TIMED, Executed
 from stlc.controller.run.run import INDEX, Run, read_library, save_library
@@ -293,14 +294,10 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
         dt: time step in seconds.
     """
     viable, fails = executed.viable, executed.fails
-    rules = {
-        name: np.where(
-            fails[name].any(0),
-            "violated",
-            np.where(held.all(0) & (len(held) > 0), "satisfied", "inconclusive"),
-        )
-        for name, held in executed.rules.items()
-    }
+    rules = {}
+    for name, held in executed.rules.items():
+        kept = held.all(0) & (len(held) > 0)
+        rules[name] = np.array(list(map(status_of, fails[name].any(0).tolist(), kept.tolist())), "<U12")
     names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(viable))}
     broken = (
         Broken(

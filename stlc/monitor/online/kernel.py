@@ -12,7 +12,7 @@ import numpy as np
 
 from stlc import native
 from stlc.compile.backends.c.streams import TABLES, Rule, Streams, runtime, streams_of
-from stlc.monitor.judgement import Status
+from stlc.compile.semantics.tolerance import Status
 from stlc.monitor.online.history import Floats
 from stlc.monitor.online.tally import JudgedInstants, RequirementSummary
 from stlc.monitor.signals import Gap

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir.support import columns_in, history
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import Status, satisfied, status_of, violated
 from stlc.monitor.instants import window_of
-from stlc.monitor.judgement import Status
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.recompute import RecomputeTracker
 
@@ -43,9 +42,7 @@ class Margin:
 
     def status(self, trace: int) -> Status:
         """Violated if violated at any window start of the trace, satisfied if at none and none is open."""
-        if self.violated[trace]:
-            return "violated"
-        return "inconclusive" if self.open[trace] else "satisfied"
+        return status_of(bool(self.violated[trace]), not self.open[trace])
 
 
 @dataclass(slots=True)

@@ -15,11 +15,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import endless
 from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import Compiled, CompiledRequirement
-from stlc.compile.semantics.tolerance import TOLERANCE
+from stlc.compile.semantics.tolerance import TOLERANCE, Status
 from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, beyond, check_length, starts_of, window_of
-from stlc.monitor.judgement import Status, unknown_requirement
+from stlc.monitor.judgement import unknown_requirement
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.kernel import After, Starts, StreamKernel, Watching
 from stlc.monitor.online.recompute import RecomputeTracker, require_bounded, without_end

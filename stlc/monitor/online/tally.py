@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import satisfied, violated
-from stlc.monitor.judgement import Status
+from stlc.compile.semantics.tolerance import Status, satisfied, status_of, violated
 from stlc.monitor.online.history import Floats
 
 Flags = NDArray[np.bool_]
@@ -96,9 +95,7 @@ class RequirementSummary:
     @property
     def status(self) -> Status:
         """Violated if violated at any counted instant, satisfied if satisfied at all, else inconclusive."""
-        if self.fails:
-            return "violated"
-        return "satisfied" if self.instants and self.holds == self.instants else "inconclusive"
+        return status_of(self.fails > 0, 0 < self.instants == self.holds)
 
     @property
     def robustness(self) -> float:
