@@ -67,6 +67,7 @@ BACKUPS = ("backup", "backup as a torch program", "backup by the runtime", "back
 POLICIES = ("policy", "policy as a torch program", "policy by ONNX", "policy by the header")
 SMOOTH = ("smooth by NumPy", "smooth by torch")
 
+_LEVELS = "levels of a control in prefixes"
 ABS = """
         {},
         "{}",
@@ -96,7 +97,7 @@ PROBES = (
         "compile/semantics/tolerance.py",
         "return rho >= -(tolerance_of(rho) if tolerance is None else tolerance)",
         "return rho >= 0.3",
-        (*RECORDED, *BACKUPS, *POLICIES, "gymnasium", "plan by search"),
+        ("check", "check as text", "stream", *BACKUPS, *POLICIES, "gymnasium", "plan by search"),
     ),
     Probe(
         "rank of plans",
@@ -183,7 +184,28 @@ PROBES = (
         (*RECORDED, "stream in C", *PLANNED, "plan by milp", "bounds"),
     ),
     Probe(
-        "levels of a control in prefixes",
+        "derivative of a function",
+        "compile/ir/functions.py",
+        '_smooth("sin", "`sin(x)` of an angle.", "cos({0})"',
+        '_smooth("sin", "`sin(x)` of an angle.", "(2.0 * cos({0}))"',
+        ("gradient by C", "gradient by torch", "symbolic derivative"),
+    ),
+    Probe(
+        "word of a status",
+        "cli/check/text.py",
+        '"satisfied": "satisfied",',
+        '"satisfied": "OBEYED",',
+        ("check as text",),
+    ),
+    Probe(
+        "size of a unit",
+        "units.py",
+        '"h": (3600, "s")',
+        '"h": (4800, "s")',
+        ("check", "check as text", "explain", "stream", "stream in C", *PLANNED, "plan by milp", "bounds"),
+    ),
+    Probe(
+        _LEVELS,
         "runtime/prefixes.py",
         "actions = np.array(list(product(*self.values)), dtype=np.float64)",
         "actions = 0.5 * np.array(list(product(*self.values)), dtype=np.float64)",
@@ -191,11 +213,50 @@ PROBES = (
     ),
 )
 
-APART: Mapping[tuple[str, str], str] = {}
-"""Meaning and face -> name of the test that holds the face to the meaning."""
+_IN_C = "tests/runtime/test_decision.py::test_rank_and_choices_are_the_same_in_every_library_and_in_c"
+_WEIGHED = "tests/compile/semantics/test_tolerance.py::test_c_weighs_and_judges_alike"
+_FORMULAS = "tests/compile/backends/test_c_formulas.py::test_every_operator_over_every_window"
+_SLOPES = "tests/compile/backends/test_c_adjoint.py::test_every_function_has_the_gradient_of_torch"
+_STREAMS = "tests/monitor/online/test_streams.py::test_a_stream_gives_what_the_whole_trace_gives"
+_EXPORT, _BACKENDS = "tests/export", "tests/compile/backends"
+_GRAPHS, _MILP = f"{_EXPORT}/test_onnx_graphs.py", "tests/controller/planning/test_milp.py"
+_WRITE, _ONNX, _EXTREMA = (
+    f"{_EXPORT}/test_write.py",
+    f"{_BACKENDS}/test_ops_onnx.py",
+    f"{_BACKENDS}/test_torch_extrema.py",
+)
+APART: Mapping[tuple[str, str], str] = {
+    ("choice of the backup", "backup by the header"): _IN_C,
+    ("rank of plans", "policy by the header"): _IN_C,
+    ("satisfaction", "backup by the header"): _WEIGHED,
+    ("satisfaction", "policy by the header"): _WEIGHED,
+    ("satisfaction", "stream"): _STREAMS,
+    ("weighed robustness", "verdict by the header"): _WEIGHED,
+    (
+        "cost of a plan",
+        "cost by ONNX",
+    ): f"{_GRAPHS}::test_promises_deepen_as_the_task_says",
+    ("cost of a plan", "cost by the header"): f"{_WRITE}::test_the_c_controller_costs_plans_as_the_task",
+    ("smooth maximum", "smooth by torch"): f"{_EXTREMA}::test_smooth_extrema_are_those_of_numpy",
+    ("until", "verdict by C"): _FORMULAS,
+    ("until", "verdict by the header"): _FORMULAS,
+    ("until", "stream"): _STREAMS,
+    ("until", "stream in C"): f"{_EXPORT}/test_monitor.py::test_random_formulas_under_sanitizers",
+    (
+        "until",
+        "plan by milp",
+    ): f"{_MILP}::test_proofs_and_plans_agree_with_trial",
+    ("value of a function", "verdict by ONNX"): f"{_ONNX}::test_every_function_equals_the_evaluator",
+    ("derivative of a function", "gradient by torch"): _SLOPES,
+    ("derivative of a function", "symbolic derivative"): (
+        "tests/dynamics/model/test_derivative.py::test_every_function_has_its_derivative"
+    ),
+    (_LEVELS, "backup by the header"): f"{_WRITE}::test_the_c_controller_decides_as_the_guard",
+}
+"""Meaning and face -> the test that holds the face to the meaning."""
 
 LAGGING: frozenset[tuple[str, str]] = frozenset()
-"""Meanings and faces without such a test, still to be followed."""
+"""Meanings and faces without such a test. The list may only shrink."""
 
 # ------------------------------------------------------------------------------------------- fixed inputs
 
@@ -225,7 +286,7 @@ require goes: v > -0.2 until[0.1 s, 0.4 s] x > 0.1
 @weight(3)
 require calm: always[0 s, 0.3 s] (x > 0.2 -> v < 0.9)
 @safety
-require slow: always[0 s, 0.4 s] abs(v) <= 1
+require slow: always[0 s, 0.4 s] abs(v) <= 3.6 km/h
 """
 MISSION = """spec cart
 state signal x [m]
@@ -497,6 +558,54 @@ def planned(words: str) -> str:
     return json.dumps([result[name] for name in ("satisfied", "infeasible", "robustness")])
 
 
+def sine() -> Any:
+    """The expression `sin(x)`."""
+    from stlc.compile.ir import nodes as ir
+
+    return ir.Op("sin", (ir.Signal("x"),))
+
+
+def gradient_in_c() -> list[float]:
+    """Slope of `sin(x)`, by the kernel."""
+    import numpy as np
+    from helpers.emitted import adjoint_of
+
+    from stlc.compile.backends.c.emit import Motion
+    from stlc.compile.ir import nodes as ir
+    from stlc.native import ObjectiveSlopes
+
+    motion = Motion(("y",), ("x",), (), {"y": sine()}, 1, 0.1)
+    at = np.linspace(-3.0, 3.0, 7)
+    outcome = ObjectiveSlopes(np.ones((len(at), 1)), None, 5.0)
+    adjoint = adjoint_of(motion, [ir.Temporal("always", ir.Window(1, 1), ir.Predicate(ir.Signal("y")))])
+    return adjoint.pull(np.zeros((len(at), 1)), at.reshape(-1, 1, 1).copy(), outcome).ravel().tolist()
+
+
+def gradient_in_torch() -> list[float]:
+    """Slope of `sin(x)`, by torch."""
+    import torch
+
+    from stlc.compile.backends.array.arith import ArrayProgram
+    from stlc.compile.backends.torch.ops import TORCH
+
+    x = torch.linspace(-3.0, 3.0, 7, dtype=torch.float64, requires_grad=True)
+    value = ArrayProgram({"out": sine()})({"x": x}, TORCH)["out"]
+    return torch.autograd.grad(value.sum(), x)[0].tolist()
+
+
+def symbolic_derivative() -> list[float]:
+    """Slope of `sin(x)`, as an expression."""
+    import numpy as np
+
+    from stlc.compile.backends.array.arith import ArrayProgram
+    from stlc.compile.backends.array.numpy_ops import NUMPY
+    from stlc.dynamics.model.derivative import derivative
+
+    found = derivative(sine(), "x")
+    assert found is not None
+    return ArrayProgram({"out": found})({"x": np.linspace(-3.0, 3.0, 7)}, NUMPY)["out"].tolist()
+
+
 FACES: Mapping[str, Callable[[], Any]] = {
     "check": lambda: documented("check cart.stl {} --json"),
     "check as text": lambda: stlc("check cart.stl {}"),
@@ -523,6 +632,9 @@ FACES: Mapping[str, Callable[[], Any]] = {
     "cost by ONNX": lambda: onnx_verdicts("mission").cost.tolist(),
     "smooth by NumPy": smooth_numpy,
     "smooth by torch": smooth_torch,
+    "gradient by C": gradient_in_c,
+    "gradient by torch": gradient_in_torch,
+    "symbolic derivative": symbolic_derivative,
     "gymnasium": gymnasium,
 }
 

@@ -25,10 +25,12 @@ from stlc.controller.run.run import Run
 from stlc.controller.training.config import TrainConfig
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.diagnostics import RunError, UsageError
+from stlc.export.c_header import header, main_of, public, weights
 from stlc.export.programs import without_deprecations
-from stlc.export.verify import Answer, agreement, answers
+from stlc.export.verify import Answer, agreement, answers, by_c
 from stlc.export.write import export, target_of
 from stlc.runtime import backup
+from stlc.runtime.decision import acceptable
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 from stlc.runtime.prefixes import SAMPLINGS
@@ -71,6 +73,22 @@ def test_the_c_controller_decides_as_the_guard(spec: str, system: str, varied: b
     assert got[:, 1].tolist() == wanted.t0.tolist()
     torch.testing.assert_close(got[:, 2], wanted.rho, rtol=0.0, atol=1e-4)
     torch.testing.assert_close(got[:, 4 + rules :].view_as(wanted.plan), wanted.plan, rtol=0.0, atol=1e-4)
+
+
+@compiled
+def test_the_c_controller_costs_plans_as_the_task(tmp_path: Path) -> None:
+    (tmp_path / "cart.yaml").write_text(CART)
+    (tmp_path / "cart.stl").write_text(MISSION)
+    run = untrained(tmp_path / "cart.stl", tmp_path / "cart.yaml", tmp_path / "runs")
+    texts = {"stlc_controller.h": header(run.task, run.network), "stlc_weights.h": weights(run.network)}
+    example = main_of(run.task).replace("verdict.rho, verdict.safe", "verdict.rho, verdict.cost")
+    for name, text in {**public(texts, "STLC_CONTROLLER_H"), "main.c": example}.items():
+        (tmp_path / name).write_text(text)
+    x = run.task.sample(20, seed=1, dtype=torch.float64)
+    found = by_c(tmp_path, run.task, tmp_path / "built")("policy")(x)
+    wanted = run.task.cost(run.task.judge(x, found.plan))
+    assert len(set(wanted.tolist())) > 10
+    torch.testing.assert_close(found.safe, wanted, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.apart
@@ -200,7 +218,7 @@ def test_a_backup_policy_with_another_rule_is_not_handed_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = run_of("traffic", "car", tmp_path)
-    monkeypatch.setattr(backup, "TOLERANCE", 0.5)
+    monkeypatch.setattr(backup, "continued", lambda rho, safe, _, ops: acceptable(rho, safe, ops))
     with pytest.raises(RunError, match="does not do what the run does"):
         export(run, "onnx", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 
 import pytest
 import torch
 
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.extrema import _Choice, _Reduction, by_kernel, choice, reduction
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.namespace import Pick, Sliding
@@ -103,6 +105,17 @@ def test_extrema_have_second_derivatives(pick: Pick) -> None:
     items = [random(3, 2 + i)[:, :2] for i in range(3)]
     assert torch.autograd.gradgradcheck(lambda *xs: _Choice.apply(pick, *(x**3 for x in xs)), items)
     assert torch.autograd.gradgradcheck(lambda x: _Reduction.apply(x**3, pick), random(5, 2))
+
+
+@pytest.mark.parametrize("k", [3.0, -3.0, 500.0])
+def test_smooth_extrema_are_those_of_numpy(k: float) -> None:
+    values = [-math.inf, -2.0, -1e-3, 0.0, 1e-3, 2.0, math.inf]
+    a, b = torch.cartesian_prod(*[torch.tensor(values, dtype=torch.float64)] * 2).unbind(1)
+    two = torch.from_numpy(NUMPY.softmax2(a.numpy(), b.numpy(), k))
+    torch.testing.assert_close(TORCH.softmax2(a, b, k), two, rtol=1e-15, atol=1e-15)
+    many = torch.stack((a, b, a + 1.0))
+    whole = torch.from_numpy(NUMPY.softmax(many.numpy(), k))
+    torch.testing.assert_close(TORCH.softmax(many, k), whole, rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.parametrize("k", [3.0, -3.0])
