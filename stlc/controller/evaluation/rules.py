@@ -294,10 +294,10 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
         dt: time step in seconds.
     """
     viable, fails = executed.viable, executed.fails
-    rules = {}
-    for name, held in executed.rules.items():
-        kept = held.all(0) & (len(held) > 0)
-        rules[name] = np.array(list(map(status_of, fails[name].any(0).tolist(), kept.tolist())), "<U12")
+    told = np.vectorize(status_of, otypes=["U12"])
+    rules = {
+        name: told(fails[name].any(0), held.all(0) & (len(held) > 0)) for name, held in executed.rules.items()
+    }
     names = {row: [name for name in rules if rules[name][row] == "violated"] for row in range(len(viable))}
     broken = (
         Broken(
