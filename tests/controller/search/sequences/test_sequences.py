@@ -90,6 +90,37 @@ def test_a_phase_is_short_where_safety_binds_the_way_to_its_target(tmp_path: Pat
     assert max(phase.sample for phase in found) <= 18
 
 
+def test_a_phase_begins_with_what_reached_another_target(tmp_path: Path) -> None:
+    (tmp_path / "arm.yaml").write_text(
+        "stlc: 1\nname: arm\ntime: {dt: 0.5 s, horizon: 40 s}\n"
+        "state: {th: {range: [-1, 5]}, out: {range: [0, 1], clamp: true},"
+        " got: {bool: true}, fed: {bool: true}}\n"
+        "control: {turn: {range: [-1.2, 1.2]}, push: {range: [-0.8, 0.8]}}\n"
+        "flow: {th: turn, out: push}\n"
+        "jump:\n"
+        "  - {name: take, guard: out >= 0.9 and abs(th) <= 0.12 and not got, reset: {got: true}}\n"
+        "  - {name: feed, guard: out >= 0.9 and abs(th) <= 0.12 and not fed, reset: {fed: true}}\n"
+        "init: {mixture: [{draw: {th: 1, out: 0, got: false, fed: false}}]}\n"
+    )
+    (tmp_path / "take.stl").write_text(
+        'spec take\nsystem "arm.yaml"\nstate signal th, out\nstate signal got, fed : bool\n'
+        "@safety\nrequire aligned: always[0, T] (out > 0.15 -> abs(th) <= 0.12)\n"
+        "require taken: eventually[0, T] got\nrequire fed: eventually[0, T] fed\n"
+    )
+    task = load_task(tmp_path / "take.stl")
+    x0 = task.sample(1, seed=0)[0].double()
+    sequences = Sequences(task, x0)
+    if sequences._phases is None:
+        pytest.skip("no C compiler")
+    tried = []
+    for target in (0, 1):
+        before = sequences._phases.tried
+        ask = Ask(sequences._first_step + target, 0, sequences.steps - 1)
+        assert sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0)).margin >= 0.0
+        tried.append(sequences._phases.tried - before)
+    assert tried[1] < 0.5 * tried[0], tried
+
+
 def test_a_target_out_of_reach_is_approached(handover: Task) -> None:
     x0 = handover.sample(1, seed=0)[0].double()
     sequences = Sequences(handover, x0)
