@@ -133,6 +133,16 @@ def test_without_a_compiler_a_stream_is_evaluated_anew(written, trace, end) -> N
     assert isinstance(online._watched[0], Recomputed)
 
 
+@pytest.mark.parametrize("every", [False, True])
+@pytest.mark.parametrize(("lo", "hi", "back", "steps"), [(1, 3, 3, 1), (0, 5, 2, 1), (2, 2, 6, 4)])
+def test_a_truth_that_lasts_decides_windows_that_reach_it(every, lo, hi, back, steps) -> None:
+    """`eventually[1..3] once[3..3] next(false)` is false before its window has passed, and its dual true."""
+    future, past = ("always", "historically") if every else ("eventually", "once")
+    part = ir.Shift(steps, ir.Truth(every), weak=every)
+    formula = ir.Temporal(future, ir.Window(lo, hi), ir.PastTemporal(past, ir.Window(back, back), part))
+    check_stream(formula, dict.fromkeys("xyz", np.zeros((9, 1))), How("all", "truncate"))
+
+
 OPERATORS = {
     "windows": "always[0, 3 s] eventually[1 s, 2 s] x > 0",
     "past": "historically[1 s, 3 s] (once[0 s, 2 s] x > 0)",

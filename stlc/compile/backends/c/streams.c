@@ -310,6 +310,15 @@ static void join_runs(monitor *m, const node *o, const node *part, int truth, at
   if (before >= oldest && known[before & mask] == truth) *first = later(before - ends[before & mask], oldest);
   if (after <= newest && known[after & mask] == truth) *last = after + ends[after & mask];
   ends[*first & mask] = ends[*last & mask] = (int32_t)(*last - *first);
+  if (*last >= newest && since_when(m, part, truth) && *last + 2 >= since_when(m, part, truth)) *last = INT64_MAX / 2;
+}
+
+/* First instant of the run of a truth that lasts from one instant on. */
+static at run_before(const monitor *m, const node *o, const node *part, at from, int truth) {
+  const at oldest = later(m->s.known - 1 - part->age, 0), before = from - 1;
+  if (part->kind == TRUTH || before < oldest || before >= m->s.known + part->ahead) return from;
+  if (m->truths[part->truth + (before & part->truth_mask)] != truth) return from;
+  return later(before - m->ints[o->ends + (before & part->truth_mask)], oldest);
 }
 
 /* Pass on to the node `r` that its operand `p` is `truth` at the instants `first` to `last`, all of them new. */
@@ -453,11 +462,12 @@ static void ever(monitor *m, int32_t r, int32_t i, at from, int truth) {
       else if (all[no] > 0) ever(m, r, reader, all[no] - 1, no);
       break;
     case FUTURE:
-      if (truth == no) ever(m, r, reader, from - a->lo, truth);
+      if (truth == no) ever(m, r, reader, run_before(m, a, o, from, truth) - a->lo, truth);
       else if (!cut || a->flags & UNCUT) ever(m, r, reader, from - a->hi, truth);
       break;
     case PAST:
-      ever(m, r, reader, from + (truth == yes ? a->lo : a->hi), truth);
+      if (truth == no && !run_before(m, a, o, from, truth)) ever(m, r, reader, 0, truth);
+      else ever(m, r, reader, from + (truth == yes ? a->lo : a->hi), truth);
       break;
     case SHIFT:
       if (!(cut && a->lo > 0 && truth == (a->flags & WEAK ? NO : YES))) ever(m, r, reader, from - a->lo, truth);
