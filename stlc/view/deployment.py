@@ -33,21 +33,39 @@ def deployment_section(contents: RunContents) -> Section | None:
 
     None without closed-loop results.
     """
-    guards = _guards(contents)
-    if not guards:
+    simulation = contents.simulation or {}
+    guards = simulation.get("guards")
+    if not guards or not isinstance(guards, Mapping):
         return None
+    seeds, agents, steps = simulation.get("seeds") or (), simulation.get("agents"), simulation.get("steps")
+    size = f"{count(len(seeds), 'seed')} of {count(agents or 0, 'agent')}, {count(steps or 0, 'step')} each"
+    interval = str(simulation.get("interval") or "").replace(" %", "\N{NO-BREAK SPACE}%")
+    size += f". Means over the seeds with their interval ({interval})." if interval else "."
+    names = _names(guards)
     body = join(
-        el("p", _setting(contents.simulation or {})),
+        el("p", size),
         _compared("", guards, _drive_rows(guards)),
         _broken(contents.simulation),
-        _compared("Progress", guards, _progress_rows(guards)),
+        _compared(
+            "Progress",
+            guards,
+            [(name.replace("_", " "), *_number_cells(guards, name)) for name in filter(is_progress, names)],
+        ),
         _compared("Decisions", guards, _decision_rows(guards)),
         el(
             "details",
             el("summary", WINDOWS),
             _compared("", guards, _share_rows(guards)),
             _model_gap(guards),
-            _compared("Requirements at each start", guards, _requirement_rows(guards)),
+            _compared(
+                "Requirements at each start",
+                guards,
+                [
+                    (name.removeprefix(HOLDS), *_cells(guards, name, _share_cell))
+                    for name in names
+                    if name.startswith(HOLDS)
+                ],
+            ),
         ),
     )
     return Section("deployment", "Drives", body)
@@ -60,18 +78,6 @@ def _compared(title: str, guards: Mapping[str, Record], rows: list[tuple[Child, 
     header = ["", *(named_guard(name).title for name in guards)]
     compared = table(header, rows, numeric=range(1, len(header)), kind="compare")
     return join(el("h3", title), compared) if title else compared
-
-
-def _guards(contents: RunContents) -> dict[str, Record]:
-    guards = (contents.simulation or {}).get("guards")
-    return dict(guards) if isinstance(guards, Mapping) else {}
-
-
-def _setting(simulation: Record) -> str:
-    seeds, agents, steps = simulation.get("seeds") or (), simulation.get("agents"), simulation.get("steps")
-    size = f"{count(len(seeds), 'seed')} of {count(agents or 0, 'agent')}, {count(steps or 0, 'step')} each"
-    interval = str(simulation.get("interval") or "").replace(" %", "\N{NO-BREAK SPACE}%")
-    return f"{size}. Means over the seeds with their interval ({interval})." if interval else f"{size}."
 
 
 def _model_gap(guards: Mapping[str, Record]) -> Html | None:
@@ -166,23 +172,8 @@ def _share_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
     ]
 
 
-def _requirement_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    """Table rows: requirement, and the share of instants from which the executed run satisfies it."""
-    names = [name for name in _names(guards) if name.startswith(HOLDS)]
-    return [(name.removeprefix(HOLDS), *_cells(guards, name, _share_cell)) for name in names]
-
-
 def _cells(guards: Mapping[str, Record], name: str, cell: Callable[[Record | None], Child]) -> list[Child]:
     return [cell((guard.get("metrics") or {}).get(name)) for guard in guards.values()]
-
-
-def _progress_rows(guards: Mapping[str, Record]) -> list[tuple[Child, ...]]:
-    def cells(name: str) -> Iterator[Child]:
-        for guard in guards.values():
-            unit = str((guard.get("units") or {}).get(name, ""))
-            yield _number_cell((guard.get("metrics") or {}).get(name), unit)
-
-    return [(name.replace("_", " "), *cells(name)) for name in filter(is_progress, _names(guards))]
 
 
 def _share_cell(metric: Record | None) -> Child:
@@ -193,12 +184,15 @@ def _share_cell(metric: Record | None) -> Child:
     return mean if half is None else join(mean, " ", classed("span", "quiet whole", f"± {100 * half:.1f}"))
 
 
-def _number_cell(metric: Record | None, unit: str) -> Child:
-    if metric is None:
-        return ""
-    mean, half = spread(metric["mean"], _half(metric))
-    more = [classed("span", "quiet", f"± {half} ")] if half else []
-    return join(f"{mean} ", classed("span", "whole", *more, unit)) if more or unit else mean
+def _number_cells(guards: Mapping[str, Record], name: str) -> Iterator[Child]:
+    for guard in guards.values():
+        metric, unit = (guard.get("metrics") or {}).get(name), str((guard.get("units") or {}).get(name, ""))
+        if metric is None:
+            yield ""
+            continue
+        mean, half = spread(metric["mean"], _half(metric))
+        more = [classed("span", "quiet", f"± {half} ")] if half else []
+        yield join(f"{mean} ", classed("span", "whole", *more, unit)) if more or unit else mean
 
 
 def _half(metric: Record) -> float | None:

@@ -163,13 +163,19 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
         return None
     conditions = _grow(held.x0, failing) if failing.sum() >= ENOUGH else ()
     region = _region(held.x0, conditions)
+    # drawn are states of an inequality, then those that best separate failing from satisfied starts
+    used, every = [each.column for each in conditions if each.op != "="], range(held.x0.shape[1])
+    focus = _region(held.x0, [each for each in conditions if each.op == "="])
+    many = [c for c in every if len(np.unique(held.x0[focus, c])) > FEW_VALUES] or every
+    ranked = sorted(many, key=lambda c: -_separation(held.x0[focus, c], failing[focus]))
+    first, second, *_ = [*dict.fromkeys([*used, *ranked]), *every, 0, 0]
     return Weakness(
         requirement=index,
         failing=float(failing.mean()),
         conditions=conditions,
         inside=float(failing[region].mean()),
         covered=float(region[failing].mean()),
-        axes=_telling(held.x0, failing, conditions),
+        axes=(first, second),
     )
 
 
@@ -249,20 +255,6 @@ def _candidates(x0: Array, region: Mask, failing: Mask, values: list[_Values]) -
             found.extend(Condition(column, ">=", cut) for cut in cuts[:-1] if cut not in kinds.common)
             found.extend(Condition(column, "<=", cut) for cut in cuts[1:] if cut not in kinds.common)
     return found
-
-
-def _telling(x0: Array, failing: Mask, conditions: tuple[Condition, ...]) -> tuple[int, int]:
-    """Return the indices of the two states to draw.
-
-    States in an inequality among `conditions` are preferred. The other states are ranked by how well they
-    separate failing from satisfied starts.
-    """
-    used, every = [each.column for each in conditions if each.op != "="], range(x0.shape[1])
-    focus = _region(x0, [each for each in conditions if each.op == "="])
-    many = [c for c in every if len(np.unique(x0[focus, c])) > FEW_VALUES] or every
-    ranked = sorted(many, key=lambda c: -_separation(x0[focus, c], failing[focus]))
-    first, second, *_ = [*dict.fromkeys([*used, *ranked]), *every, 0, 0]
-    return first, second
 
 
 def _separation(values: Array, failing: Mask) -> float:

@@ -55,16 +55,23 @@ def player_section(contents: RunContents) -> Section | None:
     shown = range(0, frames, -(-frames // MOST_FRAMES))
     animations = [panel.vector_frames(shown) for panel in panels]
     tracks = [_tracks(panel, shown) for panel in panels]
+    keys = {key.word: key for panel in panels for key in panel.keys}
+    swatches = {
+        word: el("span", attrs={"class": f"key {key.kind}", "style": _inks(key.color)})
+        for word, key in keys.items()
+    }
     head = el(
         "div",
-        _keys(panels),
+        classed("p", "keys", [classed("span", "whole", swatch, word) for word, swatch in swatches.items()]),
         _stage(panels, animations, contents),
         _data(panels, animations, tracks, shown),
         _controls(len(shown)),
         _columns(panels, tracks),
         attrs={"class": "player", "tabindex": "0"},
     )
-    return Section("film", "", join(head, _files(contents), _events(panels)))
+    name = f"{animation_name(contents.run)}.gif"
+    link = classed("p", "quiet", "The same as a file: ", el("a", name, attrs={"href": name}))
+    return Section("film", "", join(head, link if contents.run.has(name) else None, _events(panels)))
 
 
 def script() -> Html:
@@ -128,27 +135,9 @@ def _controls(frames: int) -> Html:
     )
 
 
-def _keys(panels: Sequence[RunPanel]) -> Html:
-    """Legend of the symbols in the animations of all runs."""
-    keys = {key.word: key for panel in panels for key in panel.keys}
-    swatches = {
-        word: el("span", attrs={"class": f"key {key.kind}", "style": _inks(key.color)})
-        for word, key in keys.items()
-    }
-    return classed("p", "keys", [classed("span", "whole", swatch, word) for word, swatch in swatches.items()])
-
-
 def _inks(color: str) -> str:
     """CSS that sets one colour in the light scheme, and its replacement in the dark scheme."""
     return f"--day:{color};--dusk:{SCENES_ON_DARK.get(color, color)}"
-
-
-def _files(contents: RunContents) -> Html | None:
-    """Link to the animation file beside the page; None if there is none."""
-    name = f"{animation_name(contents.run)}.gif"
-    if not contents.run.has(name):
-        return None
-    return classed("p", "quiet", "The same as a file: ", el("a", name, attrs={"href": name}))
 
 
 # ------------------------------------------------------------------------------ tracks

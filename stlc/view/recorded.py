@@ -47,8 +47,10 @@ def recorded_section(contents: RunContents) -> Section | None:
     except StlcError as error:
         return Section("driven", TITLE, el("p", f"The trace could not be judged: {_messages(error)}."))
     names = trace_names(trace)
+    drives = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'drive')}"
+    when = "" if trace.meta.judge_text else " at every instant"
     body = join(
-        el("p", _summary(verdict, "" if trace.meta.judge_text else " at every instant")),
+        el("p", f"{drives} satisfied {verdict.subject.compiled.name}{when}."),
         _verdict_table(verdict, names),
         figure(picture.data_uri(), picture.alt, _caption(trace, judged_at_start(verdict))),
         causes_of(verdict.causes, names, monitor.spec),
@@ -101,11 +103,6 @@ def map_section(contents: RunContents) -> Section | None:
         return None
     picture = draw_map(region_map)
     return Section("map", "Where it drives", figure(picture.data_uri(), picture.alt, MAP_CAPTION), picture)
-
-
-def _summary(verdict: Verdict, when: str) -> str:
-    drives = f"{verdict.satisfied_traces:,} of {count(verdict.traces, 'drive')}"
-    return f"{drives} satisfied {verdict.subject.compiled.name}{when}."
 
 
 def _verdict_table(verdict: Verdict, names: list[str]) -> Html:

@@ -62,7 +62,9 @@ def animation_of(run: RunDir, *, title: str | None = None) -> Animation | None:
     specification. Without regions, it shows the signals. The default title consists of specification,
     scenario and run.
     """
-    title = _title(run) if title is None else title
+    if title is None:
+        spec = str(run.record().get("spec", ""))
+        title = picture(" · ".join(part for part in (spec, _scenario(run), run.name) if part))
     return _scene_animation(run, title) or _signal_animation(run, title)
 
 
@@ -160,8 +162,8 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
     from stlc.dynamics.scenario import under
 
     trace_name, scene_name = (TRACE, SCENE) if guarded else UNGUARDED
-    scene = _load_scene(run, scene_name)
-    if scene is None:
+    scene = archived(run, scene_name, read_arrays)
+    if not scene or not all(values.ndim and len(values) for values in scene.values()):
         return None
     try:
         decl, scenario = load_system_decl(run.source(SYSTEM)), _scenario(run)
@@ -352,13 +354,3 @@ def map_of_drives(trace: Trace, system: Source | None, text: str = "") -> Region
     monitor = monitor_of(trace, text, system=system)
     verdict = monitor.check(trace)
     return map_of(monitor.spec, verdict, trace, violating(trace, verdict, system=system))
-
-
-def _load_scene(run: RunDir, name: str) -> Scene | None:
-    scene = archived(run, name, read_arrays)
-    return scene if scene and all(values.ndim and len(values) for values in scene.values()) else None
-
-
-def _title(run: RunDir) -> str:
-    spec = str(run.record().get("spec", ""))
-    return picture(" · ".join(part for part in (spec, _scenario(run), run.name) if part))

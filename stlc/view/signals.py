@@ -238,7 +238,8 @@ def draw_signals(
             len(rows), len(choices), squeeze=False, sharex=True, sharey="row", height_ratios=heights
         )
         for column, choice in zip(grid.T, choices, strict=True):
-            column[0].set_title(_wrapped(choice.title), pad=8)
+            narrow = len(choice.title) <= MOST_LETTERS
+            column[0].set_title(choice.title if narrow else choice.title.replace(": ", ":\n", 1), pad=8)
             for axes, (kind, name) in zip(column, rows, strict=True):
                 _draw_row(axes, kind, name, trace, margins, choice.index)
                 if kind == "line":
@@ -297,11 +298,6 @@ def _legend(figure: Figure, trace: Trace, marks: Marks, judged: bool) -> None:
         handles.insert(0, Line2D([], [], color=MUTED, lw=0.9, ls="--", label="threshold"))
     if handles:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), handlelength=1.0)
-
-
-def _wrapped(title: str) -> str:
-    """A title in one line, or in two if it is wider than its panel."""
-    return title if len(title) <= MOST_LETTERS else title.replace(": ", ":\n", 1)
 
 
 def _draw_row(axes: Axes, kind: str, name: str, trace: Trace, margins: Margins, index: int) -> None:

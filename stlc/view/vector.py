@@ -96,7 +96,15 @@ class CommandRenderer(RendererBase):
         text = self._path(path, transform)
         if text and (line or face):
             width = round(self.points_to_pixels(gc.get_linewidth()), 2)
-            self._enter(("p", text, face, line, width if line else 0, self._dash(gc), self._clip(gc)))
+            _, pattern = gc.get_dashes()
+            dash = (
+                None
+                if pattern is None
+                else " ".join(f"{self.points_to_pixels(length):.3g}" for length in pattern)
+            )
+            area, moved = gc.get_clip_path()
+            clip = None if area is None else self._path(area, moved)
+            self._enter(("p", text, face, line, width if line else 0, dash, clip))
 
     def draw_image(self, gc: Any, x: float, y: float, im: Any, transform: Any = None) -> None:  # noqa: ARG002
         """Record an image, scaled down if it is large."""
@@ -186,17 +194,6 @@ class CommandRenderer(RendererBase):
                 words.append(_LETTERS[code] + " ".join(f"{a - x} {b - y}" for a, b in ends))
             x, y = ends[-1]
         return "".join(words)
-
-    def _dash(self, gc: Any) -> str | None:
-        _, pattern = gc.get_dashes()
-        if pattern is None:
-            return None
-        return " ".join(f"{self.points_to_pixels(length):.3g}" for length in pattern)
-
-    def _clip(self, gc: Any) -> str | None:
-        """The clip path in SVG notation; None if drawing is clipped by the axes only."""
-        path, transform = gc.get_clip_path()
-        return None if path is None else self._path(path, transform)
 
 
 def _color(color: Any, gc: Any) -> str | None:
