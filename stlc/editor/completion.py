@@ -97,7 +97,8 @@ def complete(document: Document, offset: int) -> Completion:
     if behind_dot is not None:
         names = sorted(_shared(document, behind_dot[1]), key=lambda offer: offer.text)
         return Completion(start, tuple(names))
-    piece = text[_piece_start(text) : start]
+    starts = declaration_starts(text)
+    piece = text[starts[bisect_right(starts, len(text)) - 1] : start]
     units = _units_at(piece, text)
     if units is not None:
         return Completion(offset - len(units), tuple(_units()))
@@ -107,12 +108,6 @@ def complete(document: Document, offset: int) -> Completion:
     )
     unique = {offer.text: offer for offer in reversed(list(offers))}
     return Completion(start, tuple(sorted(unique.values(), key=lambda offer: (offer.order, offer.text))))
-
-
-def _piece_start(text: str) -> int:
-    """Return the offset at which the last declaration of a text starts, to parse only that declaration."""
-    starts = declaration_starts(text)
-    return starts[bisect_right(starts, len(text)) - 1]
 
 
 def _units_at(piece: str, text: str) -> str | None:
@@ -141,7 +136,10 @@ def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[st
 
     `piece` is the text of the declaration up to the word under the cursor.
     """
-    yield from _keywords(accepted)
+    for terminal in accepted:
+        plain = terminal[1:].lower() if terminal.startswith("_") else ""
+        for word in _TERMINALS.get(terminal, (plain,) if plain in _PLAIN_WORDS else ()):
+            yield Offer(word, "Keyword", doc=TEMPORAL.get(word) or KEYWORDS.get(word, ""), order=4)
     if "UNIT" in accepted:
         yield from _units()
     if "TIME_UNIT" in accepted:
@@ -158,21 +156,9 @@ def _fitting(document: Document, offset: int, piece: str, accepted: frozenset[st
 def _everything(document: Document, offset: int) -> Iterator[Offer]:
     yield from _names(document, offset)
     yield from _functions()
-    yield from (Offer(word, "Keyword", doc=KEYWORDS.get(word, ""), order=7) for word in sorted(_preferred()))
-
-
-def _preferred() -> set[str]:
-    """Return the reserved words without their aliases (`G` is an alias of `always`)."""
     aliases = {**UNARY_TEMPORAL, **BINARY_TEMPORAL}
-    return {word for word in RESERVED if aliases.get(word, word) == word}
-
-
-def _keywords(accepted: frozenset[str]) -> Iterator[Offer]:
-    """Yield proposals for the keywords among the terminals `accepted`."""
-    for terminal in accepted:
-        plain = terminal[1:].lower() if terminal.startswith("_") else ""
-        for word in _TERMINALS.get(terminal, (plain,) if plain in _PLAIN_WORDS else ()):
-            yield Offer(word, "Keyword", doc=TEMPORAL.get(word) or KEYWORDS.get(word, ""), order=4)
+    words = sorted(word for word in RESERVED if aliases.get(word, word) == word)
+    yield from (Offer(word, "Keyword", doc=KEYWORDS.get(word, ""), order=7) for word in words)
 
 
 def _names(document: Document, offset: int) -> Iterator[Offer]:

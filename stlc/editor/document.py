@@ -148,18 +148,14 @@ class Systems:
         stamp = (status.st_mtime_ns, status.st_size)
         known = self._known.get(path)
         if known is None or known[0] != stamp:
-            known = (stamp, _load(path))
+            try:
+                known = (stamp, load_system_decl(path))
+            except StlcError as error:
+                known = (stamp, error)
             self._known[path] = known
         if isinstance(known[1], StlcError):
             raise known[1]
         return known[1]
-
-
-def _load(path: Path) -> SystemDecl | StlcError:
-    try:
-        return load_system_decl(path)
-    except StlcError as error:
-        return error
 
 
 def analyse(source: Source, systems: Systems, trace: Path | None = None) -> Document:
@@ -284,13 +280,10 @@ class Meaning:
         for formula in self.formulas.values():
             for node in nodes(formula):
                 if isinstance(node, typed.Temporal | typed.Until) and node.interval.span == span:
-                    return node.interval, self._window(node)
+                    sink: list[Diagnostic] = []
+                    window = to_window(node.interval, self.grid, sink, outward=node.op in _OUTWARD)
+                    return node.interval, None if any(one.severity == "error" for one in sink) else window
         return None
-
-    def _window(self, node: typed.Temporal | typed.Until) -> Window | None:
-        sink: list[Diagnostic] = []
-        window = to_window(node.interval, self.grid, sink, outward=node.op in _OUTWARD)
-        return None if any(finding.severity == "error" for finding in sink) else window
 
 
 def understand(

@@ -138,7 +138,9 @@ def _facts(document: Document, symbol: Symbol) -> Iterator[str]:
         case "const" | "region" | "def":
             value = document.meaning.value(symbol.name)
             if value is not None:
-                yield "".join((describe(value), _constant(value), _ahead(document, symbol.name)))
+                steps = document.meaning.steps(symbol.name)
+                ahead = f", looks {duration(steps, document.grid)} ahead" if steps else ""
+                yield f"{describe(value)}{_constant(value)}{ahead}"
         case "require" | "assume":
             tags = getattr(symbol.item, "tags", ())
             yield " ".join(("requirement" if symbol.kind == "require" else "assumption", *map(show, tags)))
@@ -193,11 +195,6 @@ def _amount(number: Number) -> str:
     return f"{(number.constant or 0.0) / number.unit.scale:.6g} {unit}".rstrip()
 
 
-def _ahead(document: Document, name: str) -> str:
-    steps = document.meaning.steps(name)
-    return f", looks {duration(steps, document.grid)} ahead" if steps else ""
-
-
 # ------------------------------------------------------------------- temporal words
 
 
@@ -205,15 +202,13 @@ def _temporal_at(spec: ast.Spec, offset: int) -> ast.Temporal | ast.Until | None
     """Return the innermost temporal operator whose word or interval is under the cursor, or None."""
     found = None
     for node in descendants(spec):
-        if isinstance(node, ast.Temporal | ast.Until) and _touches(node, offset):
+        if not isinstance(node, ast.Temporal | ast.Until):
+            continue
+        first = node.span.start if isinstance(node, ast.Temporal) else node.left.span.end + 1
+        body = node.body if isinstance(node, ast.Temporal) else node.right
+        if first <= offset <= (node.interval or body).span.start or _within(node, offset):
             found = node
     return found
-
-
-def _touches(node: ast.Temporal | ast.Until, offset: int) -> bool:
-    if isinstance(node, ast.Temporal):
-        return node.span.start <= offset <= (node.interval or node.body).span.start or _within(node, offset)
-    return node.left.span.end < offset <= (node.interval or node.right).span.start or _within(node, offset)
 
 
 def _within(node: ast.Temporal | ast.Until, offset: int) -> bool:

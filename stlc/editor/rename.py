@@ -48,7 +48,8 @@ def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
     if found is None:
         raise RenameError("there is no name here that this file alone decides")
     if document.unread:
-        raise RenameError(f"the text has an error in line {_line(document)}; mend it first")
+        line = next((finding.span.line for finding in document.unread if finding.span is not None), 1)
+        raise RenameError(f"the text has an error in line {line}; mend it first")
     name = new.strip().strip("`")
     if not _NAME.fullmatch(name):
         raise RenameError(f"`{new}` is not a name: letters, digits and _, no digit first")
@@ -57,11 +58,6 @@ def rename(document: Document, offset: int, new: str) -> tuple[Edit, ...]:
     edits += _column(document, symbol.item, symbol.name)
     _refuse_capture(document, edits, name)
     return tuple(edits)
-
-
-def _line(document: Document) -> int:
-    spans = [finding.span for finding in document.unread if finding.span is not None]
-    return spans[0].line if spans else 1
 
 
 def _column(document: Document, item: ast.Item | None, name: str) -> list[Edit]:

@@ -15,7 +15,7 @@ from pygls.exceptions import JsonRpcInvalidParams
 from pygls.lsp.server import LanguageServer
 from pygls.workspace import PositionCodec
 
-from stlc.diagnostics import Diagnostic, Severity, SpecError
+from stlc.diagnostics import Severity, SpecError
 from stlc.editor.completion import Offer, complete
 from stlc.editor.document import Document, Finding, Systems, analyse, definition, outline, system_place
 from stlc.editor.hover import hover, summary
@@ -132,9 +132,12 @@ class Server(LanguageServer):
         """Convert a finding to an LSP diagnostic, with its advice and its further locations in the text."""
         inner = finding.diagnostic
         severity = lsp.DiagnosticSeverity.Warning if finding.mild else _SEVERITIES[inner.severity]
+        head = f"{inner.message}: {inner.label}" if inner.label else inner.message
+        advice = [f"help: {line}" for line in inner.help]
+        fix = [] if inner.fix is None or not inner.fix.text else [f"fix: {inner.fix.text}"]
         return lsp.Diagnostic(
             range=self.range(finding.span),
-            message="\n".join(_lines(inner)),
+            message="\n".join([head, *advice, *fix, *(f"note: {line}" for line in inner.note)]),
             severity=severity,
             code=inner.code,
             source="stlc",
@@ -143,14 +146,6 @@ class Server(LanguageServer):
                 for label in inner.labels
             ],
         )
-
-
-def _lines(finding: Diagnostic) -> list[str]:
-    """Return the lines of a diagnostic's text: its message, then advice and notes."""
-    head = f"{finding.message}: {finding.label}" if finding.label else finding.message
-    advice = [f"help: {line}" for line in finding.help]
-    fix = [] if finding.fix is None or not finding.fix.text else [f"fix: {finding.fix.text}"]
-    return [head, *advice, *fix, *(f"note: {line}" for line in finding.note)]
 
 
 # --------------------------------------------------------------------------- changes
