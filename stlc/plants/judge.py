@@ -18,7 +18,7 @@ from stlc.monitor.judgement import Verdict
 from stlc.monitor.signals import arrange, needs_of
 from stlc.monitor.streamed import verdict_of
 from stlc.monitor.verdict import Monitor
-from stlc.plants.plant import Plant, PlantFinding, PlantRun, load_plant
+from stlc.plants.plant import Plant, PlantFinding, load_plant
 from stlc.trace import Trace
 from stlc.version import __version__
 
@@ -211,13 +211,20 @@ class PlantJudge:
         """
         if stream:
             for point, seed in zip(points, seeds, strict=True):
-                yield self._streamed(point, seed)
+                online = self.monitor.online(dt=self.plant.decl.dt)
+                finding = self.plant.watch(point, online, seed=seed)
+                yield JudgedRun(seed, self._named(point), None if finding else verdict_of(online), finding)
             return
         for first in range(0, len(points), jobs):
             chosen = range(first, min(first + jobs, len(points)))
             batch = [seeds[row] for row in chosen]
             for run in self.plant.simulate(points[chosen], seeds=batch, jobs=jobs):
-                yield self._judged(run)
+                point, outcome = self._named(run.point), run.outcome
+                if isinstance(outcome, PlantFinding):
+                    yield JudgedRun(run.seed, point, None, outcome)
+                else:
+                    verdict = self.monitor.check(outcome).told(reasons=False)
+                    yield JudgedRun(run.seed, point, verdict, trace=outcome)
 
     def stored(self, traces: Sequence[Trace]) -> Trace:
         """Join traces into one with the specification; shorter ones end in unknown samples (NaN)."""
@@ -241,21 +248,6 @@ class PlantJudge:
             stlc_version=__version__,
         )
         return replace(traces[0], data=data, meta=meta)
-
-    def _judged(self, run: PlantRun) -> JudgedRun:
-        point = self._named(run.point)
-        if isinstance(run.outcome, PlantFinding):
-            return JudgedRun(run.seed, point, None, run.outcome)
-        return JudgedRun(
-            run.seed, point, self.monitor.check(run.outcome).told(reasons=False), trace=run.outcome
-        )
-
-    def _streamed(self, point: Floats, seed: int) -> JudgedRun:
-        """Simulate once, and judge while the plant runs; nothing of the trace is kept."""
-        online = self.monitor.online(dt=self.plant.decl.dt)
-        finding = self.plant.watch(point, online, seed=seed)
-        named = self._named(point)
-        return JudgedRun(seed, named, None if finding else verdict_of(online), finding)
 
     def _named(self, point: Floats) -> dict[str, float]:
         return {each.name: float(value) for each, value in zip(self.plant.variables, point, strict=True)}

@@ -262,7 +262,11 @@ class Plant:
                 yield from _Simulation(self, process, point, seed, deadline).parts(samples)
         except FaultyError as error:
             process.end()  # a plant that has failed may fail again without cause
-            raise FindingError(self._finding(error.fault, point, seed)) from None
+            fault, names = error.fault, [each.name for each in self.variables]
+            values = dict(zip(names, point.tolist(), strict=True))
+            reached = None if fault.step is None else fault.step * float(self.decl.dt)
+            finding = PlantFinding(fault.reason, fault.message, values, seed, reached, fault.stderr)
+            raise FindingError(finding) from None
         except BaseException:
             process.end()
             raise
@@ -289,11 +293,6 @@ class Plant:
         except FindingError as error:
             return error.finding
         return None
-
-    def _finding(self, fault: Fault, point: Floats, seed: int) -> PlantFinding:
-        values = {each.name: float(value) for each, value in zip(self.variables, point, strict=True)}
-        reached = None if fault.step is None else fault.step * float(self.decl.dt)
-        return PlantFinding(fault.reason, fault.message, values, seed, reached, fault.stderr)
 
     def _taken(self) -> PlantProcess:
         """Return a process that waits for requests; start one if there is none."""

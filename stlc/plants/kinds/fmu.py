@@ -73,7 +73,12 @@ class _Variables:
         self.outputs = [self._named(port, "output") for port in layout.outputs]
         used = (*self.initial, *self.param, *self.inputs, *self.outputs)
         known = {each.name: _text(each) for each in description.unitDefinitions}
-        self.units = {each.name: known.get(name, name) for each in used if (name := _unit(each))}
+        self.units = {}
+        for each in used:
+            declared = None if each.declaredType is None else each.declaredType.unit
+            name = str(each.unit or declared or "")
+            if name:
+                self.units[each.name] = known.get(name, name)
 
     def _named(self, port: Port, section: str) -> Any:
         found, place = self._known.get(port.source), f"{section}.{port.name}"
@@ -109,12 +114,6 @@ class _Variables:
         return str(variable.type)
 
 
-def _unit(variable: Any) -> str:
-    """Name of the unit of a variable, its own or that of its type; "" if it has none."""
-    declared = None if variable.declaredType is None else variable.declaredType.unit
-    return str(variable.unit or declared or "")
-
-
 def _text(unit: Any) -> str:
     """Text of a unit: the product of powers of base units that the FMU gives, else its name.
 
@@ -140,7 +139,12 @@ class Fmu:
         self._description, self._folder, self._layout = description, folder, layout
         self._variables, self._exchange = variables, exchange
         self._tolerance = float(layout.options.get("tolerance", 1e-6))
-        self._groups = _grouped(variables, variables.outputs)
+        groups: dict[str, tuple[list[int], list[int]]] = {}  # type -> places and value references
+        for place, variable in enumerate(variables.outputs):
+            places, references = groups.setdefault(variables.kind(variable), ([], []))
+            places.append(place)
+            references.append(variable.valueReference)
+        self._groups = groups
         self._instance: Any = None
         self._solver: _Integrator | None = None
         self._steps = 0
@@ -220,16 +224,6 @@ class Fmu:
             for place, value in zip(places, values, strict=True):
                 found[place] = float(value)
         return found
-
-
-def _grouped(variables: _Variables, ports: Sequence[Any]) -> dict[str, tuple[list[int], list[int]]]:
-    """Return the places and the value references of `ports` by their type, to be read in one call each."""
-    groups: dict[str, tuple[list[int], list[int]]] = {}
-    for place, variable in enumerate(ports):
-        places, references = groups.setdefault(variables.kind(variable), ([], []))
-        places.append(place)
-        references.append(variable.valueReference)
-    return groups
 
 
 class _NoInput:

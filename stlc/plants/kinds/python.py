@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
 from pathlib import Path
-from types import ModuleType
 from typing import Any, final
 
 import numpy as np
@@ -70,7 +69,11 @@ def _target(text: str, layout: Layout) -> Callable[..., Any]:
         raise UnfitError(f"`{text}` is not of the form `file.py:name` or `package.module:name`")
     sys.path.insert(0, layout.folder)
     try:
-        module = _module(match["module"], layout)
+        where = match["module"]
+        if where.endswith(".py"):
+            module = module_at(layout.path(where), f"stlc_plant_{Path(where).stem}")
+        else:
+            module = importlib.import_module(where)
     except Exception as error:
         raise UnfitError(f"importing `{match['module']}` fails: {type(error).__name__}: {error}") from error
     found = getattr(module, match["attribute"], None)
@@ -82,12 +85,6 @@ def _target(text: str, layout: Layout) -> Callable[..., Any]:
             "; ".join((f"`{match['module']}` has no function or class `{match['attribute']}`", *near))
         )
     return found  # type: ignore[no-any-return]
-
-
-def _module(where: str, layout: Layout) -> ModuleType:
-    if not where.endswith(".py"):
-        return importlib.import_module(where)
-    return module_at(layout.path(where), f"stlc_plant_{Path(where).stem}")
 
 
 def _form(target: Callable[..., Any]) -> str:
@@ -159,7 +156,8 @@ class StateFunction:
                 message = f"the output `{port.name}` is not a state of the section `initial`"
                 raise UnfitError("; ".join((message, *advice)), f"output.{port.name}")
         self._read = np.array([states.index(port.source) for port in layout.outputs], dtype=np.intp)
-        self._advance = self._integrator() if flow else self._step
+        adaptive = flow and layout.options.get("integrator") == "scipy"
+        self._advance = self._adaptive() if adaptive else self._rk4 if flow else self._step
         self._x: Floats = np.zeros(0)
         self._param: tuple[Floats, ...] = ()
         self._steps = 0
@@ -191,9 +189,6 @@ class StateFunction:
             shape = f"{what} has {found.size:,} components, the state has {len(self._layout.initial)}"
             raise FaultError("wrong shape", shape)
         return found
-
-    def _integrator(self) -> Callable[[float, Floats, Floats], Floats]:
-        return self._adaptive() if self._layout.options.get("integrator") == "scipy" else self._rk4
 
     def _rk4(self, t: float, x: Floats, u: Floats) -> Floats:
         """One time step in equal substeps of the classical Runge-Kutta method of order 4 (Kutta 1901)."""
@@ -247,7 +242,9 @@ def _files(options: Mapping[str, Any], folder: Path) -> dict[str, Path]:
     waiting = list(found.values()) if first is not None and first.is_relative_to(folder) else []
     while waiting:
         for name in _imports(waiting.pop(), folder):
-            path = _beside(name, folder)
+            base = folder.joinpath(*name.split("."))
+            files = (base.with_suffix(".py"), base / "__init__.py")
+            path = next((each for each in files if each.is_file()), None)
             if path is not None and path not in found.values():
                 found[_shown(path, folder, name)] = path
                 waiting.append(path)
@@ -256,12 +253,6 @@ def _files(options: Mapping[str, Any], folder: Path) -> dict[str, Path]:
 
 def _shown(path: Path, folder: Path, otherwise: str) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else otherwise
-
-
-def _beside(module: str, folder: Path) -> Path | None:
-    """Return the file of a module in a folder; None if there is none."""
-    base = folder.joinpath(*module.split("."))
-    return next((each for each in (base.with_suffix(".py"), base / "__init__.py") if each.is_file()), None)
 
 
 def _located(module: str, folder: Path) -> Path | None:
