@@ -40,7 +40,9 @@ def read(path: Path, wanted: Wanted = ALL) -> Recording:
     with file, damage(path), redirect_stdout(io.StringIO()):
         if path.stat().st_size > MAX_BYTES:
             raise unreadable(path, f"it is larger than {MAX_BYTES / 1e9:.0f} GB", advice="split it")
-        log = _bounded()(file, None if wanted.names is None else _topics(wanted))
+        heads = {name.partition(".")[0] for name in (*(wanted.names or ()), wanted.clock)}
+        topics = heads | {re.sub(r"_\d+$|\[\d+\]$", "", head) for head in heads}  # topic_1 is a topic
+        log = _bounded()(file, None if wanted.names is None else topics)
     found = Arrays(wanted)
     prefixes = Counter(_instance(data) for data in log.data_list)
     groups = []
@@ -75,12 +77,6 @@ def read(path: Path, wanted: Wanted = ALL) -> Recording:
 
 def _instance(data: Any) -> str:
     return f"{data.name}_{data.multi_id}" if data.multi_id else str(data.name)
-
-
-def _topics(wanted: Wanted) -> set[str]:
-    """Topics that may be meant by the names: `battery_status_1.current_a` is of `battery_status` too."""
-    heads = {name.partition(".")[0] for name in (*(wanted.names or ()), wanted.clock)}
-    return heads | {re.sub(r"_\d+$|\[\d+\]$", "", head) for head in heads}
 
 
 class _Watched(io.BufferedReader):
