@@ -47,12 +47,9 @@ def regularised_beta(x: float, a: float, b: float) -> float:
         return 0.0 if x <= 0.0 else 1.0
     if x > (a + 1.0) / (a + b + 2.0):
         return 1.0 - regularised_beta(1.0 - x, b, a)
-    front = a * math.log(x) + b * math.log1p(-x) - _log_beta(a, b)
+    log_beta = math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+    front = a * math.log(x) + b * math.log1p(-x) - log_beta
     return math.exp(front) / (a * _fraction(x, a, b))
-
-
-def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
 def _fraction(x: float, a: float, b: float) -> float:

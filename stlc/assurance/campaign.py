@@ -137,15 +137,15 @@ def campaign(order: Campaign) -> Iterator[Progress]:
         if not fixed and claim.calibration is None:  # the same units, however many follow
             claim = replace(claim, calibration=min(first, sum(part.count for part in parts)))
         assessment = assess(replace(joined(parts), left_out=left_out), claim)
-        done = known == len(every) or _answered(assessment, order.width)
+        if order.width is None:
+            answered = assessment.answer in ("certified", "refuted")
+        else:
+            answered = assessment.width <= order.width
+        done = known == len(every) or answered
         yield Progress(assessment, every[:known], batches, done)
         if done:
             return
     raise usage(f"the assumptions of the specification hold in none of {known:,} simulations")
-
-
-def _answered(found: Assessment, width: float | None) -> bool:
-    return found.width <= width if width is not None else found.answer in ("certified", "refuted")
 
 
 # ---------------------------------------------------------------------- certificates

@@ -390,6 +390,9 @@ def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
     found = shares_of(low, high, claim.confidence, any_time=claim.any_time)
     whole = Tally.of(values == 1.0)
     least = sample.least(judged.robustness)
+    reached, share = -math.inf, claim.target + claim.shift
+    if share < 1.0:
+        reached = tolerance_bound(least, share, claim.confidence, any_time=claim.any_time)
     return Statement(
         name=judged.name,
         unit=judged.unit,
@@ -402,21 +405,10 @@ def statement(judged: Judged, sample: Sample, claim: Claim) -> Statement:
         whole=int((values == 1.0).sum()),
         whole_lower=shares_of(whole, whole, claim.confidence, any_time=claim.any_time).lower,
         next_robustness=lower_bound(least[: claim.calibration], claim.confidence, claim.shift),
-        reached=_reached(least, claim),
+        reached=reached,
         low=low,
         high=high,
     )
-
-
-def _reached(least: NDArray[np.float64], claim: Claim) -> float:
-    """Lower bound on the robustness that the requested share of future units reaches.
-
-    `least` is the least robustness of each observed unit, (units,). The result is -inf if there is no bound.
-    """
-    share = claim.target + claim.shift
-    if share >= 1.0:
-        return -math.inf
-    return tolerance_bound(least, share, claim.confidence, any_time=claim.any_time)
 
 
 # ---------------------------------------------------------------------- the whole answer
@@ -629,11 +621,14 @@ def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
         any_time,
     )
     wrong = []
-    for place, each in _places(document):
-        low, high = (_tally(each[name]) for name in ("observed", "observed_high"))
-        expected = _expected(low, high, int(document["overall"]["drives"]), claim)
-        wrong += [f"{place}.{name}" for name, values in expected.items() if not _agree(each[name], values)]
     overall = document["overall"]
+    for place, each in (
+        ("overall", overall),
+        *((str(each["name"]), each) for each in document["requirements"]),
+    ):
+        low, high = (_tally(each[name]) for name in ("observed", "observed_high"))
+        expected = _expected(low, high, int(overall["drives"]), claim)
+        wrong += [f"{place}.{name}" for name, values in expected.items() if not _agree(each[name], values)]
     lower, upper = float(overall["lower_deployed"]), float(overall["upper_deployed"])
     answer = "certified" if claim.share is not None and lower >= claim.share else "undecided"
     answer = "refuted" if answer == "undecided" and upper < (claim.share or 0.0) else answer
@@ -675,12 +670,6 @@ def _agree(given: Any, expected: float | Bounds | None) -> bool:
         low, high = given
         return _agree(low, expected.low) and _agree(high, expected.high)
     return abs(float(given) - expected) <= _AGREE * max(1.0, abs(expected))
-
-
-def _places(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    yield "overall", document["overall"]
-    for each in document["requirements"]:
-        yield str(each["name"]), each
 
 
 def _tally(pairs: Sequence[Sequence[float]]) -> Tally:

@@ -59,7 +59,12 @@ def sample_of(
         UsageError: U101, there is no such requirement.
         SpecError: the rules use names that the system does not have.
     """
-    found = _judged_by_plans(task, recording) if rules is None else _judged_by_rules(task, recording, rules)
+    if rules is None:
+        found = _judged_by_plans(task, recording)
+    else:
+        verdict = verdict_on_runs(rules, task, recording)
+        inside = np.broadcast_to(verdict.scope, (len(recording.states),))
+        found = _Verdicts(tuple(map(Judged.by, verdict)), verdict.factors, inside)
     counted = chosen(found.judged, require)
     rows = len(recording.states)
     alone = recording.agents == 1 or independent_agents(world_type(task.system.decl))
@@ -95,12 +100,6 @@ def _judged_by_plans(task: Task, recording: DeploymentRecording) -> _Verdicts:
     columns = dict(zip(task.system.names, np.moveaxis(recording.states, -1, 0).swapaxes(1, 2), strict=True))
     weights = {rule.name: rule.factor for rule in task.rules}
     return _Verdicts(judged, weights, in_scope(task, columns))
-
-
-def _judged_by_rules(task: Task, recording: DeploymentRecording, rules: Rules) -> _Verdicts:
-    verdict = verdict_on_runs(rules, task, recording)
-    inside = np.broadcast_to(verdict.scope, (len(recording.states),))
-    return _Verdicts(tuple(map(Judged.by, verdict)), verdict.factors, inside)
 
 
 # ---------------------------------------------------------------------- deploying

@@ -340,7 +340,8 @@ def shrunk(simulator: Simulator, requirement: int, found: Counterexample) -> Cou
     """
     for coordinates, values in _changes(simulator.space):
         for value in values(found.point):
-            point = _set(found.point, coordinates, value)
+            point = found.point.copy()
+            point[list(coordinates)] = value
             if np.array_equal(point, found.point):
                 break
             outcome = simulator.simulate(point[None], requirement)
@@ -387,12 +388,6 @@ def _like(coordinate: int) -> Values:
 def _rounded(coordinate: int) -> Values:
     """Return the function that proposes the present value, rounded to few decimal digits."""
     return lambda point: tuple(round(float(point[coordinate]), digits) for digits in DIGITS)
-
-
-def _set(point: Point, coordinates: Sequence[int], value: float) -> Point:
-    changed = point.copy()
-    changed[list(coordinates)] = value
-    return changed
 
 
 def coverage(points: NDArray[np.float64]) -> float:

@@ -93,7 +93,7 @@ class ModelSimulator:
         blocks = []
         for each in self.task.system.decl.inputs:
             found = self.points.coordinates_of(each.values)
-            first = self._time_coordinates(each.times)
+            first = self.points.last_coordinates_of(each.times)
             if len(found) == len(each.values):
                 shares = tuple(float(end / each.duration) for end in each.ends[: each.points])
                 values = tuple(found[name] for name in each.values)
@@ -102,13 +102,6 @@ class ModelSimulator:
                     SignalBlock(each.name, values, first, () if first else shares, each.lead, length)
                 )
         return SearchSpace(self.points.dim, tuple(blocks))
-
-    def _time_coordinates(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Index of the search coordinate that sets each of the free switching times `names`.
-
-        Several coordinates may affect a time. The last of them, which is returned, affects no other time.
-        """
-        return self.points.last_coordinates_of(names)
 
     @property
     def part(self) -> int:

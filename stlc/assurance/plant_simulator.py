@@ -22,7 +22,6 @@ from stlc.plants.judge import PlantJudge
 from stlc.plants.plant import Plant, PlantFinding, PlantRun
 
 if TYPE_CHECKING:
-    from stlc.compile.pipeline import CompiledRequirement
     from stlc.trace import Trace
 
 
@@ -125,7 +124,11 @@ class PlantSimulator(Simulator):
         decl = self.plant.decl
         compiled = self.monitor.compiled
         read_by = (compiled.requirements[requirement], *compiled.assumptions)
-        if not decl.free or any(_reads_everything(rule) for rule in read_by):
+        for rule in read_by:  # one that reads a simulation to its end, whatever its length
+            ahead = (node for node in nodes(rule.formula) if isinstance(node, ir.Windowed) and not node.back)
+            if rule.windowed or rule.uses_end or any(node.window.hi is None for node in ahead):
+                return 1.0
+        if not decl.free:
             return 1.0
         return min((max(rule.reach for rule in read_by) + 1) * float(decl.dt) / float(decl.duration), 1.0)
 
@@ -204,9 +207,3 @@ def _judged(monitor: Monitor, runs: Sequence[PlantRun], requirement: int) -> Sim
             inside[index] = verdict.statuses[0] != "out of scope"
             judged[index] = verdict.statuses[0] != "inconclusive"
     return Simulations(margins, inside, judged)
-
-
-def _reads_everything(rule: CompiledRequirement) -> bool:
-    """True if a requirement reads a simulation to its end, whatever its length."""
-    ahead = (node for node in nodes(rule.formula) if isinstance(node, ir.Windowed) and not node.back)
-    return rule.windowed or rule.uses_end or any(node.window.hi is None for node in ahead)

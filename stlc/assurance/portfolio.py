@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.assurance.sensitive import SensitiveClimbing
+from stlc.assurance.sensitive import SensitiveSearch
 from stlc.assurance.strategies import (
     PIECES,
     AlternatingVertices,
@@ -50,7 +50,7 @@ class Portfolio:
     these a third is random, a third goes to the strategy that has found the least robust point, and a third
     to all in turn. If the robustness takes few values, as that of conditions on gears does, nothing can be
     learnt from it: then points are drawn at random. In a space most of whose coordinates have no effect,
-    `SensitiveClimbing` is the only strategy, and points are uniform while the robustness hardly ever changes.
+    `SensitiveSearch` is the only strategy, and points are uniform while the robustness hardly ever changes.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Portfolio:
             without: names of strategies that have no turns, to see what they contribute.
         """
         uniform = UniformSampling(space, generator)
-        self._sensitive = SensitiveClimbing(space, generator) if space.sparse and not random else None
+        self._sensitive = SensitiveSearch(space, generator) if space.sparse and not random else None
         self._guided = not random and not space.sparse and graded and space.dim > 0
         self._blind: list[Strategy] = [uniform]
         if not random:
@@ -87,9 +87,9 @@ class Portfolio:
         self._first: list[Strategy] = []
         self._others: list[Strategy] = []
         if self._guided:
-            climb, coarse = GradientVertices(space, generator, gradient), CoarseSampling(space, generator)
+            descent, coarse = GradientVertices(space, generator, gradient), CoarseSampling(space, generator)
             constant, surrogate = ConstantVertices(space, generator), SurrogateSearch(space, generator)
-            self._others.append(climb)
+            self._others.append(descent)
             if space.blocks:
                 self._others.append(PeriodicInputs(space, generator))
             if any(len(block.values) > max(PIECES) for block in space.blocks) and coarse.name not in without:
@@ -97,11 +97,11 @@ class Portfolio:
             drawn = [coarse] if self._drawn is coarse else []
             alternating, perturbed = AlternatingVertices(space, generator), Perturbation(space, generator)
             if space.small:
-                self._first = [constant, perturbed, climb]
+                self._first = [constant, perturbed, descent]
             elif len(space.blocks) > 1:
-                self._first = [alternating, constant, constant, *drawn, climb, constant]
+                self._first = [alternating, constant, constant, *drawn, descent, constant]
             else:
-                self._first = [alternating, constant, perturbed, *drawn, climb]
+                self._first = [alternating, constant, perturbed, *drawn, descent]
             self._first += drawn * (OPENING - 1)
             self._leading = self._drawn if surrogate.name in without else surrogate
             self._first = [each for each in self._first if each.name not in without]

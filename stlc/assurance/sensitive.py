@@ -1,4 +1,4 @@
-"""Search for drives: climbing that learns which of the many random numbers of a world matter.
+"""Search for drives: local search that learns which of the many random numbers of a world matter.
 
 A world draws hundreds of random numbers, most of which change nothing: rejected candidates, or obstacles that
 are never reached. A change of some coordinates that leaves the robustness as it was makes it likely that none
@@ -61,7 +61,7 @@ class _Change:
     coordinates: NDArray[np.int64]
 
 
-class SensitiveClimbing(Strategy):
+class SensitiveSearch(Strategy):
     """Changed copies of the least robust points, in coordinates that have had an effect before."""
 
     name = "sensitive climbing"
@@ -78,10 +78,18 @@ class SensitiveClimbing(Strategy):
         self._made += 1
         if self._made <= FIRST or not self._kept or self.generator.random() < FRESH:
             return self.generator.random(self.space.dim)
-        parent = self._parent()
+        ranks = np.arange(len(self._kept))
+        share = np.exp(-2.0 * ranks / max(len(ranks), 1))
+        parent = self._kept[int(self.generator.choice(len(ranks), p=share / share.sum()))]
         coordinates = self._coordinates()
         point = parent.point.copy()
-        point[coordinates] = self._changed(point[coordinates])
+        values = point[coordinates]
+        generator = self.generator
+        width = WIDTHS[int(generator.integers(len(WIDTHS)))]
+        moved = values + width * generator.standard_normal(len(values))
+        inside = np.abs(np.mod(moved + 1.0, 2.0) - 1.0)  # reflected at the ends
+        anew = generator.random(len(values)) < REDRAWN
+        point[coordinates] = np.where(anew, generator.random(len(values)), np.clip(inside, 0.0, 1.0))
         self._open[id(point)] = _Change(point, parent, coordinates)
         return point
 
@@ -93,7 +101,12 @@ class SensitiveClimbing(Strategy):
             return
         parent = change.parent
         effect = not math.isclose(value, parent.value, rel_tol=SAME, abs_tol=SAME)
-        self._learn(change.coordinates, effect=effect)
+        before = self._matters[change.coordinates]
+        if effect:  # any of them may be the cause
+            now = before * (1.0 - MASKED) / (1.0 - np.prod(1.0 - before * (1.0 - MASKED))) + before * MASKED
+        else:
+            now = before * MASKED / (1.0 - before * (1.0 - MASKED))
+        self._matters[change.coordinates] = np.clip(now, LEAST * self._prior, MOST)
         parent.tried += 1
         if value < parent.value:
             parent.point, parent.value, parent.tried = point, value, 0
@@ -110,21 +123,6 @@ class SensitiveClimbing(Strategy):
         """Probability that a coordinate matters to the robustness of the kept points, (dim,)."""
         return self._matters
 
-    def _learn(self, changed: NDArray[np.int64], *, effect: bool) -> None:
-        """Update the probabilities of the changed coordinates by Bayes' rule."""
-        before = self._matters[changed]
-        if effect:  # any of them may be the cause
-            now = before * (1.0 - MASKED) / (1.0 - np.prod(1.0 - before * (1.0 - MASKED))) + before * MASKED
-        else:
-            now = before * MASKED / (1.0 - before * (1.0 - MASKED))
-        self._matters[changed] = np.clip(now, LEAST * self._prior, MOST)
-
-    def _parent(self) -> _Kept:
-        """One of the kept points; the least robust half of them is chosen more often."""
-        ranks = np.arange(len(self._kept))
-        share = np.exp(-2.0 * ranks / max(len(ranks), 1))
-        return self._kept[int(self.generator.choice(len(ranks), p=share / share.sum()))]
-
     def _coordinates(self) -> NDArray[np.int64]:
         """Coordinates to change: as many as are expected to contain a few that matter."""
         random = np.log(self.generator.random(self.space.dim))
@@ -134,15 +132,6 @@ class SensitiveClimbing(Strategy):
         expected = np.cumsum(self._matters[order])
         count = int(np.searchsorted(expected, self.generator.exponential(CHANGED))) + 1
         return order[:count]
-
-    def _changed(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """New values for some coordinates: drawn anew, or moved by one of three widths."""
-        generator = self.generator
-        width = WIDTHS[int(generator.integers(len(WIDTHS)))]
-        moved = values + width * generator.standard_normal(len(values))
-        inside = np.abs(np.mod(moved + 1.0, 2.0) - 1.0)  # reflected at the ends
-        anew = generator.random(len(values)) < REDRAWN
-        return np.where(anew, generator.random(len(values)), np.clip(inside, 0.0, 1.0))
 
     def _keep(self, point: Point, value: float) -> None:
         """Keep a point if it is among the least robust ones and its value is new."""

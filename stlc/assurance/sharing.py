@@ -69,15 +69,14 @@ class SimulatorWorkers:
         for each in results(self._calls, _call, orders, files=lambda _: self._files):
             ended[each.index] = each.value
             while following in ended:
-                yield self._value(ended.pop(following))
+                found = ended.pop(following)
                 following += 1
-
-    def _value(self, found: _Found | LostCall) -> Any:
-        if isinstance(found, LostCall):
-            self.reasons[found.reason] = None
-            return found
-        self.findings += found.findings
-        return found.value
+                if isinstance(found, LostCall):
+                    self.reasons[found.reason] = None
+                    yield found
+                else:
+                    self.findings += found.findings
+                    yield found.value
 
 
 @dataclass(frozen=True, slots=True)

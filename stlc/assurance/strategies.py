@@ -350,7 +350,8 @@ class PeriodicInputs(Strategy):
         if self._waves is not None and self._proposed > SWEPT and generator.random() < 0.8:
             waves = self._waves + generator.normal(0.0, self._width, self._waves.shape)
         else:
-            share = (_van_der_corput(self._proposed) + self._shift) % 1.0
+            bits = f"{self._proposed:b}"  # van der Corput sequence: 1/2, 1/4, 3/4, 1/8 and so on
+            share = (int(bits[::-1], 2) / (1 << len(bits)) + self._shift) % 1.0
             half = math.log(SHORTEST) + share * (math.log(LONGEST) - math.log(SHORTEST))
             waves = np.stack([np.full(count, half), generator.random(count) * 2.0], 1)
         point = self.space.middle()
@@ -387,11 +388,6 @@ class PeriodicInputs(Strategy):
             self._waves, self._value, self._width = waves, value, 0.15
         elif self._proposed > SWEPT:
             self._width = max(0.9 * self._width, 0.02)
-
-
-def _van_der_corput(index: int) -> float:
-    """Element of the van der Corput sequence in base 2: 1/2, 1/4, 3/4, 1/8 and so on."""
-    return int(f"{index:b}"[::-1], 2) / (1 << index.bit_length())
 
 
 def quantiles_of(times: NDArray[np.float64]) -> NDArray[np.float64]:

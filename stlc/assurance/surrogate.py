@@ -133,19 +133,16 @@ class SurrogateSearch(LocalSearch):
             return self._samplers[0].propose()
         values = np.array(self._values)
         kept = np.argsort(values, kind="stable")[:FITTED]
-        candidates = self._candidates()
+        near = CANDIDATES // 2
+        candidates = [neighbour(self.space, self.generator, self._one_of_the_best()) for _ in range(near)]
+        candidates += [
+            self._samplers[index % len(self._samplers)].propose() for index in range(CANDIDATES - near)
+        ]
         new = [each for each in candidates if each.tobytes() not in self._known] or candidates
         self._process.fit(np.array(self._points)[kept], _normal_scores(values[kept]))
         means, deviations = self._process.predict(np.array(new))
         bounds = means - self.generator.choice(BOLDNESS) * deviations
         return new[int(np.argmin(np.round(bounds, DIGITS)))]
-
-    def _candidates(self) -> list[Point]:
-        """Neighbours of the best points, and random ones."""
-        near = CANDIDATES // 2
-        found = [neighbour(self.space, self.generator, self._one_of_the_best()) for _ in range(near)]
-        found += [self._samplers[index % len(self._samplers)].propose() for index in range(CANDIDATES - near)]
-        return found
 
     def observe(self, point: Point, value: float) -> None:
         super().observe(point, value)

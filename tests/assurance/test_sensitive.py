@@ -1,4 +1,4 @@
-"""Climbing in spaces most of whose coordinates have no effect."""
+"""Local search in spaces most of whose coordinates have no effect."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from stlc.assurance.portfolio import Portfolio
 from stlc.assurance.search_space import SearchSpace
-from stlc.assurance.sensitive import SensitiveClimbing
+from stlc.assurance.sensitive import SensitiveSearch
 
 DIM = 600
 GOOD = np.array([11, 97, 250, 399, 580])
@@ -31,13 +31,13 @@ def searched(seed: int, *, random: bool, count: int = 300) -> tuple[float, Portf
 
 def test_the_search_is_better_than_sampling():
     pairs = [(searched(seed, random=False)[0], searched(seed, random=True)[0]) for seed in range(5)]
-    climbed, sampled = np.mean(pairs, axis=0)
-    assert climbed < 0.5 * sampled
+    learnt, sampled = np.mean(pairs, axis=0)
+    assert learnt < 0.5 * sampled
 
 
 def test_coordinates_without_effect_are_changed_less_often():
     space = SearchSpace(DIM, sparse=True)
-    strategy = SensitiveClimbing(space, np.random.default_rng(1))
+    strategy = SensitiveSearch(space, np.random.default_rng(1))
     for _ in range(500):
         point = strategy.propose()
         assert point.shape == (DIM,)
@@ -47,7 +47,7 @@ def test_coordinates_without_effect_are_changed_less_often():
 
 
 def test_points_of_others_are_starts():
-    strategy = SensitiveClimbing(SearchSpace(DIM, sparse=True), np.random.default_rng(0))
+    strategy = SensitiveSearch(SearchSpace(DIM, sparse=True), np.random.default_rng(0))
     best = np.full(DIM, 0.5)
     best[GOOD] = TARGET
     for _ in range(30):

@@ -264,7 +264,13 @@ class SharedExaminer:
         for each in results(self._calls, _call, self._orders(batches, sent)):
             ended[each.index] = each.value
             while following in ended:
-                yield from self._results(ended.pop(following), sent[following])
+                found = ended.pop(following)
+                if isinstance(found, LostCall):
+                    self.lost += [found.reason] * sent[following]
+                    yield from [found] * sent[following]
+                else:
+                    self._seconds += sum(result.seconds for result in found)
+                    yield from found
                 following += 1
 
     def _orders(self, batches: Iterable[BoxBatch], sent: list[int]) -> Iterator[_Order]:
@@ -273,14 +279,6 @@ class SharedExaminer:
         while chosen := tuple(islice(waiting, _TOGETHER)):
             sent.append(len(chosen))
             yield _Order(self._source, chosen)
-
-    def _results(self, found: list[BatchResult] | LostCall, size: int) -> list[BatchResult | LostCall]:
-        """Results of the batches of a call."""
-        if isinstance(found, LostCall):
-            self.lost += [found.reason] * size
-            return [found] * size
-        self._seconds += sum(each.seconds for each in found)
-        return [*found]
 
 
 @dataclass(frozen=True, slots=True)

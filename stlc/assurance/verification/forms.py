@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any, TypeAlias, cast, final
 
 import numpy as np
@@ -327,7 +328,8 @@ class FormOps(FloatConstants):
             ]
         size = np.sqrt(np.sum([part.centre**2 for part in parts], axis=0))
         along = [part.centre / np.maximum(size, 1e-300) for part in parts]
-        linear = _total([part.times(share) for part, share in zip(parts, along, strict=True)])
+        shares = [part.times(share) for part, share in zip(parts, along, strict=True)]
+        linear = reduce(FORMS.add, shares)
         linear = Forms(linear.centre, linear.generators, linear.rest)
         aside = [self.sub(part, linear.times(share)) for part, share in zip(parts, along, strict=True)]
         across = np.sqrt(np.sum([part.radius**2 for part in aside], axis=0))
@@ -522,13 +524,6 @@ def _between_lines(
     error = SLACK * (1.0 + np.abs(low) + np.abs(high) + np.abs(slope) * (1.0 + np.abs(x.centre)))
     found = x.times(slope).widened(0.5 * (low + high), 0.5 * (high - low) + error)
     return _bounded(picked(good, found, Forms.between(plain.low, plain.high)), plain)
-
-
-def _total(forms: Sequence[Forms]) -> Forms:
-    out = forms[0]
-    for each in forms[1:]:
-        out = cast("Forms", FORMS.add(out, each))
-    return out
 
 
 def tanh(x: Forms) -> Forms:

@@ -15,7 +15,6 @@ import numpy as np
 from stlc.assurance.verification.forms import FORMS, Floats, Forms, ranges, spread
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
@@ -89,7 +88,11 @@ class Judge:
         for name in self._numbers.values():
             forms = [spread(each[name], batch) for each in numbers]
             env[name] = ranges(forms)
-            self._add_effects(effects, forms, env[name])
+            for row, form in enumerate(forms):  # shares in the radius of forms that may have both signs
+                crossing = ~((env[name].low[row] >= 0.0) | (env[name].high[row] <= 0.0))
+                if crossing.any():
+                    share = np.abs(form.generators[: len(effects)]) / np.maximum(form.radius, 1e-300)
+                    effects[: len(share)] += np.where(crossing, np.nan_to_num(share), 0.0)
         found = evaluate(self._formulas, env, ops=INTERVALS, end=self._end)
         low, high = (
             np.min([np.broadcast_to(end[0], batch) for end in ends], axis=0)
@@ -118,11 +121,3 @@ class Judge:
             else:
                 env[name] = forms[place]
         return env or {"": Forms.point(np.zeros_like(like))}
-
-    def _add_effects(self, effects: Floats, forms: Sequence[Forms], bound: Intervals) -> None:
-        """Add the share of each symbol in the radius of every form that may have both signs."""
-        for row, form in enumerate(forms):
-            crossing = ~((bound.low[row] >= 0.0) | (bound.high[row] <= 0.0))
-            if crossing.any():
-                share = np.abs(form.generators[: len(effects)]) / np.maximum(form.radius, 1e-300)
-                effects[: len(share)] += np.where(crossing, np.nan_to_num(share), 0.0)

@@ -98,18 +98,15 @@ class _Chain:
             weight = values[0].T if first else values[0]
             self._compose(weight, np.zeros(len(weight)))
         elif kind in ("Add", "Sub", "Mul", "Div") and (first or kind in ("Add", "Mul")):
-            self._each(kind, values[0].reshape(-1))
+            value = values[0].reshape(-1)
+            size = self._linear(max(self.size, value.size))[0].shape[0]
+            value = np.broadcast_to(value, size)
+            if kind in ("Add", "Sub"):
+                self._compose(np.eye(size), value if kind == "Add" else -value)
+            else:
+                self._compose(np.diag(value if kind == "Mul" else 1.0 / value), np.zeros(size))
         else:
             raise ValueError("no layer of a feed-forward network")
-
-    def _each(self, kind: str, value: Floats) -> None:
-        """Add an operation on each component with a constant."""
-        size = self._linear(max(self.size, value.size))[0].shape[0]
-        value = np.broadcast_to(value, size)
-        if kind in ("Add", "Sub"):
-            self._compose(np.eye(size), value if kind == "Add" else -value)
-        else:
-            self._compose(np.diag(value if kind == "Mul" else 1.0 / value), np.zeros(size))
 
     def _linear(self, size: int) -> tuple[Floats, Floats]:
         """The linear map after the layers; the identity if there is none."""

@@ -14,7 +14,7 @@ agents in another way, are outside of it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -101,7 +101,8 @@ class TubeModel:
         self._noises = tuple(map(Drawing, scenario.noise if scenario else ()))
         for noise in self._noises:
             if names := noise.reads - {TIME}:
-                message = f"the measurement noise on `{noise.name}` depends on {_listed(names)}"
+                listed = ", ".join(f"`{name}`" for name in sorted(names))
+                message = f"the measurement noise on `{noise.name}` depends on {listed}"
                 raise usage(f"{message}, which is not known exactly", "a tube needs noise with known bounds")
         _refuse_functions(self._truth, task)
         self._scale = 1.0 if decl.discrete else system.dt
@@ -155,7 +156,13 @@ class TubeModel:
         if len(parts) == 1:
             return parts[0]
         names = self.task.system.names
-        whole = {name: _side_by_side([part.states[name] for part in parts]) for name in names}
+        whole = {
+            name: Intervals(
+                np.concatenate([part.states[name].low for part in parts], 1),
+                np.concatenate([part.states[name].high for part in parts], 1),
+            )
+            for name in names
+        }
         return Tube(whole, torch.cat([part.low for part in parts]), torch.cat([part.high for part in parts]))
 
     def safe(self, x: Tensor, plans: Tensor, *, steps: int | None = None) -> Tensor:
@@ -315,7 +322,10 @@ class _Motion:
             errors: errors of actuators and parameters; None for none.
             symbols: source of new symbols.
         """
-        given = self._commanded(env, [Forms.point(each) for each in plan])
+        given = [Forms.point(each) for each in plan]
+        if self._commands is not None:
+            found = _computed(self._commands, {**env, **dict(zip(self._controls, given, strict=True))})
+            given = [found[name] for name in self._controls]
         acted = given if errors is None else errors.acted(given)
         if self._feedback is not None:
             ends = zip(acted, self._feedback.low, self._feedback.high, strict=True)
@@ -326,13 +336,6 @@ class _Motion:
             moving.update(_computed(block, moving))
         later = {name: _full(moving[f"{name}'"], symbols.batch) for name in self._moved}
         return {**env, **later}
-
-    def _commanded(self, env: _Env, plan: list[Forms]) -> list[Forms]:
-        """Commands of the actuators for planned controls."""
-        if self._commands is None:
-            return plan
-        found = _computed(self._commands, {**env, **dict(zip(self._controls, plan, strict=True))})
-        return [found[name] for name in self._controls]
 
 
 def _computed(program: ArrayProgram, env: Mapping[str, Forms]) -> _Env:
@@ -380,7 +383,7 @@ class _Judge:
     def __call__(self, history: Mapping[str, list[Forms]]) -> list[Intervals]:
         """Bounds on the robustness of each requirement, (B,) each."""
         env = {name: ranges(forms) for name, forms in history.items()}
-        over_time = _stacked(history) if self._programs else {}
+        over_time = {name: _over_time(forms) for name, forms in history.items()} if self._programs else {}
         for name, program in self._programs.values():
             env[name] = _margins(program, env, over_time)
         found = evaluate(self._formulas, env, ops=INTERVALS, end=self._end)
@@ -400,11 +403,6 @@ def _margins(program: ArrayProgram, env: Mapping[str, Intervals], forms: Mapping
     return Intervals(low, np.maximum(np.fmin(plain.high, linear.high), low))
 
 
-def _stacked(history: Mapping[str, list[Forms]]) -> _Env:
-    """Forms over time as one form each, (T+1, B)."""
-    return {name: _over_time(forms) for name, forms in history.items()}
-
-
 def _over_time(forms: Sequence[Forms]) -> Forms:
     count = max(len(form.generators) for form in forms)
     generators = np.zeros((count, len(forms), *forms[0].shape))
@@ -414,28 +412,15 @@ def _over_time(forms: Sequence[Forms]) -> Forms:
     return Forms(centre, generators, rest)
 
 
-def _side_by_side(parts: Sequence[Intervals]) -> Intervals:
-    return Intervals(
-        np.concatenate([part.low for part in parts], 1), np.concatenate([part.high for part in parts], 1)
-    )
-
-
 def _refuse_functions(motion: _Motion, task: Task) -> None:
     """Refuse Python functions, whose values have no bounds. Raises UsageError (U101)."""
     formulas = (num for rule in task.rules for num in numbers(rule.formula))
     for num in (*motion.numbers.values(), *formulas):
-        for name in _python_functions(num):
-            raise usage(f"`{name}` is a Python function, whose values have no bounds: there is no tube")
-
-
-def _python_functions(num: ir.Num) -> Iterator[str]:
-    for part in subexpressions(num):
-        if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
-            yield part.name
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(f"`{name}`" for name in sorted(names))
+        for part in subexpressions(num):
+            if isinstance(part, ir.Extern) and not isinstance(part.function, ir.Body):
+                raise usage(
+                    f"`{part.name}` is a Python function, whose values have no bounds: there is no tube"
+                )
 
 
 def tube(task: Task, x: Any, plans: Any, *, deviations: float = DEVIATIONS) -> Tube:

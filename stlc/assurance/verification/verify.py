@@ -200,7 +200,12 @@ class Verifier:
                 for box in batch.boxes:
                     fronts[batch.mode].add(box)
         for each, front in zip(found, fronts, strict=True):
-            self._close(each, front)
+            each.accepted = self.plans.acceptance(each.mode)
+            sure = sum(box.volume for box in each.boxes if box.inside)
+            bad = sum(box.volume for box in front if box.refuted)
+            each.proved = min(1.0, sure / each.accepted)
+            each.refuted = min(bad / each.accepted, 1.0 - each.proved)
+            each.open = max(0.0, 1.0 - each.proved - each.refuted)
         return Verification(tuple(found), self._clock() - begun)
 
     def _chosen(self, fronts: list[_Front], most: float) -> list[BoxBatch]:
@@ -236,15 +241,6 @@ class Verifier:
             result.witness is None or found.witness.robustness < result.witness.robustness
         ):
             result.witness = found.witness
-
-    def _close(self, result: ModeResult, front: _Front) -> None:
-        """Compute the shares of a mode at the end."""
-        result.accepted = self.plans.acceptance(result.mode)
-        sure = sum(box.volume for box in result.boxes if box.inside)
-        bad = sum(box.volume for box in front if box.refuted)
-        result.proved = min(1.0, sure / result.accepted)
-        result.refuted = min(bad / result.accepted, 1.0 - result.proved)
-        result.open = max(0.0, 1.0 - result.proved - result.refuted)
 
     def around(self, states: int, *, seed: int = 0) -> list[Around]:
         """Search boxes with a proof around random initial states; one result per mode, in their order."""
