@@ -156,7 +156,10 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             seen, self._next = self._shown(self._next), None
             self._pictured(first=True)
             return seen, np.zeros(self.num_envs), none, none.copy(), self._told(self._episodes.states)
-        moved = self._episodes.step(self._plans(actions))
+        if np.shape(actions) != self.action_space.shape:
+            raise usage(f"actions have the shape {np.shape(actions)}", f"give {self.action_space.shape}")
+        held = torch.from_numpy(self._actuators.physical(actions, unit=self.normalised))
+        moved = self._episodes.step(self.task.system.planned(self._episodes.states, held))
         reward, done = moved.reward.double().numpy(), moved.done.numpy()
         self._pictured(first=moved.verdicts is not None)
         if moved.verdicts is None:
@@ -168,16 +171,6 @@ class SpecVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         info = self._told(self._episodes.states)
         info |= self._marked({"final_obs": _objects(final), "final_info": end})
         return self._shown(moved.observation), reward, done, none, info
-
-    def _plans(self, actions: NDArray[np.float32]) -> Tensor:
-        """Return the controls of the model, (N, m), that lead to the actuator commands `actions`.
-
-        They depend on the present states if the system file declares a feedback law around plans.
-        """
-        if np.shape(actions) != self.action_space.shape:
-            raise usage(f"actions have the shape {np.shape(actions)}", f"give {self.action_space.shape}")
-        held = torch.from_numpy(self._actuators.physical(actions, unit=self.normalised))
-        return self.task.system.planned(self._episodes.states, held)
 
     def _shown(self, seen: Tensor) -> Floats:
         """Clip the observations `seen` to their bounds and, if requested, normalise them: (N, k).

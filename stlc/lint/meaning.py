@@ -202,7 +202,9 @@ def bare_numbers(spec: typed.Spec) -> Iterator[Diagnostic]:
         for number, other in ((compared.left, compared.right), (compared.right, compared.left)):
             value = plain.get(number.name) if isinstance(number, ast.Name) else number
             amount = None if value is None else _bare(value)
-            if value is None or amount is None or amount < rival.least or _measured(other):
+            if value is None or amount is None or amount < rival.least:
+                continue
+            if any(isinstance(node, ast.Quantity) and node.unit for node in descendants(other)):
                 continue
             text = value.span.text
             yield Diagnostic(
@@ -241,11 +243,6 @@ def _bare(expr: ast.Expr) -> Fraction | None:
             return abs(value)
         case _:
             return None
-
-
-def _measured(expr: ast.Expr) -> bool:
-    """True if a number with a unit stands in an expression."""
-    return any(isinstance(node, ast.Quantity) and node.unit for node in descendants(expr))
 
 
 TypedCheck: TypeAlias = Callable[[typed.Spec], Iterator[Diagnostic]]

@@ -70,7 +70,8 @@ def foreign_spellings(spec: ast.Spec) -> Iterator[Diagnostic]:
         if name is None:
             continue
         span = source.span(item.start, item.end)
-        text = f"{name} " if name[-1].isalpha() and _glues(item, following) else name
+        joined = following.start == item.end and following.kind in ("word", "number")  # `!p` is no `notp`
+        text = f"{name} " if name[-1].isalpha() and joined else name
         if item.start and name[0].isalpha() and source.text[item.start - 1].isalnum():
             text = f" {text}"
         yield Diagnostic(
@@ -93,11 +94,6 @@ def _own(item: Lexeme, following: Lexeme) -> str | None:
     bare = item.text.removesuffix("_") if following.text == "[" else item.text
     name = _WORDS.get(bare)
     return bare if name is None and bare != item.text and bare in UNARY_TEMPORAL | BINARY_TEMPORAL else name
-
-
-def _glues(item: Lexeme, following: Lexeme) -> bool:
-    """True if a word follows the sign `item` without a space: `!p` must not become `notp`."""
-    return following.start == item.end and following.kind in ("word", "number")
 
 
 _KINDS: dict[type[ast.Declaration], str] = {
