@@ -94,14 +94,8 @@ def _ansi(char: str) -> str:
     """A character as written within `$'…'` in a shell; an invisible character is written as its bytes."""
     if not _INVISIBLE.match(char):
         return char
-    return "".join(
-        f"\\x{byte:02x}" for byte in char.encode("utf-8", "surrogateescape" if _raw(char) else "replace")
-    )
-
-
-def _raw(char: str) -> bool:
-    """True for a character that stands for an invalid UTF-8 byte in a file name, as Python represents it."""
-    return "\udc80" <= char <= "\udcff"
+    raw = "\udc80" <= char <= "\udcff"  # an invalid UTF-8 byte in a file name, as Python represents it
+    return "".join(f"\\x{byte:02x}" for byte in char.encode("utf-8", "surrogateescape" if raw else "replace"))
 
 
 def encodable(text: str) -> str:

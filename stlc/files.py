@@ -59,7 +59,9 @@ def read_source(path: Path | str, root: str = "") -> Source:
     try:
         data = read_regular(path, MAX_BYTES)
     except FileNotFoundError:
-        raise UsageError(_missing(path)) from None
+        near = closest(path.name, _siblings(path.parent))
+        advice = (f"did you mean `{path.parent / near}`?",) if near else ()
+        raise UsageError(Diagnostic("U102", f"there is no file `{path}`", help=advice)) from None
     except OSError as error:
         raise (_too_large(name) if error.errno == errno.EFBIG else unreadable(path, error)) from None
     except ValueError:  # a zero byte in the name
@@ -116,12 +118,6 @@ def unreadable(path: Path, error: OSError) -> UsageError:
 
 def _too_large(name: str) -> SpecError:
     return SpecError(Diagnostic("E005", f"`{name}` is larger than {MAX_BYTES // 1_000_000} MB"))
-
-
-def _missing(path: Path) -> Diagnostic:
-    near = closest(path.name, _siblings(path.parent))
-    advice = (f"did you mean `{path.parent / near}`?",) if near else ()
-    return Diagnostic("U102", f"there is no file `{path}`", help=advice)
 
 
 def _siblings(folder: Path) -> list[str]:

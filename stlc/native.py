@@ -72,8 +72,8 @@ class SearchOptions:
         factors: two numbers for each requirement, (2, R). The first is its weight (tag `@weight`) divided by
             its scale (tag `@scale`); the search multiplies each robustness by this factor, and maximises the
             least product. The second is 1 if the requirement is tagged `@safety`, else 0.
-        bank: plans that satisfied the specification from other states, (k, T, m). The search may replace the
-            last steps of a plan, or all of its steps, by those of a plan in the bank.
+        library: plans that satisfied the specification from other states, (k, T, m). The search may replace
+            the last steps of a plan, or all of its steps, by those of a plan in the library.
         generations: largest number of iterations, in each of which several changes of the best plan are
             tried.
         enough: robustness at which the search for one initial state ends.
@@ -86,7 +86,7 @@ class SearchOptions:
 
     bounds: NDArray[np.float64]
     factors: NDArray[np.float64]
-    bank: NDArray[np.float64]
+    library: NDArray[np.float64]
     generations: int
     enough: float
     seed: int
@@ -216,12 +216,12 @@ class Kernel:
             ValueError: an array has another shape.
         """
         self._sizes.check(x0, plans)
-        if len(search.bank) and search.bank.shape[1:] != plans.shape[1:]:
-            raise ValueError(f"the bank has the shape (k, T, m), not {search.bank.shape}")
+        if len(search.library) and search.library.shape[1:] != plans.shape[1:]:
+            raise ValueError(f"the library of plans has the shape (k, T, m), not {search.library.shape}")
         x0, plans = np.ascontiguousarray(x0, dtype=np.float64), np.array(plans, dtype=np.float64, order="C")
         rho = np.full(len(x0), np.nan)
-        arrays = [a.ctypes.data for a in (x0, plans, rho, search.bounds, search.factors, search.bank)]
-        scalars = (len(search.bank), search.generations, search.enough, search.seed, search.cycle)
+        arrays = [a.ctypes.data for a in (x0, plans, rho, search.bounds, search.factors, search.library)]
+        scalars = (len(search.library), search.generations, search.enough, search.seed, search.cycle)
 
         def rows(first: int, last: int) -> int:
             done: int = self._climb(first, last, *arrays, *scalars)

@@ -79,7 +79,7 @@ def test_arrays_of_other_sizes_are_refused() -> None:
         ):
             with pytest.raises(ValueError, match=r"x0 \(B, 1\) and u \(B, 5, 1\)"):
                 call()
-    with pytest.raises(ValueError, match="bank"):
+    with pytest.raises(ValueError, match="library of plans"):
         kernel.climb(x0, u, search)
     for wrong in (replace(slopes, by_rho=np.ones((3, 1))), replace(slopes, by_columns=np.ones((1, 5, 4)))):
         with pytest.raises(ValueError, match="by_"):
