@@ -18,7 +18,7 @@ from benchmarks.roster import Contender
 from benchmarks.store import BENCHMARKS
 from benchmarks.table import Columns, bullet, listed
 from benchmarks.training import Length
-from stlc.cli.framework.options import parse_seconds, parse_seeds
+from stlc.options import parse_seconds, parse_seeds
 from stlc.registry import GUARDS
 
 HOUR = 3600.0

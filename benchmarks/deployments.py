@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ from benchmarks.options import Output, ResultsOption, TrainedOption
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore
 from benchmarks.table import Table, listed, publish
 from benchmarks.training import Place, benchmark_order
-from stlc.cli.framework.options import SeedsOption, parse_limit, parse_seeds
+from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.output import say
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.deployment import decided, feasible_states
@@ -35,6 +36,7 @@ from stlc.diagnostics import Diagnostic, UsageError
 from stlc.dynamics.declaration.deployment import ErrorsDecl
 from stlc.dynamics.scenario import DISTURBED
 from stlc.jsontext import plain
+from stlc.options import parse_limit, parse_seeds
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
 from stlc.rundir import SPEC, SYSTEM, RunDir
@@ -79,7 +81,8 @@ class DeploymentOptions:
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
         limit = parse_limit(self.time_limit)
-        return Setting(parse_seeds(self.seeds), agents, steps, test.replan, limit, ceiling)
+        finite = limit if math.isfinite(limit) else None
+        return Setting(parse_seeds(self.seeds), agents, steps, test.replan, finite, ceiling)
 
     def runs(self, names: Sequence[str] | None) -> list[RunDir]:
         """Return the runs called `names`; without names, the most accurate run of each benchmark.

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SeedsOption, parse_clock, parse_seconds, parse_seeds
+from stlc.cli.framework.options import JsonOption, SeedsOption
 from stlc.diagnostics import Diagnostic, UsageError
+from stlc.options import parse_clock, parse_seconds, parse_seeds
 from stlc.registry import closest
 
 if TYPE_CHECKING:

@@ -23,10 +23,11 @@ from stlc.controller.parallel.inputs import input_files
 from stlc.controller.parallel.jobs import Job
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
-from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED, Clock
+from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.run.run import Run, spec_hash, system_hash
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig
 from stlc.diagnostics import StlcError
+from stlc.options import Clock
 from stlc.provenance import sha256
 from stlc.registry import METHODS
 from stlc.rundir import RunDir, every_run

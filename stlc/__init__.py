@@ -24,13 +24,17 @@ from stlc.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from stlc.assurance.certificates import certify
+    from stlc.assurance.falsification import falsify
     from stlc.assurance.verification.tubes import tube
+    from stlc.assurance.verification.verified import verify
     from stlc.controller.explain import explain
     from stlc.controller.problem.task import Task
     from stlc.controller.run.run import Run
     from stlc.controller.search.planner import PlanResult, plan
     from stlc.diagnostics import SpecError, StlcError
     from stlc.dynamics.system import System
+    from stlc.export.targets import export
     from stlc.grammar import ast
     from stlc.monitor.check import check
     from stlc.monitor.judgement import RequirementVerdict, Verdict
@@ -39,11 +43,13 @@ if TYPE_CHECKING:
     from stlc.trace import Trace
     from stlc.view.plotted import plot
     from stlc.view.report import report
+    from stlc.view.simulated import simulate
     from stlc.view.trained import train
 
     compile = Task.of
 else:
     import stlc.compile as compile
+    import stlc.export as export
     import stlc.lint as lint
 
 __all__ = [
@@ -58,17 +64,22 @@ __all__ = [
     "Trace",
     "Verdict",
     "__version__",
+    "certify",
     "check",
     "compile",
     "explain",
+    "export",
+    "falsify",
     "lint",
     "load",
     "parse",
     "plan",
     "plot",
     "report",
+    "simulate",
     "train",
     "tube",
+    "verify",
 ]
 
 _HOMES = {
@@ -82,16 +93,21 @@ _HOMES = {
     "Task": "stlc.controller.problem.task:Task",
     "Trace": "stlc.trace:Trace",
     "Verdict": "stlc.monitor.judgement:Verdict",
+    "certify": "stlc.assurance.certificates:certify",
     "check": "stlc.monitor.check:check",
     "explain": "stlc.controller.explain:explain",
+    "falsify": "stlc.assurance.falsification:falsify",
     "plan": "stlc.controller.search.planner:plan",
     "plot": "stlc.view.plotted:plot",
     "report": "stlc.view.report:report",
+    "simulate": "stlc.view.simulated:simulate",
     "train": "stlc.view.trained:train",
     "tube": "stlc.assurance.verification.tubes:tube",
+    "verify": "stlc.assurance.verification.verified:verify",
 }
 _CALLED = {
     "stlc.compile": "stlc.controller.problem.task:Task.of",
+    "stlc.export": "stlc.export.targets:export",
     "stlc.lint": "stlc.monitor.linted:lint",
 }
 """Packages that can be called like the function that has their name."""

@@ -22,6 +22,8 @@ from stlc.escape import json_text
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 Num: TypeAlias = Annotated[float, "unbounded"]
 """Number of a record that need not be finite."""
+Count: TypeAlias = Annotated[int, 0]
+"""Whole number of a record from 0 on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,12 @@ def keys_of(kind: type) -> tuple[Key, ...]:
     parts = [word.partition("=") for word in words.split()]
     names = [(name.removesuffix("?"), attribute, name.endswith("?")) for name, _, attribute in parts]
     return tuple(Key(name, attribute or name, optional) for name, attribute, optional in names)
+
+
+def keys_below(field: str, kind: type) -> str:
+    """Words of `JSON` for the keys of a record among those of another, which has it as a field."""
+    keys = keys_of(kind)
+    return " ".join(f"{key.name}{'?' * key.optional}={field}.{key.attribute}" for key in keys)
 
 
 def plain(value: object) -> Json:

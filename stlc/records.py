@@ -80,10 +80,6 @@ def schema_of(kind: Any) -> dict[str, Any]:
         needed = [key.name for key in keys_of(kind) if not key.optional]  # type: ignore[arg-type]
         return {"type": "object", "properties": inner} | ({"required": needed} if needed else {})
     if origin is Annotated:
-        if is_typeddict(args[1]):  # the keys of both
-            one, other = (schema_of(each) for each in args[:2])
-            keys = {**one["properties"], **other["properties"]}
-            return {"type": "object", "properties": keys, "required": [*one["required"], *other["required"]]}
         what = args[1]() if callable(args[1]) else args[1]
         if what == "unbounded":
             return {"type": ["number", "string"]}

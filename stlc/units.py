@@ -313,3 +313,13 @@ def _text(powers: Mapping[str, int]) -> str:
 
 SYMBOLS = _symbols()
 """Symbol -> unit, with all prefixes."""
+
+
+def floored(share: float) -> str:
+    """Format a lower bound on a share, rounded down to two decimals of a percent."""
+    return f"{math.floor(1e4 * share + 1e-9) / 100:.2f} %"
+
+
+def raised(share: float) -> str:
+    """Format an upper bound on a share, rounded up to two decimals of a percent."""
+    return f"{math.ceil(1e4 * share - 1e-9) / 100:.2f} %"

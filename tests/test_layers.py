@@ -20,7 +20,7 @@ ROOMS = (
     {"source", "version", "stopping"},
     {"diagnostics"},
     {"escape"},
-    {"activity", "plugins", "registry", "units", "jsontext", "records", "extras", "tabular"},
+    {"activity", "options", "plugins", "registry", "units", "jsontext", "records", "extras", "tabular"},
     {"signature"},
     {"rundir", "files", "foreign", "provenance", "cache", "toolchain", "native", "trace"},
     {"grammar"},

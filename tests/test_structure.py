@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463706
+NODES = 464700
 CROSSINGS = 6.5
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {

@@ -29,7 +29,6 @@ from stlc.assurance.verification.loop import NetworkLoop
 from stlc.assurance.verification.network import NetworkLayer
 from stlc.assurance.verification.onnx_layers import read_onnx
 from stlc.assurance.verification.verify import Verifier
-from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.tolerance import violated
@@ -37,6 +36,7 @@ from stlc.controller.problem.load import load_task
 from stlc.controller.training.budget import clock_of
 from stlc.diagnostics import usage
 from stlc.files import SYSTEMS
+from stlc.options import parse_seconds
 from stlc.provenance import sha256
 
 _OUTPUT = Output(Path("docs/assurance.md"))

@@ -20,10 +20,10 @@ from benchmarks.table import Columns, Table, listed, provenance, publish
 from benchmarks.timing import one_thread
 from stlc.assurance.falsify import FALSIFIER_VERSION, ViolationSearch
 from stlc.assurance.model_simulator import ModelSimulator
-from stlc.cli.framework.options import parse_seeds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.files import SPECS
+from stlc.options import parse_seeds
 
 SIMULATIONS = 300
 _OUTPUT = Output(Path("docs/falsification.md"))

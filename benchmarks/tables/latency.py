@@ -21,7 +21,7 @@ from benchmarks.deployments import sampled_states
 from benchmarks.options import Output, RunsArgument, opened
 from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import Times, after_warm_up, one_thread
-from stlc.cli.framework.options import SeedsOption, parse_seeds
+from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits
@@ -29,6 +29,7 @@ from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.run.run import Run
 from stlc.diagnostics import UsageError
+from stlc.options import parse_seeds
 from stlc.registry import GUARDS
 
 TEXT = """## A decision

@@ -22,10 +22,10 @@ from benchmarks.tables.falsify import CASES, side_by_side
 from benchmarks.timing import one_thread
 from stlc.assurance.falsify import FALSIFIER_VERSION, ViolationSearch
 from stlc.assurance.model_simulator import ModelSimulator
-from stlc.cli.framework.options import parse_seeds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.files import SPECS
+from stlc.options import parse_seeds
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
 SIMULATIONS = 300

@@ -18,10 +18,11 @@ from benchmarks.measured import measured
 from benchmarks.options import OnlyOption, Output, ResultsOption, TrainedOption, chosen
 from benchmarks.store import Key, Result, ResultStore
 from benchmarks.table import Columns, Table, listed, provenance, publish
-from stlc.cli.framework.options import SeedsOption, parse_seeds
+from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.controller.search.planner import PLANNING_VERSION
 from stlc.controller.training.config import ENGINE_VERSION
+from stlc.options import parse_seeds
 from stlc.registry import GUARDS as KINDS
 
 PARTS = ("plans", "controller", "policy")

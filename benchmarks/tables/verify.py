@@ -20,13 +20,13 @@ from stlc.assurance.verification.examine import SharedExaminer
 from stlc.assurance.verification.plans import PolicySource, ProposedPlans
 from stlc.assurance.verification.subject import VerificationSubject
 from stlc.assurance.verification.verify import Verifier
-from stlc.cli.framework.options import parse_seconds
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
 from stlc.compile.semantics.tolerance import violated
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.controller.run.run import Run
 from stlc.controller.training.budget import clock_of
+from stlc.options import parse_seconds
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
 

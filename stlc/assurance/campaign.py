@@ -11,21 +11,22 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from stlc.assurance.certificate import (
-    FORMAT,
     Assessment,
     Claim,
     Sample,
+    StoredStatement,
     assess,
     joined,
     wrong_numbers,
 )
+from stlc.assurance.conformal import parse_shift
 from stlc.diagnostics import usage
-from stlc.jsontext import plain
-from stlc.provenance import hardware, versions
-from stlc.rundir import now
+from stlc.jsontext import Count
+from stlc.provenance import versions
+from stlc.registry import GUARDS
 
 SEED = 1 << 41
 """First seed of certificates; those of `simulate` begin at 0, those after a training at 2^40."""
@@ -57,8 +58,8 @@ class Subject(Protocol):
     def observed(self, seeds: Sequence[int]) -> Iterable[Sample]:
         """Observe the units of `seeds`, and yield the judged ones."""
 
-    def record(self, seeds: Sequence[int]) -> dict[str, Any]:
-        """Entries of the certificate on the subject: its name, its inputs, and the conditions.
+    def record(self, seeds: Sequence[int]) -> Any:
+        """Record of the subject in the certificate: its name, its inputs, and the conditions.
 
         `seeds` are those observed so far.
         """
@@ -151,23 +152,88 @@ def campaign(order: Campaign) -> Iterator[Progress]:
 # ---------------------------------------------------------------------- certificates
 
 
-def certificate(order: Campaign, progress: Progress) -> dict[str, Any]:
-    """Content of a certificate file: answer, bounds, assumptions, and everything that they depend on."""
-    bounds: Any = plain(progress.assessment)
-    document = {
-        "certificate": FORMAT,
-        "made": now(),
-        **order.subject.record(progress.seeds),
-        **bounds,
-        "width": order.width,
-        "finished": progress.done,
-        "batches": progress.batches,
-        "versions": versions(*order.subject.packages),
-        "hardware": hardware(),
-    }
-    found: Any = plain(document)
-    result: dict[str, Any] = found
-    return result
+@dataclass(frozen=True, slots=True)
+class CertifiedInputs:
+    """Hashes and versions of everything that the drives of a run depend on, beside their conditions.
+
+    Attributes:
+        spec: the specification, with imports and the changes of the training.
+        system: the system file, with these changes.
+        functions: files that the system file names.
+        rules: the specification of drives with its imports and changes; None if there is none.
+        world: the file of the world; None for the model.
+        policy: the checkpoint and the options of the method.
+        guard_version: raised with every change of the guard's decisions.
+    """
+
+    spec: str
+    system: str
+    functions: str
+    rules: str | None
+    world: str | None
+    policy: str
+    guard_version: int
+
+
+@dataclass(frozen=True, slots=True)
+class CertifiedConditions:
+    """Options of the deployment; seeds are ranges [first, last]."""
+
+    guard: Annotated[str, lambda: GUARDS.installed]
+    scenario: str | None
+    overrides: Mapping[str, str]
+    require: Sequence[str]
+    margin: Mapping[str, float]
+    time_limit: float | None
+    agents: Count
+    steps: Count
+    replan: Count
+    seeds: Sequence[Sequence[int]]
+
+
+@dataclass(frozen=True, slots=True)
+class CertifiedDrives:
+    """Run of a certificate, and how its policy was deployed."""
+
+    run: str
+    spec: str
+    system: str
+    inputs: CertifiedInputs
+    conditions: CertifiedConditions
+
+
+@dataclass(frozen=True, slots=True)
+class StoredConditions:
+    """Conditions in a certificate, as far as they are read; those of a policy have a guard."""
+
+    seeds: list[tuple[int, int]]
+    overrides: dict[str, str]
+    guard: str = ""
+    scenario: str | None = None
+    agents: Annotated[int, 1] = 1
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCertificate:
+    """File of a certificate, as far as it is read."""
+
+    certificate: Literal["stlc-certificate/1"]
+    answer: str
+    confidence: float
+    sequential: bool
+    overall: StoredStatement
+    requirements: list[StoredStatement]
+    inputs: dict[str, str | int | None]
+    versions: dict[str, str]
+    conditions: StoredConditions
+    made: str = ""
+    kind: Literal["plant", "system"] | None = None
+    run: str = ""
+    spec_file: str = ""
+    system_file: str = ""
+    share: float | None = None
+    shift: str | None = None
+    left_out: Annotated[int, 0] | None = None
 
 
 def seed_ranges(seeds: Sequence[int]) -> list[list[int]]:
@@ -210,9 +276,9 @@ class CertificateVerification:
         return not self.inputs and not self.numbers
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class CertificateCheck:
-    """Comparison of the certificate in a file with a run, or with a plant or system, whose file is `run`."""
+    """Comparison of a stored certificate with a run, or with a plant or system, whose file is `run`."""
 
     JSON: ClassVar = (
         "file run same=found.same inputs=found.inputs numbers=found.numbers software=found.software"
@@ -221,34 +287,42 @@ class CertificateCheck:
     file: str
     run: str
     found: CertificateVerification
+    stored: StoredCertificate
+
+    def __repr__(self) -> str:
+        return f"CertificateCheck({self.file}: {'the same' if self.found.same else 'differs'}, {self.run})"
 
 
 def compared(
-    document: Mapping[str, Any], inputs: Mapping[str, Any], packages: Sequence[str] = ()
+    stored: StoredCertificate, inputs: Mapping[str, Any], packages: Sequence[str] = ()
 ) -> CertificateVerification:
     """Compare a certificate with the present inputs, and with the present versions of packages.
 
     Raises:
-        KeyError, TypeError, ValueError: the document is no certificate.
+        ValueError: its numbers are no counts of drives.
     """
+    claim = Claim(
+        stored.share,
+        stored.confidence,
+        0.0 if stored.shift is None else parse_shift(stored.shift),
+        stored.sequential,
+    )
     return CertificateVerification(
-        _different(document["inputs"], inputs),
-        (*wrong_numbers(document), *_wrong_seeds(document)),
-        _different(document["versions"], versions(*packages)),
+        _different(stored.inputs, inputs),
+        (*wrong_numbers(stored.overall, stored.requirements, claim, stored.answer), *_wrong_seeds(stored)),
+        _different(stored.versions, versions(*packages)),
     )
 
 
-def _wrong_seeds(document: Mapping[str, Any]) -> tuple[str, ...]:
+def _wrong_seeds(stored: StoredCertificate) -> tuple[str, ...]:
     """The entry of the seeds, if they do not give as many drives as a certificate counts or leaves out."""
-    conditions, drives = document["conditions"], int(document["overall"]["drives"])
-    seeds = sum(int(last) - int(first) + 1 for first, last in conditions["seeds"])
-    expected = seeds if "kind" in document else seeds * int(conditions["agents"])
-    left_out = int(document.get("left_out", 0))
-    apart = all(int(a[1]) < int(b[0]) for a, b in pairwise([*conditions["seeds"]]))
-    if "left_out" not in document and "kind" in document:  # certificates did not count them at first
+    ranges, drives = stored.conditions.seeds, stored.overall.drives
+    expected = sum(last - first + 1 for first, last in ranges) * stored.conditions.agents
+    left_out = stored.left_out or 0
+    if stored.left_out is None and stored.kind is not None:  # certificates did not count them at first
         left_out = max(expected - drives, 0)
-    given = apart and left_out >= 0 and drives + left_out == expected
-    return () if given else ("conditions.seeds",)
+    apart = all(one[1] < other[0] for one, other in pairwise(ranges))
+    return () if apart and drives + left_out == expected else ("conditions.seeds",)
 
 
 def _different(then: Mapping[str, Any], present: Mapping[str, Any]) -> tuple[Difference, ...]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,19 +31,17 @@ from stlc.assurance.conformal import (
     calibrate_online,
     drives_for_bound,
     lower_bound,
-    parse_shift,
     tolerance_bound,
 )
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.compile.semantics.tolerance import Status, overall
-from stlc.jsontext import Num
+from stlc.jsontext import Count, Num
 from stlc.monitor.judgement import RequirementVerdict, Verdict
 
-FORMAT = "stlc-certificate/1"
+FORMAT: Literal["stlc-certificate/1"] = "stlc-certificate/1"
 ALL = "all requirements"
 Noun: TypeAlias = Literal["world", "drive", "trace", "simulation"]
-Count: TypeAlias = Annotated[int, 0]
 Answer: TypeAlias = Literal["certified", "refuted", "undecided", "measured"]
 _AGREE = 1e-9
 """Largest difference of a recomputed bound that counts as rounding."""
@@ -604,37 +602,48 @@ def _units(noun: Noun, most: int) -> Iterator[str]:
 # ---------------------------------------------------------------------- certificate files
 
 
-def wrong_numbers(document: Mapping[str, Any]) -> list[str]:
+@dataclass(frozen=True, slots=True)
+class StoredStatement:
+    """Bounds on one requirement in a certificate, as far as they are compared."""
+
+    name: str
+    drives: Count
+    units: Count
+    satisfied: Count
+    undecided: Count
+    whole_units: Count
+    share: Num
+    lower: Num
+    upper: Num
+    interval: tuple[Num, Num]
+    lower_any_time: Num
+    lower_deployed: Num
+    upper_deployed: Num
+    whole_units_lower: Num
+    observed: list[tuple[float, Count]]
+    observed_high: list[tuple[float, Count]]
+    lower_fixed: Num | None = None
+
+
+def wrong_numbers(
+    overall: StoredStatement, requirements: Sequence[StoredStatement], claim: Claim, answer: str
+) -> list[str]:
     """Bounds in a certificate that do not follow from its counts, such as `overall.lower`.
 
-    Args:
-        document: content of a certificate file.
-
     Raises:
-        KeyError, TypeError, ValueError: the document is no certificate.
+        ValueError: its numbers are no counts of drives.
     """
-    confidence, any_time = float(document["confidence"]), bool(document["sequential"])
-    claim = Claim(
-        None if document["share"] is None else float(document["share"]),
-        confidence,
-        0.0 if document["shift"] is None else parse_shift(str(document["shift"])),
-        any_time,
-    )
     wrong = []
-    overall = document["overall"]
-    for place, each in (
-        ("overall", overall),
-        *((str(each["name"]), each) for each in document["requirements"]),
-    ):
-        low, high = (_tally(each[name]) for name in ("observed", "observed_high"))
-        expected = _expected(low, high, int(overall["drives"]), claim)
-        wrong += [f"{place}.{name}" for name, values in expected.items() if not _agree(each[name], values)]
-    lower, upper = float(overall["lower_deployed"]), float(overall["upper_deployed"])
-    answer = "certified" if claim.share is not None and lower >= claim.share else "undecided"
-    answer = "refuted" if answer == "undecided" and upper < (claim.share or 0.0) else answer
-    if document["answer"] != ("measured" if claim.share is None else answer):
-        wrong.append("answer")
-    return wrong
+    for place, each in [("overall", overall), *((each.name, each) for each in requirements)]:
+        expected = _expected(_tally(each.observed), _tally(each.observed_high), overall.drives, claim)
+        wrong += [
+            f"{place}.{name}" for name, value in expected.items() if not _agree(getattr(each, name), value)
+        ]
+    expected_answer = "measured"
+    if claim.share is not None:
+        certified, refuted = overall.lower_deployed >= claim.share, overall.upper_deployed < claim.share
+        expected_answer = "certified" if certified else "refuted" if refuted else "undecided"
+    return wrong if answer == expected_answer else [*wrong, "answer"]
 
 
 def _expected(low: Tally, high: Tally, drives: int, claim: Claim) -> dict[str, float | Bounds | None]:
@@ -672,12 +681,11 @@ def _agree(given: Any, expected: float | Bounds | None) -> bool:
     return abs(float(given) - expected) <= _AGREE * max(1.0, abs(expected))
 
 
-def _tally(pairs: Sequence[Sequence[float]]) -> Tally:
+def _tally(pairs: Sequence[tuple[float, int]]) -> Tally:
     values, counts = zip(*pairs, strict=True)
-    whole = np.array([int(count) for count in counts], dtype=np.int64)
-    if len(whole) > MOST_VALUES or (whole < 0).any() or not 0 < float(whole.sum(dtype=float)) <= MOST_UNITS:
+    if len(counts) > MOST_VALUES or not 0 < sum(counts) <= MOST_UNITS:
         raise ValueError("these are no counts of drives")
     given = np.array([float(value) for value in values])
     if not bool(((given >= 0.0) & (given <= 1.0)).all()):
         raise ValueError("an observation is outside of [0, 1]")
-    return Tally(given, whole)
+    return Tally(given, np.array(counts, dtype=np.int64))

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from stlc.assurance.campaign import CertificateVerification, compared, seed_ranges
+from stlc.assurance.campaign import CertificateVerification, StoredCertificate, compared, seed_ranges
 from stlc.assurance.certificate import Judged, Sample, together
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
@@ -20,6 +20,7 @@ from stlc.compile.frontend.modules import library_of, spec_sha256
 from stlc.compile.semantics.tolerance import satisfied, violated
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parser import parse
+from stlc.jsontext import Count
 from stlc.monitor.judgement import chosen
 from stlc.plants.declaration import PlantDecl, load_plant_decl
 from stlc.provenance import sha256
@@ -88,21 +89,18 @@ class PlantDraws:
             sample = _sample(rules, [_judged(run, rule) for rule in rules])
             yield sample.in_scope(np.array([run.verdict is None or run.verdict.in_scope > 0]))
 
-    def record(self, seeds: Sequence[int]) -> dict[str, Any]:
-        """Entries of the certificate on the plant, its files, its failures, and the conditions."""
+    def record(self, seeds: Sequence[int]) -> CertifiedDraws:
+        """Record of the plant in the certificate, its files, its failures, and the conditions."""
         decl, monitor = self.judge.plant.decl, self.judge.monitor
         shown = self.findings[:MOST_FINDINGS]
         found = [FailedDraw(e.seed, e.reason, e.message, e.time, dict(e.point)) for e in shown]
-        return {
-            "kind": "plant",
-            "spec": monitor.compiled.name,
-            "spec_file": str(self.spec),
-            "system": decl.name,
-            "system_file": str(decl.path),
-            "inputs": plant_inputs(monitor.spec, decl),
-            "conditions": _conditions(self.overrides, self.require, seeds),
-            "findings": {"count": len(self.findings), "first": found},
-        }
+        return CertifiedDraws(
+            "plant",
+            *(monitor.compiled.name, self.spec, decl.name, decl.path),
+            plant_inputs(monitor.spec, decl),
+            DrawnConditions(self.overrides, self.require, seed_ranges(seeds)),
+            CertifiedFindings(len(self.findings), tuple(found)),
+        )
 
     def close(self) -> None:
         """End the processes of the plant."""
@@ -164,20 +162,17 @@ class ModelDraws:
     def _evaluated(rules: Sequence[CompiledRequirement], columns: Mapping[str, Any]) -> Sequence[Any]:
         return evaluate([rule.formula for rule in rules], columns, ops=NUMPY)
 
-    def record(self, seeds: Sequence[int]) -> dict[str, Any]:
-        """Entries of the certificate on the system, its files, and the conditions."""
+    def record(self, seeds: Sequence[int]) -> CertifiedDraws:
+        """Record of the system in the certificate, its files, and the conditions."""
         task = self.simulator.task
         decl = task.system.decl
-        return {
-            "kind": "system",
-            "spec": task.compiled.name,
-            "spec_file": str(self.spec),
-            "system": decl.name,
-            "system_file": str(decl.path),
-            "inputs": system_inputs(task.compiled.spec, decl.path, self.overrides),
-            "conditions": _conditions(self.overrides, self.require, seeds),
-            "findings": {"count": 0, "first": []},
-        }
+        return CertifiedDraws(
+            "system",
+            *(task.compiled.name, self.spec, decl.name, decl.path),
+            system_inputs(task.compiled.spec, decl.path, self.overrides),
+            DrawnConditions(self.overrides, self.require, seed_ranges(seeds)),
+            CertifiedFindings(0, ()),
+        )
 
     def close(self) -> None:
         """Do nothing: the system is simulated in this process."""
@@ -194,8 +189,35 @@ class FailedDraw:
     point: dict[str, float]
 
 
-def _conditions(overrides: Mapping[str, str], require: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
-    return {"overrides": dict(overrides), "require": list(require), "seeds": seed_ranges(seeds)}
+@dataclass(frozen=True, slots=True)
+class CertifiedFindings:
+    """Number of failed simulations, and the first of them."""
+
+    count: Count
+    first: tuple[FailedDraw, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnConditions:
+    """Options of the simulations of a plant or system; seeds are ranges [first, last]."""
+
+    overrides: Mapping[str, str]
+    require: Sequence[str]
+    seeds: Sequence[Sequence[int]]
+
+
+@dataclass(frozen=True, slots=True)
+class CertifiedDraws:
+    """Plant or system of a certificate; the inputs are hashes of its files and of the specification."""
+
+    kind: Literal["plant", "system"]
+    spec: str
+    spec_file: Path
+    system: str
+    system_file: Path
+    inputs: dict[str, str]
+    conditions: DrawnConditions
+    findings: CertifiedFindings
 
 
 def _sample(rules: Sequence[CompiledRequirement], judged: Sequence[Judged]) -> Sample:
@@ -244,26 +266,24 @@ def _file_hash(path: Path) -> str:
     return sha256(path.read_bytes()) if path.is_file() else MISSING
 
 
-def verify_draws(
-    document: Mapping[str, Any], spec: str | None, system: str | None
-) -> CertificateVerification:
+def verify_draws(stored: StoredCertificate, spec: str | None, system: str | None) -> CertificateVerification:
     """Compare a certificate with the present files of its specification and of its plant or system.
 
     Nothing is simulated, and nothing that the files name is run.
 
     Args:
-        document: content of the certificate.
+        stored: content of the certificate.
         spec: path of the specification; by default the one that the certificate names.
         system: path of the plant file or system file; by default the one that the certificate names.
 
     Raises:
-        KeyError, TypeError, ValueError: the document is no certificate.
+        ValueError: its numbers are no counts of drives.
         UsageError, SpecError, SystemFileError: a file is missing or invalid.
     """
-    text = parse(read_source(find_spec(spec or str(document["spec_file"]))))
-    named = Path(system or str(document["system_file"]))
-    if document["kind"] == "plant":
+    text = parse(read_source(find_spec(spec or stored.spec_file)))
+    named = Path(system or stored.system_file)
+    if stored.kind == "plant":
         decl = load_plant_decl(named)
-        return compared(document, plant_inputs(text, decl), decl.packages)
-    changed = {str(name): str(value) for name, value in document["conditions"]["overrides"].items()}
-    return compared(document, system_inputs(text, find_system(str(named), Path(text.source.name)), changed))
+        return compared(stored, plant_inputs(text, decl), decl.packages)
+    found = find_system(str(named), Path(text.source.name))
+    return compared(stored, system_inputs(text, found, stored.conditions.overrides))

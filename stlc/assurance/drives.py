@@ -8,19 +8,28 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from stlc.assurance.campaign import CertificateVerification, compared, seed_ranges
+from stlc.assurance.campaign import (
+    CertificateVerification,
+    CertifiedConditions,
+    CertifiedDrives,
+    CertifiedInputs,
+    StoredCertificate,
+    compared,
+    seed_ranges,
+)
 from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.tolerance import satisfied, violated
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
+from stlc.controller.deployment.simulator import Recorder, Setting, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.guard import Guard
 from stlc.controller.run.checkpoint import FOLDER, POINTER, CheckpointHead
-from stlc.controller.run.run import CONFIG, Run, declaration_of_run, spec_hash, system_hash
+from stlc.controller.run.run import CONFIG, declaration_of_run, spec_hash, system_hash
 from stlc.controller.world import independent_agents, world_type
 from stlc.dynamics.functions import function_files
+from stlc.jsontext import plain
 from stlc.monitor.judgement import chosen
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
@@ -29,7 +38,9 @@ from stlc.rundir import MOST_ARRAYS, RunDir
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from stlc.controller.deployment.simulator import DeploymentRecording, Watch
     from stlc.controller.problem.task import Task
+    from stlc.controller.run.run import Run
     from stlc.dynamics.declaration.decl import SystemDecl
 
 ROWS = 1000
@@ -156,28 +167,23 @@ class PolicyDrives:
             assert recording is not None
             yield sample_of(task, recording, self.rules, self.require)
 
-    def record(self, seeds: Sequence[int]) -> dict[str, Any]:
-        """Entries of the certificate on the run, and on how its policy was deployed."""
+    def record(self, seeds: Sequence[int]) -> CertifiedDrives:
+        """Record of the run in the certificate, and of how its policy was deployed."""
         run, setting = self.run, self.setting
         scenario = run.task.system.decl.scenario
-        return {
-            "run": run.dir.shown,
-            "spec": run.task.compiled.name,
-            "system": run.task.system.decl.name,
-            "inputs": inputs_of(run.dir, run.task.system.decl, self.rules, self.guard),
-            "conditions": {
-                "guard": self.guard,
-                "scenario": None if scenario is None else scenario.name,
-                "overrides": dict(self.overrides),
-                "require": list(self.require),
-                "margin": dict(setting.margin),
-                "time_limit": setting.limit if GUARDS.get(self.guard).timed else setting.paper_limit,
-                "agents": setting.agents,
-                "steps": setting.steps,
-                "replan": setting.replan,
-                "seeds": seed_ranges(seeds),
-            },
-        }
+        conditions = CertifiedConditions(
+            self.guard,
+            None if scenario is None else scenario.name,
+            self.overrides,
+            self.require,
+            setting.margin,
+            setting.limit if GUARDS.get(self.guard).timed else setting.paper_limit,
+            *(setting.agents, setting.steps, setting.replan),
+            seed_ranges(seeds),
+        )
+        decl = run.task.system.decl
+        inputs = inputs_of(run.dir, decl, self.rules, self.guard)
+        return CertifiedDrives(run.dir.shown, run.task.compiled.name, decl.name, inputs, conditions)
 
     def close(self) -> None:
         """Do nothing: drives have no processes of their own."""
@@ -186,16 +192,8 @@ class PolicyDrives:
 # ---------------------------------------------------------------------- verification
 
 
-def inputs_of(
-    folder: RunDir, decl: SystemDecl, rules: Rules | None, guard: str
-) -> dict[str, str | int | None]:
-    """Hashes and versions of everything that the drives of a run depend on, beside their conditions.
-
-    `spec`, `system`: files in the folder of the run, with imports and the changes of the training.
-    `functions`: files that the system file names. `rules`: the specification of drives with its imports and
-    changes, None if there is none. `world`: the file of the world, None for the model. `policy`: the
-    checkpoint and the options of the method. `guard_version`: raised with every change of the guard's
-    decisions.
+def inputs_of(folder: RunDir, decl: SystemDecl, rules: Rules | None, guard: str) -> CertifiedInputs:
+    """Return the present inputs of the drives of a run.
 
     Raises:
         UsageError: U101, there is no guard called `guard`.
@@ -203,33 +201,31 @@ def inputs_of(
     files = sorted(function_files(decl).items())
     judge = "" if rules is None else spec_sha256(rules.spec.source.text, rules.spec.library or {})
     changes = [] if rules is None else sorted(rules.overrides.items())
-    return {
-        "spec": spec_hash(folder),
-        "system": system_hash(folder),
-        "functions": sha256("\0".join(f"{name} {sha256(path.read_bytes())}" for name, path in files)),
-        "rules": None if rules is None else sha256(f"{judge} {changes}"),
-        "world": None if decl.test.world is None else sha256(decl.test.world.path.read_bytes()),
-        "policy": _policy(folder),
-        "guard_version": GUARDS.get(guard).version,
-    }
+    return CertifiedInputs(
+        spec_hash(folder),
+        system_hash(folder),
+        functions=sha256("\0".join(f"{name} {sha256(path.read_bytes())}" for name, path in files)),
+        rules=None if rules is None else sha256(f"{judge} {changes}"),
+        world=None if decl.test.world is None else sha256(decl.test.world.path.read_bytes()),
+        policy=_policy(folder),
+        guard_version=GUARDS.get(guard).version,
+    )
 
 
-def verify(document: Mapping[str, Any], folder: RunDir) -> CertificateVerification:
+def verify(stored: StoredCertificate, folder: RunDir) -> CertificateVerification:
     """Compare a certificate with the present state of a run's folder and of the software.
 
     The policy is not loaded, so that a changed checkpoint is a difference and not an error.
 
     Raises:
-        KeyError, TypeError, ValueError: the document is no certificate.
+        ValueError: its numbers are no counts of drives.
         UsageError: U101, there is no such guard.
         SpecError, SystemFileError, RunError: the folder is damaged.
     """
-    conditions = document["conditions"]
-    changed = {str(name): str(text) for name, text in conditions["overrides"].items()}
-    scenario = conditions["scenario"]
-    decl = declaration_of_run(folder, changed, None if scenario is None else str(scenario))
-    present = inputs_of(folder, decl, rules_for(folder, decl), str(conditions["guard"]))
-    return compared(document, present)
+    conditions = stored.conditions
+    decl = declaration_of_run(folder, conditions.overrides, conditions.scenario)
+    present: Any = plain(inputs_of(folder, decl, rules_for(folder, decl), conditions.guard))
+    return compared(stored, present)
 
 
 def _policy(folder: RunDir) -> str:

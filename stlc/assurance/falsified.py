@@ -62,9 +62,14 @@ class FalsifiedFinding:
     replay: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class FalsifiedSystem:
-    """Searches for violations of the requirements of a system or run; failures are those of a plant."""
+    """Searches for violations of the requirements of a system or run; failures are those of a plant.
+
+    `lost` simulations were lost with their processes, for `reasons`.
+    """
+
+    JSON: ClassVar = "target simulations seed coordinates failures findings requirements lost"
 
     target: str
     simulations: int
@@ -74,6 +79,11 @@ class FalsifiedSystem:
     findings: tuple[FalsifiedFinding, ...]
     requirements: tuple[FalsifiedRequirement, ...]
     lost: int
+    reasons: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        each = (f"{each.search.requirement} {each.verdict}" for each in self.requirements)
+        return f"FalsifiedSystem({self.target}: {', '.join(each)})"
 
     @property
     def violated(self) -> bool:
@@ -97,11 +107,14 @@ class ReplayedCounterexample:
 class ReplayedFinding:
     """Failed simulation of a plant that was simulated again; without a reason if it gives a trace now."""
 
+    JSON: ClassVar = "reason message time stored_reason identical"
+
     reason: str | None
     message: str | None
     time: float | None
     stored_reason: str
     identical: bool
+    stderr: str = ""
 
 
 # ---------------------------------------------------------------------- files

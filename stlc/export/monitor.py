@@ -32,7 +32,7 @@ _ROW, _RULE, _HEAD = 24, 136, 128
 """Bytes of a gap, of the verdicts of a requirement and of the head of a state, at most."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class ExportedMonitor:
     """Result of the export of a monitor.
 
@@ -51,6 +51,14 @@ class ExportedMonitor:
     folder: Path
     files: tuple[str, ...]
     bytes: int
+
+    def __repr__(self) -> str:
+        return f"ExportedMonitor({self.spec} as {self.target}: {len(self.files)} files in {self.folder})"
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on the export."""
+        return (f"the state takes {self.bytes:,} bytes",)
 
 
 def export_monitor(monitor: Monitor, folder: Path, *, single: bool = False) -> ExportedMonitor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
@@ -48,7 +48,7 @@ GUARDED = 16
 """Number of random states in which its backup policy is verified."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Exported:
     """Result of an export.
 
@@ -61,6 +61,7 @@ class Exported:
         agreement: comparison with the run; None if the export could not be verified.
         latency: decision time of the Python runtime; None if it was not measured.
         unchecked: reason why the export could not be verified; "" if it was verified.
+        precision: numbers of the export.
     """
 
     JSON: ClassVar = "run target folder files kept checked=agreement latency"
@@ -73,6 +74,30 @@ class Exported:
     latency: Latency | None = None
     unchecked: str = ""
     kept: tuple[str, ...] = ()
+    precision: Precision = "float64"
+
+    def __repr__(self) -> str:
+        return f"Exported({self.run} as {self.target}: {len(self.files)} files in {self.folder})"
+
+    @property
+    def remarks(self) -> Iterator[str]:
+        """Sentences on the comparison with the run, on the decision time, and on files that were kept."""
+        found, taken = self.agreement, self.latency
+        if found is None:
+            yield f"not checked: {self.unchecked}"
+        else:
+            yield (
+                f"checked in {found.states} random states, the backup policy in {found.guarded}: "
+                f"plans within {found.plan:.1e} of a range, robustness within {found.rho:.1e}"
+                f"{'' if self.precision == 'float64' else ', in float32'}"
+            )
+        if taken is not None:
+            yield (
+                f"decides in {taken.median:.2f} ms, 99 % within {taken.p99:.2f} ms: "
+                "one agent, one thread, stlc.runtime"
+            )
+        for name in self.kept:
+            yield f"kept {self.folder / name}, which was there and differs"
 
 
 def target_of(word: str) -> Target:
@@ -125,7 +150,7 @@ def export(run: Run, target: Target, folder: Path, precision: Precision = "float
         files = tuple(name for name in texts if name not in kept)
         for name in files:
             write_atomic(place(folder, name), texts[name])
-    return Exported(run.dir.shown, target, folder, files, found, latency, unchecked, kept)
+    return Exported(run.dir.shown, target, folder, files, found, latency, unchecked, kept, precision)
 
 
 def _differs(path: Path, content: bytes) -> bool:

@@ -18,7 +18,7 @@ from stlc.monitor.judgement import Verdict
 from stlc.monitor.signals import arrange, needs_of
 from stlc.monitor.streamed import verdict_of
 from stlc.monitor.verdict import Monitor
-from stlc.plants.plant import Plant, PlantFinding, load_plant
+from stlc.plants.plant import Plant, PlantFinding, PlantVariable, load_plant
 from stlc.trace import Trace
 from stlc.version import __version__
 
@@ -82,7 +82,7 @@ class JudgedRun:
         return tuple(found)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class PlantSimulation:
     """Simulations of a plant, and their verdicts.
 
@@ -95,6 +95,7 @@ class PlantSimulation:
         streamed: whether simulations were judged while they ran.
         trace: file of the traces; None if they were not written.
         runs: the simulations.
+        variables: variables of the plant, in the order of points.
     """
 
     JSON: ClassVar = (
@@ -109,6 +110,11 @@ class PlantSimulation:
     streamed: bool
     trace: str | None
     runs: tuple[JudgedRun, ...]
+    variables: tuple[PlantVariable, ...] = ()
+
+    def __repr__(self) -> str:
+        satisfied = f"{self.satisfied} of {len(self.runs)} simulations satisfy every requirement"
+        return f"PlantSimulation({self.spec} on {self.plant}: {satisfied})"
 
     def count(self, outcome: str) -> int:
         """Number of simulations with an outcome."""

@@ -2,27 +2,46 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
-from stlc.controller.training.launch import train_here
-from stlc.controller.training.loop import Watch
+from stlc.controller.training.config import TrainConfig
+from stlc.controller.training.launch import open_folder
+from stlc.controller.training.loop import Watch, prepare, run
+from stlc.controller.training.options import TrainOptions
+from stlc.diagnostics import usage
+from stlc.options import given, taking
 
 
-def train(task: Task, *, progress: bool = True, **options: Any) -> Run:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShownTraining(TrainOptions):
+    """Options of a training, and whether a bar shows its progress, in a terminal or a notebook only."""
+
+    progress: bool = True
+
+
+@taking(ShownTraining)
+def train(task: Task, options: ShownTraining) -> Run:
     """Train a policy in a new folder below `runs/` and return the run.
 
     Args:
         task: problem to train for; see `stlc.compile`.
-        progress: whether a bar is shown; in a terminal or a notebook only.
-        options: arguments of `stlc.controller.training.launch.train_here`: `budget` in seconds, `steps`,
-            `seed`, `method`, and the fields of `stlc.controller.training.config.TrainConfig`.
+        options: fields of `stlc.controller.training.options.TrainOptions`, such as `budget` in seconds,
+            `steps`, `seed` and `method`; and `progress`, False for no bar.
 
     Raises:
         UsageError: U101, `budget` is not a positive number, `steps` is below 1, `seed` is negative, or there
             is no such method.
     """
+    chosen = given(options)
+    progress, budget, steps, seed = (chosen.pop("progress"), options.budget, options.steps, options.seed)
+    if budget is not None and not 0.0 < budget < math.inf:
+        raise usage(f"a training time of {budget} s is not a positive number")
+    if (isinstance(steps, int) and steps < 1) or (seed is not None and seed < 0):
+        raise usage("a training has at least 1 step, and its seed is at least 0")
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -37,4 +56,5 @@ def train(task: Task, *, progress: bool = True, **options: Any) -> Run:
             bar.update(shown, completed=found["step"] / max(found["steps"], 1), told=told)
 
         watch = Watch(row=row, evaluating=lambda text: bar.update(shown, told=text))
-        return train_here(task, watch=watch, **options)
+        config = TrainConfig(**chosen)
+        return run(prepare(task, config), open_folder(task, config), watch).run

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,12 +17,14 @@ from stlc.assurance.certificate import (
     Judged,
     Noun,
     Sample,
+    StoredStatement,
     assess,
     joined,
     together,
     wrong_numbers,
 )
 from stlc.jsontext import plain
+from stlc.records import read
 
 
 def judged(robustness: list[float], name: str = "near") -> Judged:
@@ -85,7 +89,9 @@ def test_a_certificate_is_consistent(
 ) -> None:
     units = [index // 2 for index in range(len(values))]
     found = assess(sample(values, units, "world"), Claim(share, shift=shift, any_time=any_time))
-    assert wrong_numbers(plain(found)) == []  # type: ignore[arg-type]
+    document: Any = plain(found)
+    whole, *each = (read(StoredStatement, one) for one in (document["overall"], *document["requirements"]))
+    assert wrong_numbers(whole, each, found.claim, document["answer"]) == []
     bounds = found.overall.shares
     assert 0 <= bounds.interval.low <= bounds.lower <= bounds.upper <= bounds.interval.high <= 1
     assert found.overall.deployed <= bounds.lower

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,12 +10,12 @@ import typer
 from stlc.diagnostics import usage
 from stlc.escape import visible
 from stlc.jsontext import plain
-from stlc.registry import GUARDS
+from stlc.options import checked_share
+from stlc.units import floored, raised
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment
 
-GuardOption = Annotated[str, typer.Option(metavar="|".join(GUARDS.installed), help="Guard of the policy.")]
 CertifyOption = Annotated[
     float | None,
     typer.Option(
@@ -26,13 +25,6 @@ CertifyOption = Annotated[
         "is at least SHARE.",
     ),
 ]
-
-
-def checked_share(option: str, share: float) -> float:
-    """Return a share between 0 and 1, the value of `option`; any other number raises UsageError (U101)."""
-    if not 0.0 < share < 1.0:
-        raise usage(f"`{option} {share:g}` is not between 0 and 1", f"{option} .99")
-    return share
 
 
 def require_claim(share: float | None, fail_under: float | None) -> None:
@@ -138,16 +130,6 @@ def percent(share: float) -> str:
     if 0.0 < share < 1.0 and text in ("0", "100"):
         text = "< 0.01" if share < 0.5 else "> 99.99"
     return f"{text} %"
-
-
-def floored(share: float) -> str:
-    """Format a lower bound on a share, rounded down to two decimals of a percent."""
-    return f"{math.floor(1e4 * share + 1e-9) / 100:.2f} %"
-
-
-def raised(share: float) -> str:
-    """Format an upper bound on a share, rounded up to two decimals of a percent."""
-    return f"{math.ceil(1e4 * share - 1e-9) / 100:.2f} %"
 
 
 def robustness(value: float | str, unit: str) -> str:

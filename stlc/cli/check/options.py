@@ -10,18 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import typer
 
-from stlc.cli.framework.options import (
-    RequireOption,
-    RunsOption,
-    SetOption,
-    SystemOption,
-    parse_overrides,
-    parse_pairs,
-)
+from stlc.cli.framework.options import RequireOption, SetOption
 from stlc.compile.semantics.tolerance import TOLERANCE, End
 from stlc.diagnostics import usage
 from stlc.escape import operand
 from stlc.monitor.check import Question, seconds_of
+from stlc.options import Runs, SystemName, parse_overrides, parse_pairs
 from stlc.registry import SEMANTICS
 
 if TYPE_CHECKING:
@@ -32,57 +26,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """Command-line options that say how traces are read and judged."""
+    """Command-line options that say how traces are read and judged.
 
-    spec: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The specification, instead of the trace's own.")
-    ] = None
-    system: SystemOption = None
+    Attributes:
+        spec (FILE): The specification, instead of the trace's own.
+        map_ (SIGNAL=NAME): A signal's name in the trace; t is the clock.
+        resample (TIME): Judge on a grid of this step; every recorded sample counts.
+        between (SIGNAL=HOW): Values between samples: hold, hold:0.5s (older is unknown), linear or angle.
+        max_gap (TIME): In longer gaps signals are unknown; by default three steps with --resample, else
+            no gap.
+        dt (TIME): Time between samples that have no clock, as 10ms.
+        clock (NAME[:UNIT]): The clock and its unit: timestamp:us, header.stamp, frame:frames.
+        fps (N): Frames per second, for a clock that counts frames.
+        group (NAME): Column that tells objects apart, a trace each; none: one trace.
+        columns (NAMES): Names of the columns of a table without a header.
+    """
+
+    spec: Path | None = None
+    system: SystemName = None
     set_: SetOption = None
     require: RequireOption = None
-    map_: Annotated[
-        list[str] | None,
-        typer.Option("--map", metavar="SIGNAL=NAME", help="A signal's name in the trace; t is the clock."),
-    ] = None
-    resample: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="Judge on a grid of this step; every recorded sample counts."),
-    ] = None
-    between: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SIGNAL=HOW",
-            help="Values between samples: hold, hold:0.5s (older is unknown), linear or angle.",
-        ),
-    ] = None
-    max_gap: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="In longer gaps signals are unknown.",
-            show_default="three steps with --resample, else no gap",
-        ),
-    ] = None
-    dt: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Time between samples that have no clock, as 10ms.")
-    ] = None
-    clock: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME[:UNIT]", help="The clock and its unit: timestamp:us, header.stamp, frame:frames."
-        ),
-    ] = None
-    fps: Annotated[
-        float | None, typer.Option(metavar="N", help="Frames per second, for a clock that counts frames.")
-    ] = None
-    group: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Column that tells objects apart, a trace each; none: one trace."),
-    ] = None
-    columns: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Names of the columns of a table without a header.")
-    ] = None
-    runs: RunsOption = Path("runs")
+    map_: list[str] | None = None
+    resample: str | None = None
+    between: list[str] | None = None
+    max_gap: str | None = None
+    dt: str | None = None
+    clock: str | None = None
+    fps: float | None = None
+    group: str | None = None
+    columns: str | None = None
+    runs: Runs = Path("runs")
 
     def words(self) -> dict[str, tuple[str, ...]]:
         """The options as they were given: name -> the values of all occurrences, "" for a switch."""
@@ -156,35 +129,27 @@ TRACES = Traces()
 
 @dataclass(frozen=True, slots=True)
 class Judging(Traces):
-    """Options of `stlc check` on reading and judging, with which its result can be made again."""
+    """Options of `stlc check` on reading and judging, with which its result can be made again.
 
-    uncertain: Annotated[
-        list[str] | None,
-        typer.Option(metavar="SIGNAL=ERROR", help="Greatest error of each sample, as x=0.1m or v=2%."),
-    ] = None
-    at: Annotated[
-        str | None,
-        typer.Option(metavar="0|all|K|TIME", help="Judge at this sample or time, or at all starts."),
-    ] = None
-    end: Annotated[End, typer.Option(help="If the trace is too short: bounds, an error, or cut windows.")] = (
-        "open"
-    )
-    tolerance: Annotated[
-        float, typer.Option(help="A robustness of at least minus this is satisfied; 0: `>` is not `>=`.")
-    ] = TOLERANCE
+    Attributes:
+        uncertain (SIGNAL=ERROR): Greatest error of each sample, as x=0.1m or v=2%.
+        at (0|all|K|TIME): Judge at this sample or time, or at all starts.
+        end: If the trace is too short: bounds, an error, or cut windows.
+        tolerance: A robustness of at least minus this is satisfied; 0: `>` is not `>=`.
+        strict: Times at which signals were not seen are unknown; 4 if a requirement was not fully judged.
+    """
+
+    uncertain: list[str] | None = None
+    at: str | None = None
+    end: End = "open"
+    tolerance: float = TOLERANCE
     semantics: Annotated[
         str,
         typer.Option(
             metavar="NAME", help=f"Reported robustness: {', '.join(SEMANTICS.names)}. Verdicts are exact."
         ),
     ] = "exact"
-    strict: Annotated[
-        bool,
-        typer.Option(
-            "--strict",
-            help="Times at which signals were not seen are unknown; 4 if a requirement was not fully judged.",
-        ),
-    ] = False
+    strict: bool = False
 
     def question(self, **more: Any) -> Question:
         """Return the options as a `Question`. Raises UsageError (U101) if one is malformed."""

@@ -15,19 +15,14 @@ import typer
 from stlc.activity import PULSE
 from stlc.cli.certify.text import CertifyOption, bounds_lines, require_claim
 from stlc.cli.check import options as given
-from stlc.cli.framework.options import (
-    ClusterOption,
-    FailUnderOption,
-    JsonOption,
-    require_no_jobs,
-    require_separate,
-)
+from stlc.cli.framework.options import FailUnderOption, JsonOption, require_separate
 from stlc.cli.framework.output import QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import visible
 from stlc.files import SPEC_SUFFIXES, STDIN, has_wildcard, matching_traces, real, write_atomic
 from stlc.jsontext import plain
+from stlc.options import Cluster, require_no_jobs
 
 if TYPE_CHECKING:
     from io import BufferedReader
@@ -81,7 +76,7 @@ def check(
     jobs: Annotated[
         int, typer.Option("--jobs", "-j", min=0, help="Number of processes; 0: one per core.")
     ] = 1,
-    cluster: ClusterOption = None,
+    cluster: Cluster = None,
     chunk: Annotated[
         int,
         typer.Option(

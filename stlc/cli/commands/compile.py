@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SetOption, SystemOption, parse_overrides
+from stlc.cli.framework.options import JsonOption, SetOption
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
+from stlc.options import SystemName, parse_overrides
 
 if TYPE_CHECKING:
     from stlc.cli.framework.documents import ParsedFile, ParsedFiles
@@ -28,7 +29,7 @@ def compile_(
     files: Annotated[
         list[str], typer.Argument(metavar="SPEC", help="The specification; for ast and dot several, or -.")
     ],
-    system: SystemOption = None,
+    system: SystemName = None,
     set_: SetOption = None,
     show: Annotated[
         Part, typer.Option("--show", metavar="PART", help="all, steps, states, ir, ast, or dot.")

@@ -60,25 +60,20 @@ def explain(
     found: Any = explained(what, guarantee=guarantee, runs=reading.runs, **options)
     match found:
         case CodeList():
-            shown = table(list(found.codes.items()), indent="")
+            return Answer(found, lambda: emit(table(list(found.codes.items()), indent="")))
         case Page():
-            shown = "\n".join([found.title, "", *_plain_lines(found.text)]).rstrip()
+            return Answer(
+                found, lambda: emit("\n".join([found.title, "", *_plain_lines(found.text)]).rstrip())
+            )
         case SpecInWords():
-            shown = "\n\n".join("\n".join(_in_words(each)) for each in found.requirements)
-            shown = shown or f"{found.spec} requires nothing"
-        case _ if guarantee:
-            shown = "\n".join(_guarantee_lines(found))
-        case _:
-            return _violations(found, talk=not json)
-    return Answer(found, lambda: emit(shown))
-
-
-def _violations(found: Explanation, *, talk: bool) -> Answer[Any]:
-    """Answer with the violations of a recording; with `talk`, remarks go to the standard error."""
+            text = "\n\n".join("\n".join(_in_words(each)) for each in found.requirements)
+            return Answer(found, lambda: emit(text or f"{found.spec} requires nothing"))
+    if guarantee:
+        return Answer(found, lambda: emit("\n".join(_guarantee_lines(found))))
     from stlc.cli.check.many import EXIT_CODES, SATISFIED
 
-    verdict = found.verdict
-    if talk:
+    verdict: Verdict = found.verdict
+    if not json:
         for line in verdict.notes:
             say(line)
         show_diagnostics(verdict.warnings)

@@ -13,17 +13,14 @@ from stlc.activity import PULSE
 from stlc.cli.framework.options import (
     FailUnderOption,
     MethodOptionsOption,
-    SeedOption,
     SetOption,
-    SystemOption,
-    parse_count,
-    parse_overrides,
     planner_choice,
     require_separate,
 )
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
+from stlc.options import Seed, SystemName, parse_count, parse_overrides
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
@@ -42,7 +39,7 @@ if TYPE_CHECKING:
 )
 def plan(
     spec: Annotated[Path, typer.Argument(metavar="SPEC", help="The specification, a .stl file.")],
-    system: SystemOption = None,
+    system: SystemName = None,
     from_: Annotated[
         str,
         typer.Option("--from", metavar="random|STATE|TRACE", help="Initial states, such as `x=1, v=2 m/s`."),
@@ -66,7 +63,7 @@ def plan(
     target: Annotated[
         str, typer.Option(metavar="RHO|max", help="Robustness at which the search ends.")
     ] = "0",
-    seed: SeedOption = 0,
+    seed: Seed = 0,
     tube: Annotated[
         str | None,
         typer.Option(

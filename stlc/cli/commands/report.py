@@ -5,19 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stlc.cli.framework.options import PythonOption, RunArgument, RunsOption
+from stlc.cli.framework.options import RunArgument
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.escape import visible
+from stlc.options import Python, Runs
 
 if TYPE_CHECKING:
     from stlc.view.report import Report
 
 
 @command("stlc report latest")
-def report(
-    run: RunArgument = "latest", python: PythonOption = False, runs: RunsOption = Path("runs")
-) -> Answer[Report]:
+def report(run: RunArgument = "latest", python: Python = False, runs: Runs = Path("runs")) -> Answer[Report]:
     """Write a self-contained report.html with the pictures of a run.
 
     The report is written to the run's folder. It shows training curves, signals with the robustness of each

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.options import RunArgument, RunsOption
+from stlc.cli.framework.options import RunArgument
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.diagnostics import StlcError, usage
 from stlc.escape import visible
+from stlc.options import Runs
 from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, every_run, remove_run
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ GROUP = group("List, show, compare and remove runs.", "stlc runs", default=_defa
 @subcommand(GROUP, "list", "stlc runs list --sort acc")
 def list_(
     sort: Annotated[Sort, typer.Option(help="Newest last, best last, or by name.")] = "time",
-    runs: RunsOption = RUNS,
+    runs: Runs = RUNS,
 ) -> Answer[documents.RunList]:
     """List all runs."""
     found = [(run, *_record(run)) for run in every_run(runs)]
@@ -56,7 +57,7 @@ def list_(
 
 
 @subcommand(GROUP, "show", "stlc runs show latest")
-def show(run: RunArgument = "latest", runs: RunsOption = RUNS) -> Answer[documents.RunContent]:
+def show(run: RunArgument = "latest", runs: Runs = RUNS) -> Answer[documents.RunContent]:
     """Show the settings and results of a run."""
     folder = RunDir.open(run, runs)
     record = folder.record()
@@ -76,7 +77,7 @@ def show(run: RunArgument = "latest", runs: RunsOption = RUNS) -> Answer[documen
 def diff(
     first: RunArgument,
     second: Annotated[str, typer.Argument(metavar="OTHER", help="The run to compare with.")] = "latest",
-    runs: RunsOption = RUNS,
+    runs: Runs = RUNS,
 ) -> Answer[documents.RunComparison]:
     """Show the differences between two runs: options, inputs, results.
 
@@ -101,7 +102,7 @@ def rm(
         list[str], typer.Argument(metavar="RUN…", help="Runs to remove.", autocompletion=run_names)
     ],
     force: Annotated[bool, typer.Option("--force", help="Also runs in progress, and damaged ones.")] = False,
-    runs: RunsOption = RUNS,
+    runs: Runs = RUNS,
 ) -> Answer[documents.RemovedRuns]:
     """Remove the folders of runs.
 

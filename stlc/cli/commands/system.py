@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import SeedOption, SetOption, parse_overrides
+from stlc.cli.framework.options import SetOption
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.escape import visible
+from stlc.options import Seed, parse_overrides
 
 if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
@@ -49,7 +50,7 @@ def check(
     steps: Annotated[
         int, typer.Option(min=0, help="Steps of the rollouts; with 0 the file is only read.")
     ] = 32,
-    seed: SeedOption = 0,
+    seed: Seed = 0,
     set_: SetOption = None,
 ) -> Answer[SystemFacts]:
     """Validate a system file with random rollouts.

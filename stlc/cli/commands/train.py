@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,26 +13,22 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.options import (
-    MOST_SEED,
-    ClusterOption,
-    JobsOption,
-    MethodOptionsOption,
-    PicturesOption,
-    RunsOption,
-    SetOption,
-    SystemOption,
-    parse_clock,
-    parse_count,
-    parse_overrides,
-    parse_pairs,
-    parse_seconds,
-    parse_seeds,
-)
+from stlc.cli.framework.options import PicturesOption, SetOption
 from stlc.cli.framework.output import Answer, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.cli.train.many import Many, train_many
+from stlc.controller.training.budget import StepSchedule
+from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, usage
+from stlc.options import (
+    Cluster,
+    Jobs,
+    Runs,
+    SystemName,
+    given,
+    parse_overrides,
+    parse_seeds,
+)
 from stlc.registry import METHODS
 from stlc.rundir import RUNS, RunDir
 
@@ -41,10 +36,12 @@ if TYPE_CHECKING:
     from stlc.cli.framework.documents import TrainedRun, TrainedRuns
     from stlc.cli.train.session import Session
     from stlc.controller.problem.task import Task
-    from stlc.controller.training.budget import StepSchedule
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
     from stlc.controller.training.tensorboard import Opener
+
+
+OPTIONS = TrainOptions()
 
 
 @command(
@@ -61,71 +58,23 @@ def train(
             metavar="SPEC", help="The specification, a .stl file; several are trained for one by one."
         ),
     ] = None,
-    system: SystemOption = None,
-    budget: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Training time, such as 5min; the steps are adapted.",
-            show_default="60s",
-        ),
-    ] = None,
-    clock: Annotated[
-        str | None,
-        typer.Option(
-            metavar="wall|processor",
-            help="Clock of the budget; processor time is that of an idle machine.",
-            show_default="wall",
-        ),
-    ] = None,
-    steps: Annotated[
-        str | None,
-        typer.Option(metavar="N", help="Steps of the optimiser instead of a budget, or a recorded schedule."),
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, max=MOST_SEED, help="Seed of everything random.", show_default="the system's"),
-    ] = None,
+    system: SystemName = None,
+    options: TrainOptions = OPTIONS,
     seeds: Annotated[
         str | None,
         typer.Option(metavar="SEEDS", help="Several runs, such as 0..2 or 0,3, in processes of their own."),
     ] = None,
-    jobs: JobsOption = 1,
-    cluster: ClusterOption = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            metavar="|".join((*METHODS.installed, "FILE.py")),
-            help="How to train, see docs/methods.md.",
-            show_default="the system's, or guided",
-        ),
-    ] = None,
-    option: MethodOptionsOption = None,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
     resume: Annotated[
         str | None,
         typer.Option(metavar="RUN", help="Go on with an interrupted run.", autocompletion=run_names),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the run.", show_default="random words")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")] = "cpu",
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads of torch.")] = None,
-    plans: Annotated[int | None, typer.Option(min=1, help="Plans that the network proposes.")] = None,
-    lr: Annotated[float | None, typer.Option(help="Peak learning rate.")] = None,
-    batch: Annotated[int | None, typer.Option(min=1, help="New states per step.")] = None,
-    held_out: Annotated[
-        int | None, typer.Option(min=1, help="Held-out starts of the verdict.", show_default="5000")
-    ] = None,
-    drives: Annotated[
-        int | None,
-        typer.Option(min=0, help="Drives after the training per guard, at most.", show_default="400"),
-    ] = None,
-    falsify: Annotated[
-        bool,
-        typer.Option("--falsify", help="Also train on the states of drives that falsification makes fail."),
-    ] = False,
     log: Annotated[
         str | None, typer.Option(metavar="tensorboard", help="Also write the curves for TensorBoard.")
     ] = None,
-    runs: RunsOption = RUNS,
+    runs: Runs = RUNS,
     pictures: PicturesOption = True,
     set_: SetOption = None,
 ) -> Answer[TrainedRun | TrainedRuns]:
@@ -135,43 +84,27 @@ def train(
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads of torch must not busy-wait
     specs = tuple(dict.fromkeys(spec or ()))
-    given = {
-        **{"--system": system, "--seed": seed, "--seeds": seeds, "--method": method, "--name": name},
-        **{"--threads": threads, "--plans": plans, "--lr": lr, "--batch": batch, "--set": set_},
-        **{"--held-out": held_out, "--drives": drives, "--cluster": cluster, "--clock": clock},
-        **{"--option": option, "--falsify": falsify or None},
-    }
-    _check_together(specs, jobs, {**given, "--budget": budget, "--steps": steps})
+    usual = TrainOptions()
+    changed = {name: value for name, value in given(options).items() if value != getattr(usual, name)}
+    if "budget" in changed and "steps" in changed:
+        raise usage("`--budget` and `--steps` contradict each other")
+    own = {"--system": system, "--seeds": seeds, "--name": name, "--set": set_, "--cluster": cluster}
     logger = _logger(log)
     if resume is not None:
-        _refuse_on_resume({"SPEC": spec or None, **given})
-        total = None if steps is None else parse_count(steps, "--steps")
-        more = None if budget is None else parse_seconds(budget)
+        if isinstance(options.steps, StepSchedule):
+            raise usage("a resumed run follows no schedule", "--steps 1200")
+        _refuse_on_resume({"SPEC": spec or None, **own}, changed)
         with one_voice():
-            session = _resume(RunDir.open(resume, runs), total, more, device, logger)
+            folder = RunDir.open(resume, runs)
+            session = _resume(folder, options.steps, options.budget, options.device, logger)
             return session.conclude(pictures=pictures)
-    from stlc.controller.run.config import DRIVES, HELD_OUT
+    _check_together(specs, jobs, {**own, "--seed": options.seed})
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
 
-    config = TrainConfig(
-        method=_method(method) if method is not None else None,
-        budget=parse_seconds(budget) if budget is not None else None,
-        steps=_steps(steps) if steps is not None else None,
-        seed=seed,
-        device=device,
-        threads=threads,
-        plans=plans,
-        lr=_rate(lr) if lr is not None else None,
-        batch=batch,
-        held_out=held_out or HELD_OUT,
-        clock=parse_clock(clock or "wall"),
-        drives=DRIVES if drives is None else drives,
-        options=parse_pairs(option, "--option", "NAME=VALUE", "environments=256"),
-        falsify=falsify,
-    )
+    config = TrainConfig(**given(options))
     launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
-    drawn = parse_seeds(seeds) if seeds is not None else (seed,)
+    drawn = parse_seeds(seeds) if seeds is not None else (options.seed,)
     if len(specs) < 2:  # errors of a single specification are reported once, before the first of several runs
         with one_voice():
             task = _task(specs, system, launch.overrides, config.method)
@@ -186,9 +119,8 @@ def _check_together(specs: Sequence[Path], jobs: int, given: Mapping[str, object
     Some options do not apply to a single run, some not to several specifications, and some not to a cluster.
     `given` maps the name of an option to its value, or to None if it is not given.
     """
-    for one, other in (("--budget", "--steps"), ("--seed", "--seeds")):
-        if given[one] is not None and given[other] is not None:
-            raise usage(f"`{one}` and `{other}` contradict each other")
+    if given["--seed"] is not None and given["--seeds"] is not None:
+        raise usage("`--seed` and `--seeds` contradict each other")
     if len(specs) > 1 and given["--system"] is not None:
         raise usage("`--system` is for one specification", 'a line `system "FILE"` in every specification')
     if given["--cluster"] is not None and jobs > 1:
@@ -211,43 +143,6 @@ def _logger(name: str | None) -> Opener | None:
     from stlc.controller.training.tensorboard import find_writer
 
     return find_writer()
-
-
-def _method(name: str) -> str:
-    """Return the name of the training method that `--method` names, or whose file it names.
-
-    Raises UsageError (U101) if there is none.
-    """
-    name = METHODS.chosen(name)
-    if name not in METHODS:
-        raise usage(f"there is no method `{name}`", METHODS.suggest(name))
-    return name
-
-
-def _steps(text: str) -> int | StepSchedule:
-    """Parse the value of `--steps`: a number of steps, or a schedule that was recorded by another run.
-
-    A run with a time budget adjusts its total number of steps as it proceeds, and records these totals as a
-    schedule. In `10000,1240@10` the total is 10000 at first, and 1240 after step 10; `simulations=6@400` is a
-    round of falsification after step 400.
-    """
-    from stlc.controller.training.budget import StepSchedule
-
-    if text.strip().isdecimal():
-        return parse_count(text, "--steps")
-    try:
-        return StepSchedule.parse(text)
-    except ValueError as error:
-        help_ = ("--steps 1200", "the schedule of a run is in its report and in its run.json")
-        message = f"`--steps {text}` is no number of steps"
-        raise UsageError(Diagnostic("U101", message, help=help_, note=(str(error),))) from None
-
-
-def _rate(value: float) -> float:
-    """Check that a learning rate is positive and finite, and return it. Raises UsageError (U101) if not."""
-    if not 0.0 < value < math.inf:
-        raise usage(f"`--lr {value:g}` is not a learning rate", "--lr 1e-3")
-    return value
 
 
 def _task(
@@ -331,12 +226,14 @@ def _resume(
     return session
 
 
-def _refuse_on_resume(given: Mapping[str, object]) -> None:
+def _refuse_on_resume(own: Mapping[str, object], changed: Mapping[str, object]) -> None:
     """Raise UsageError (R104) for an option that a resumed run cannot change.
 
-    Only the length of the training and `--device` can be changed.
+    Only the length of the training and `--device` can be changed. `changed` are options of the training.
     """
-    named = [option for option, value in given.items() if value is not None]
+    named = [option for option, value in own.items() if value is not None]
+    named += [f"--{name.replace('_', '-').replace('options', 'option')}" for name in changed]
+    named = [option for option in named if option not in ("--budget", "--steps", "--device")]
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"
         advice = ("stlc train --resume RUN [--steps N | --budget TIME]", "a new run takes any option")

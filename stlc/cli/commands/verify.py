@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.activity import PULSE
-from stlc.cli.certify.text import floored
+from stlc.assurance.options import VerifyOptions
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.options import (
-    FailUnderOption,
-    JobsOption,
-    PythonOption,
-    RunsOption,
-    SeedOption,
-    SystemOption,
-    parse_clock,
-    parse_seconds,
-)
+from stlc.cli.framework.options import FailUnderOption
 from stlc.cli.framework.output import Answer, emit, show_diagnostics, table
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, usage
+from stlc.diagnostics import Diagnostic
 from stlc.escape import visible
-from stlc.foreign import driving
+from stlc.options import given
+from stlc.units import floored
 
 if TYPE_CHECKING:
-    from stlc.assurance.verification.loop import NetworkLoop
-    from stlc.assurance.verification.plans import PolicySource
     from stlc.assurance.verification.verified import Verified
     from stlc.assurance.verification.verify import Verification
 
+OPTIONS = VerifyOptions()
 _MOST = 3
 """Counterexamples that the text shows."""
 
@@ -52,34 +39,8 @@ def verify(
             metavar="RUN|SPEC", help="A run, or with --controller a specification.", autocompletion=run_names
         ),
     ] = "latest",
-    controller: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="A network in ONNX that controls the system of SPEC."),
-    ] = None,
-    period: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="Control period of the network.", show_default="the time step"),
-    ] = None,
-    continuous: Annotated[
-        bool,
-        typer.Option("--continuous", help="Bound solutions of the differential equations, not the model's."),
-    ] = False,
-    system: SystemOption = None,
-    budget: Annotated[str, typer.Option(metavar="TIME", help="Time of the search for proofs.")] = "60s",
-    boxes: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Boxes of each mode to examine at most.")
-    ] = None,
-    states: Annotated[
-        int, typer.Option(min=0, metavar="N", help="Random initial states around which to prove boxes.")
-    ] = 0,
-    clock: Annotated[
-        str, typer.Option(metavar="wall|processor", help="Clock of the search for proofs.")
-    ] = "wall",
-    jobs: JobsOption = 1,
-    seed: SeedOption = 0,
+    options: VerifyOptions = OPTIONS,
     fail_under: FailUnderOption = None,
-    python: PythonOption = False,
-    runs: RunsOption = Path("runs"),
 ) -> Answer[Verified]:
     """Prove plans or closed loops on boxes of states.
 
@@ -94,45 +55,16 @@ def verify(
     With --controller, a network acts on the system of SPEC once per period, and the whole horizon is proved,
     at the samples of the model or, with --continuous, of the exact solutions.
     """
-    import torch
+    from stlc.assurance.verification.verified import verify as prove
 
-    from stlc.assurance.verification.examine import SharedExaminer
-    from stlc.assurance.verification.plans import PolicySource
-    from stlc.assurance.verification.verified import Verified
-    from stlc.assurance.verification.verify import Verifier
-    from stlc.controller.parallel.workers import LocalProcesses
-    from stlc.controller.training.budget import clock_of
-    from stlc.rundir import RunDir
-
-    torch.set_num_threads(1)  # for the few states of a box, threads cost more than they save
-    seconds, measured = parse_seconds(budget), parse_clock(clock)
-    source: PolicySource | _LoopSource
-    if controller is None:
-        if period is not None or system is not None or continuous:
-            raise usage("--period, --system and --continuous are for a network: --controller FILE")
-        folder = RunDir.open(run, runs)
-        name, source = folder.shown, PolicySource(folder.path)
-    else:
-        name, source = run, _LoopSource(run, system, controller, period, continuous)
-    with driving(python):
-        subject = source.load()
-    with nullcontext() if jobs == 1 else SharedExaminer(source, LocalProcesses(jobs, fresh=True)) as shared:
-        tick = clock_of(measured)
-        if shared is not None and measured == "processor":
-            tick = shared.processor_time
-        verifier = Verifier(subject, seed=seed, clock=tick, examiner=shared)
-        with PULSE.doing("proving"):
-            found = verifier.run(seconds, boxes=boxes)
-    with PULSE.doing("proving boxes around random states"):
-        near = verifier.around(states, seed=seed)
-    record = Verified(name, found, near)
-    lost = () if shared is None or not shared.lost else (_lost(shared.lost),)
+    found = prove(run, **given(options))
+    lost = (_lost(found.lost),) if found.lost else ()
 
     def show() -> None:
         show_diagnostics(lost)
-        emit("\n".join(_lines(record)))
+        emit("\n".join(_lines(found)))
 
-    return Answer(record, show, _exit_code(found, fail_under), lost)
+    return Answer(found, show, _exit_code(found.found, fail_under), lost)
 
 
 def _lost(reasons: Sequence[str]) -> Diagnostic:
@@ -140,38 +72,6 @@ def _lost(reasons: Sequence[str]) -> Diagnostic:
     count = f"{len(reasons):,} batch{'es' if len(reasons) > 1 else ''} of boxes"
     message = f"{count} stayed open: lost with the processes that examined them"
     return Diagnostic("R406", message, note=tuple(dict.fromkeys(reasons)))
-
-
-@dataclass(frozen=True, slots=True)
-class _LoopSource:
-    """Closed loop of a system and a network, for this process and others.
-
-    Attributes:
-        spec: path or name of the specification.
-        system: path or name of the system; None: that of the specification.
-        controller: file of the network.
-        period: control period with its unit; None: the time step.
-        continuous: whether solutions of the differential equations are bounded, not the model's.
-    """
-
-    spec: str
-    system: str | None
-    controller: Path
-    period: str | None
-    continuous: bool
-
-    def load(self) -> NetworkLoop:
-        """Load the closed loop."""
-        from stlc.assurance.verification.loop import NetworkLoop
-        from stlc.assurance.verification.onnx_layers import read_onnx
-        from stlc.controller.problem.load import load_task
-
-        task = load_task(self.spec, self.system)
-        dt = float(task.system.decl.dt)
-        steps = 1.0 if self.period is None else parse_seconds(self.period) / dt
-        if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
-            raise usage(f"the control period `{self.period}` is not a multiple of the time step {dt:g} s")
-        return NetworkLoop(task, read_onnx(self.controller), round(steps), continuous=self.continuous)
 
 
 def _exit_code(found: Verification, fail_under: float | None) -> int:

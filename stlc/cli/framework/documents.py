@@ -6,11 +6,7 @@ version of a schema, keys are added and never removed.
 
 from typing import Annotated, Any, Literal, NotRequired, TypeAlias, TypedDict
 
-from stlc.assurance.certificate import Assessment
-from stlc.cli.framework.assured import FalsificationRounds
 from stlc.controller.evaluation.closed_loop import ClosedLoop
-from stlc.controller.evaluation.deployment import DecisionLatency
-from stlc.controller.evaluation.stats import MeanInterval
 from stlc.view.learning import Learning
 
 Num: TypeAlias = float | str
@@ -92,73 +88,14 @@ class RemovedRuns(TypedDict):
     removed: list[str]
 
 
-class UnsafeStart(TypedDict):
-    seed: int
-    agent: int
-    savable: bool
+class FalsificationRounds(TypedDict):
+    """Rounds of `stlc train --falsify`; see `stlc.controller.training.failures.FailureBank`."""
 
-
-class RuleCounts(TypedDict):
-    obeyed: Count
-    broken: Count
-    undecided: Count
-
-
-class LossCause(TypedDict):
-    why: Literal["start", "told", "later", "missed", "near", "rules"]
-    time: Positive
-
-
-class BrokenRun(TypedDict):
-    seed: int
-    agent: Count
-    lost: bool
-    rules: dict[str, float | None]
-    cause: LossCause | None
-
-
-class JudgedRuns(TypedDict):
-    count: Count
-    obeyed: Count
-    safe: Count | None
-    undecided: Count
-    lost: Count
-    told: Count
-    rules: dict[str, RuleCounts]
-    broken: list[BrokenRun]
-
-
-class GuardedRuns(TypedDict):
-    metrics: dict[str, MeanInterval]
-    units: dict[str, str]
-    decisions: dict[str, Num]
-    unsafe: NotRequired[list[UnsafeStart]]
-    latency: DecisionLatency
-    search: NotRequired[dict[str, Num]]
-    drives: NotRequired[JudgedRuns]
-    assurance: NotRequired[Assessment]
-
-
-class ModelErrors(TypedDict):
-    actuator_gain: NotRequired[float]
-    parameters: NotRequired[float]
-    actuator_noise: NotRequired[float]
-    sensor_noise: NotRequired[float]
-    numbers: NotRequired[list[str]]
-    exact: NotRequired[list[str]]
-
-
-class JudgeSpec(TypedDict):
-    spec: str
-    path: str
-    rules: dict[str, str]
-
-
-class ScenarioResult(TypedDict):
-    doc: str
-    expect: Literal["nominal", "ood"]
-    guards: dict[str, GuardedRuns]
-    judge: NotRequired[JudgeSpec | None]
+    rounds: int
+    drives: int
+    failing: int
+    last_share: float
+    states: int
 
 
 class LiveMargin(TypedDict):
@@ -178,35 +115,6 @@ class RobustnessLine(TypedDict):
     policy_rho: Num | None
     plan_safe: bool | None
     margins: dict[str, LiveMargin]
-
-
-class Simulation(TypedDict):
-    scenarios: NotRequired[dict[str, ScenarioResult]]
-    spec: str
-    system: str
-    run: str
-    world: str | None
-    scenario: str | None
-    trace: str
-    seeds: list[int]
-    agents: int
-    steps: int
-    replan: int
-    starts: NotRequired[Literal["any", "savable", "feasible"]]
-    redrawn: NotRequired[Count]
-    time_limit: NotRequired[float | None]
-    paper_time_limit: NotRequired[float | None]
-    ceiling: NotRequired[int]
-    overrides: NotRequired[dict[str, str]]
-    interval: str
-    guards: dict[str, GuardedRuns]
-    planners: NotRequired[dict[str, GuardedRuns]]
-    animation: NotRequired[str]
-    report: NotRequired[str]
-    errors: NotRequired[ModelErrors]
-    margin: NotRequired[dict[str, Positive]]
-    safety: NotRequired[list[str]]
-    judge: NotRequired[JudgeSpec | None]
 
 
 class Training(TypedDict):

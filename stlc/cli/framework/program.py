@@ -17,12 +17,13 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from types import FrameType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
 
 from stlc.activity import PULSE
+from stlc.cli.framework import completion
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.errors import report as report_error
 from stlc.cli.framework.help import CommandHelp, ProgramHelp
@@ -30,6 +31,7 @@ from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import COLOR, QUIET, Answer, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, PluginError, UsageError
 from stlc.foreign import driving
+from stlc.options import Option, described
 from stlc.registry import Registry
 from stlc.version import __version__
 
@@ -120,33 +122,34 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     hints = _parameter_hints(function)
     signature = inspect.signature(function)
-    given = [each.replace(annotation=hints.get(name)) for name, each in signature.parameters.items()]
-    signature = signature.replace(parameters=given)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     returned = signature.return_annotation  # a text, where the module postpones annotations
     answers = get_origin(returned) is Answer or str(returned).startswith("Answer[")
     passed = "json" in signature.parameters
-    if not groups and not answers:
-        return function
     spread: list[inspect.Parameter] = []
+    told: dict[str, tuple[str | None, str]] = {}
     for name, parameter in signature.parameters.items():
         if name not in groups:
-            spread.append(parameter)
+            spread.append(parameter.replace(annotation=hints.get(name)))
             continue
-        hints = get_type_hints(groups[name], include_extras=True)
+        own = get_type_hints(groups[name], include_extras=True)
+        told |= described(groups[name])
         spread += [
             parameter.replace(
-                name=each.name, annotation=hints[each.name], default=getattr(parameter.default, each.name)
+                name=each.name, annotation=own[each.name], default=getattr(parameter.default, each.name)
             )
             for each in fields(groups[name])
         ]
-
     if answers and not passed:
         option = inspect.Parameter.POSITIONAL_OR_KEYWORD
         spread.append(inspect.Parameter("json", option, default=False, annotation=JsonOption))
+    read = {each.name: (each.default, parse) for each in spread if (parse := _parts(each.annotation)[2])}
+    spread = [_on_command_line(each, *told.get(each.name, (None, ""))) for each in spread]
 
     def run(**values: Any) -> Any:
         as_json = values["json"] if passed else values.pop("json", False)
+        for name, (default, parse) in read.items():
+            values[name] = default if values[name] in (None, []) else parse(values[name])
         for name, kind in groups.items():
             values[name] = kind(**{each.name: values.pop(each.name) for each in fields(kind)})
         answer = function(**values)
@@ -158,6 +161,41 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     run.__signature__ = signature.replace(parameters=spread)  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in spread}
     return run
+
+
+def _parts(hint: Any) -> tuple[Any, Option | None, Callable[[Any], Any] | None]:
+    """Type of an option without its description, the description, and the function that reads its text."""
+    if get_origin(hint) in (Union, UnionType):
+        found = [_parts(each) for each in get_args(hint)]
+        described = [each for each in found if each[1] is not None]
+        return (hint, None, None) if not described else (described[0][0] | None, *described[0][1:])
+    parts = get_args(hint) if get_origin(hint) is Annotated else ()
+    if len(parts) < 2 or not isinstance(parts[1], Option):
+        return hint, None, None
+    return parts[0], parts[1], parts[2] if len(parts) > 2 else None
+
+
+def _on_command_line(parameter: inspect.Parameter, metavar: str | None, told: str) -> inspect.Parameter:
+    """Return a parameter as typer declares it, if an `Option` or the docstring (`told`) describes it."""
+    kind, option, parse = _parts(parameter.annotation)
+    if option is None and not told:
+        return parameter
+    option = option or Option()
+    help_, _, shown = (told or option.help).removesuffix(".").partition("; by default ")
+    name = f"--{parameter.name.rstrip('_').replace('_', '-')}"
+    if parse is not None or option.many:
+        kind = list[str] | None if option.many else str | None
+        parameter = parameter.replace(default=None)
+    found = typer.Option(
+        *(option.flags or (name,)),
+        help=f"{help_}.",
+        metavar=metavar or option.metavar,
+        min=option.least,
+        max=option.most,
+        show_default=shown or True,
+        autocompletion=getattr(completion, option.names, None),
+    )
+    return parameter.replace(annotation=Annotated[kind, found])
 
 
 def _parameter_hints(function: Callable[..., Any]) -> dict[str, Any]:

@@ -10,11 +10,10 @@ from typing import Any, TypedDict
 from stlc.diagnostics import Diagnostic
 
 _DOCUMENTS = "stlc.cli.framework.documents"
-_ASSURED = "stlc.cli.framework.assured"
 RESULTS: dict[str, tuple[str, ...]] = {
     "certify": (
-        f"{_ASSURED}:BoundedDrives",
-        f"{_ASSURED}:BoundedDraws",
+        "stlc.assurance.certificates:BoundedDrives",
+        "stlc.assurance.certificates:BoundedDraws",
         "stlc.assurance.campaign:CertificateCheck",
     ),
     "check": ("stlc.assurance.certificate:BoundedVerdict", "stlc.assurance.certificate:JudgedFiles"),
@@ -46,7 +45,7 @@ RESULTS: dict[str, tuple[str, ...]] = {
     "runs": tuple(
         f"{_DOCUMENTS}:{name}" for name in ("RunList", "RunComparison", "RunContent", "RemovedRuns")
     ),
-    "simulate": (f"{_DOCUMENTS}:Simulation", "stlc.plants.judge:PlantSimulation"),
+    "simulate": ("stlc.assurance.simulated:Simulation", "stlc.plants.judge:PlantSimulation"),
     "stlc": (),
     "system": ("stlc.dynamics.facts:SystemList", "stlc.dynamics.facts:SystemFacts"),
     "train": (f"{_DOCUMENTS}:TrainedRun", f"{_DOCUMENTS}:TrainedRuns"),

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from stlc.escape import visible
+from stlc.cli.framework.output import console
 from stlc.files import reported
+from stlc.view.simulated import bar
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.live import LiveMonitor
@@ -25,25 +26,28 @@ class Watching:
     """Options for the output while a deployment (closed-loop simulation) runs.
 
     Attributes:
-        title: name of the deployment.
         live: whether the live view is shown instead of a progress bar.
         margins: file for the robustness margins, as JSON lines; `-` is the standard output. None: no margins
             are written.
+        check: called before the deployment.
     """
 
-    title: str
     live: bool = False
     margins: str | None = None
+    check: Callable[[Task], object] | None = None
 
     @contextmanager
-    def of(self, task: Task, setting: Setting) -> Iterator[Watch]:
-        """Return a context that yields a function to be called after every step of the deployment.
+    def of(self, task: Task, setting: Setting, title: str, asked: bool) -> Iterator[Watch]:
+        """Return a context that yields a function to be called after every step of the deployment `title`.
 
-        The function updates the progress bar or the live view. It also writes the robustness margins to the
-        file `margins`, if there is one.
+        The function updates the progress bar or the live view. If the deployment is the one that was `asked`
+        for, it also writes the robustness margins to the file `margins`.
         """
-        if not self.live and self.margins is None:
-            with _bar(self.title) as watch:
+        if self.check is not None:
+            self.check(task)
+        margins = self.margins if asked else None
+        if not self.live and margins is None:
+            with bar(title, console(stderr=True)) as watch:
                 yield watch
             return
         from stlc.controller.deployment.live import LiveMonitor
@@ -51,19 +55,18 @@ class Watching:
         monitor = LiveMonitor(task, setting)
         with ExitStack() as stack:
             listeners: list[Callable[[], None]] = []
-            if self.margins is not None:
-                lines = stack.enter_context(_lines(self.margins))
+            if margins is not None:
+                lines = stack.enter_context(_lines(margins))
                 listeners.append(lambda: _write(monitor, lines))
             if self.live:
-                from stlc.cli.framework.output import console
                 from stlc.cli.simulate.live import LiveView
 
-                view = LiveView(monitor, self.title, console(stderr=True))
+                view = LiveView(monitor, title, console(stderr=True))
                 stack.callback(view.stop)
                 view.start()
                 listeners.append(view.update)
             else:
-                update = stack.enter_context(_bar(self.title))
+                update = stack.enter_context(bar(title, console(stderr=True)))
                 listeners.append(lambda: update(_present(monitor)))
 
             def watch(moment: SimulationStep) -> None:
@@ -111,25 +114,3 @@ def _write(monitor: LiveMonitor, stream: TextIO) -> None:
     with tolerate_closed(stream):
         stream.writelines(dumps(record) + "\n" for record in monitor.records())
         stream.flush()
-
-
-@contextmanager
-def _bar(title: str) -> Iterator[Watch]:
-    """Context with a progress bar on the standard error, which is shown only if that is a terminal.
-
-    The context yields the function that updates the bar.
-    """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from stlc.cli.framework.output import console
-
-    talk = console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
-        bar = progress.add_task(visible(title), total=None)
-        yield lambda moment: progress.update(bar, completed=moment.step, total=moment.steps)

@@ -5,9 +5,10 @@ An error in a world's code is reported with its location in the world's file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,6 +68,13 @@ class Setting:
     margin: RobustnessMargins = field(default_factory=dict)
     paper_limit: float | None = None
     draws: tuple[NDArray[np.float64], ...] | None = None
+
+    def limited(self, seconds: float | None) -> Setting:
+        """Return the same with a time limit of all guards: infinite for no limit, None for the usual ones."""
+        if seconds is None:
+            return self
+        limit = seconds if math.isfinite(seconds) else None
+        return replace(self, limit=limit, paper_limit=limit)
 
     @property
     def limits(self) -> Limits:

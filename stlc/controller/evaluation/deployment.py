@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,14 +16,14 @@ from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.metrics import measure
-from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, judge_runs_by_plans, runs_json
+from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, judge_runs_by_plans
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.guard.candidates import SOURCES
 from stlc.controller.guard.guard import Guard
 from stlc.controller.search.feasibility import solvable
 from stlc.controller.search.planner_policy import PlannerPolicy, SearchUse
 from stlc.controller.world import world_type
-from stlc.jsontext import Num, plain
+from stlc.jsontext import Num
 
 if TYPE_CHECKING:
     from stlc.controller.policies.policy import Policy
@@ -222,49 +222,3 @@ def latency(guard: Guard, recording: DeploymentRecording) -> DecisionLatency:
         if perf_counter() > stop:
             break
     return DecisionLatency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), len(seconds))
-
-
-def as_json(
-    deployments: Mapping[str, Deployment],
-    setting: Setting,
-    facts: Mapping[str, Any],
-    planners: Mapping[str, Deployment] | None = None,
-) -> dict[str, Any]:
-    """Content of `eval/simulate.json`.
-
-    Args:
-        deployments: name of a guard -> results.
-        setting: setting of the simulation.
-        facts: further entries at the top level.
-        planners: name of a planner that was simulated beside the policy -> results.
-    """
-    return {
-        **facts,
-        "seeds": list(setting.seeds),
-        "agents": setting.agents,
-        "steps": setting.steps,
-        "replan": setting.replan,
-        "time_limit": setting.limit,
-        "paper_time_limit": setting.paper_limit,
-        "ceiling": setting.ceiling,
-        "margin": dict(setting.margin),
-        "interval": "95 %, Student's t over the deployment seeds",
-        "guards": {name: _record(found, setting) for name, found in deployments.items()},
-        **({"planners": {k: _record(found, setting) for k, found in planners.items()}} if planners else {}),
-    }
-
-
-def _record(found: Deployment, setting: Setting) -> dict[str, Any]:
-    """The results of one guard or planner as a JSON object."""
-    return {
-        "metrics": plain(found.metrics),
-        "drives": runs_json(found.runs, setting.seeds, setting.agents),
-        "units": dict(found.recording.units),
-        "decisions": dict(found.decisions),
-        "unsafe": [
-            {"seed": setting.seeds[each.seed], "agent": each.agent, "savable": each.viable}
-            for each in found.unsafe
-        ],
-        "latency": asdict(found.latency),
-        **({} if found.search is None else {"search": asdict(found.search)}),
-    }

@@ -10,20 +10,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.tolerance import status_of
-from stlc.controller.evaluation.causes import Lost, losses
-from stlc.controller.evaluation.executed import MOST_TIMED, Executed
-from stlc.controller.run.run import INDEX, Run, read_library, save_library
+from stlc.controller.evaluation.causes import Cause, Lost, losses
+from stlc.controller.evaluation.executed import MOST_TIMED
+from stlc.controller.run.run import INDEX, read_library, save_library
 from stlc.diagnostics import Diagnostic, SystemFileError, UsageError
 from stlc.files import read_source
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
+from stlc.jsontext import Count
 from stlc.monitor.explain.report import explain
 from stlc.monitor.verdict import Monitor
 
@@ -31,7 +32,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stlc.controller.deployment.simulator import DeploymentRecording
+    from stlc.controller.evaluation.executed import Executed
     from stlc.controller.problem.task import Task
+    from stlc.controller.run.run import Run
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.dynamics.declaration.deployment import JudgeRef
     from stlc.monitor.judgement import Verdict
@@ -334,49 +337,78 @@ def _moments(verdict: Verdict, row: int, names: Sequence[str]) -> dict[str, floa
 # ------------------------------------------------------------------------- JSON
 
 
-def runs_json(runs: RunVerdicts, seeds: Sequence[int], agents: int) -> dict[str, Any]:
-    """Return verdicts on the closed-loop runs under one guard: entry `drives` of `simulate.json`.
+@dataclass(frozen=True, slots=True)
+class RuleCounts:
+    """Numbers of runs that obey a rule, that break it, and without a verdict."""
 
-    The entries are:
+    obeyed: Count
+    broken: Count
+    undecided: Count
 
-    - `count`: number of runs.
-    - `obeyed`: number of runs that satisfy every rule.
-    - `safe`: number of runs that satisfy every rule tagged `@safety`; null if no rule has this tag.
-    - `undecided`: number of inconclusive runs.
-    - `lost`: number of runs that could not obey the rules (see `RunVerdicts.viable`).
-    - `told`: number of the lost runs in which a good plan was known until an exogenous event. In the other
-      lost runs, no good plan was known even at the start.
-    - `rules`: for each rule, the numbers of obeyed, broken and undecided runs.
-    - `broken`: one entry per run that broke rules. Its `rules` are the times of the violations in seconds
-      from the start (null if unknown). Its `cause` says since when no good plan was known, and why (see
-      `Lost`).
+
+@dataclass(frozen=True, slots=True)
+class LossCause:
+    """Time in seconds since which no good plan was known, and why; see `Lost`."""
+
+    why: Cause
+    time: float
+
+
+@dataclass(frozen=True, slots=True)
+class BrokenRun:
+    """Run that broke rules: their times in seconds from the start (None if unknown), and the cause."""
+
+    seed: int
+    agent: Count
+    lost: bool
+    rules: Mapping[str, float | None]
+    cause: LossCause | None
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedRuns:
+    """Verdicts on the closed-loop runs under one guard, as `simulate.json` holds them.
+
+    Attributes:
+        count: number of runs.
+        obeyed: number of runs that satisfy every rule.
+        safe: number of runs that satisfy every rule tagged `@safety`; None if no rule has this tag.
+        undecided: number of inconclusive runs.
+        lost: number of runs that could not obey the rules (see `RunVerdicts.viable`).
+        told: number of the lost runs in which a good plan was known until an exogenous event. In the other
+            lost runs, no good plan was known even at the start.
+        rules: rule -> numbers of runs.
+        broken: the runs that broke rules.
     """
-    obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
-    return {
-        "count": rows,
-        "obeyed": obeyed,
-        "safe": None if runs.safe is None else int(runs.safe.sum()),
-        "undecided": rows - obeyed - len(runs.broken),
-        "lost": int((~runs.viable).sum()),
-        "told": sum(each.lost is not None and each.lost.why == "told" for each in runs.broken),
-        "rules": {
-            name: {
-                "obeyed": int((statuses == "satisfied").sum()),
-                "broken": int((statuses == "violated").sum()),
-                "undecided": int((statuses == "inconclusive").sum()),
-            }
-            for name, statuses in runs.rules.items()
-        },
-        "broken": [
-            {
-                "seed": seeds[each.row // agents],
-                "agent": each.row % agents,
-                "lost": not bool(runs.viable[each.row]),
-                "rules": dict(each.rules),
-                "cause": None
-                if each.lost is None
-                else {"why": each.lost.why, "time": round(each.lost.time, 9)},
-            }
-            for each in runs.broken
-        ],
-    }
+
+    count: Count
+    obeyed: Count
+    safe: Count | None
+    undecided: Count
+    lost: Count
+    told: Count
+    rules: Mapping[str, RuleCounts]
+    broken: Sequence[BrokenRun]
+
+    @classmethod
+    def of(cls, runs: RunVerdicts, seeds: Sequence[int], agents: int) -> JudgedRuns:
+        """Count verdicts on runs of `agents` agents under each seed."""
+        obeyed, rows = int(runs.obeyed.sum()), len(runs.viable)
+        words = ("satisfied", "violated", "inconclusive")
+        broken = []
+        for each in runs.broken:
+            lost, (seed, agent) = each.lost, divmod(each.row, agents)
+            cause = None if lost is None else LossCause(lost.why, round(lost.time, 9))
+            viable = bool(runs.viable[each.row])
+            broken.append(BrokenRun(seeds[seed], agent, not viable, dict(each.rules), cause))
+        return cls(
+            *(rows, obeyed, None if runs.safe is None else int(runs.safe.sum())),
+            undecided=rows - obeyed - len(runs.broken),
+            lost=int((~runs.viable).sum()),
+            told=sum(each.lost is not None and each.lost.why == "told" for each in runs.broken),
+            rules={
+                name: RuleCounts(*(int((statuses == word).sum()) for word in words))
+                for name, statuses in runs.rules.items()
+            },
+            broken=broken,
+        )

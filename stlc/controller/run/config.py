@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, fields
-from typing import Literal, TypeAlias, get_args
+from typing import get_args
 
 from stlc.controller.options import MOST, Bounds, bounds_of
+from stlc.options import Clock
 from stlc.registry import METHODS, PLANNERS
-
-Clock: TypeAlias = Literal["wall", "processor"]
-"""Clock of a budget: wall time, or processor time as on an idle machine."""
 
 DRIVES = 400
 """Default maximum number of closed-loop runs after training, for each kind of guard."""

@@ -23,7 +23,7 @@ from stlc.native import cores
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from stlc.controller.run.config import Clock
+    from stlc.options import Clock
 
 PROVISIONAL = 10_000
 """Planned number of steps before the first steps have been timed."""

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
 from stlc.controller.options import value_of
-from stlc.controller.run.config import DRIVES, HELD_OUT, Clock, ResolvedConfig, checked_config
+from stlc.controller.run.config import ResolvedConfig, checked_config
 from stlc.controller.training.budget import StepSchedule
+from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import usage
 from stlc.native import cores
 from stlc.registry import METHODS, did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from stlc.controller.problem.task import Task
     from stlc.controller.search.planner_policy import PlannerChoice
 
@@ -30,45 +29,11 @@ MISSION_MOST = 128
 """Maximum number of hard states per search round on missions, where many hard states are similar."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainConfig:
-    """Options of the user; None leaves the choice to the system file, then to the method.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainConfig(TrainOptions):
+    """Options of a training, and the planner of the method `plan`."""
 
-    Attributes:
-        method: name of a training method, see `stlc.registry.METHODS`, or path of its file.
-        budget: training time in seconds, final evaluation included; the number of steps is adapted to it.
-        clock: clock that measures the budget: `wall` time or `processor` time.
-        steps: number of training steps, or the recorded schedule of an earlier run, which is followed again;
-            takes precedence over `budget`.
-        seed: seed of all random numbers in training.
-        device: torch device.
-        threads: number of threads of torch; None: all cores, less one if a search runs concurrently.
-        plans: number of plans that the network proposes per state.
-        lr: peak learning rate.
-        batch: number of newly drawn states per step.
-        held_out: number of initial states of the final evaluation, on which no policy is trained.
-        drives: maximum number of closed-loop simulations after the training, for each kind of guard (a guard
-            checks plans at run time); 0: none.
-        planner: planner of the method `plan`, with its options.
-        options: options that only this method has, name -> text.
-        falsify: whether states of failing closed-loop drives are mixed into the training.
-    """
-
-    method: str | None = None
-    budget: float | None = None
-    steps: int | StepSchedule | None = None
-    seed: int | None = None
-    device: str = "cpu"
-    threads: int | None = None
-    plans: int | None = None
-    lr: float | None = None
-    batch: int | None = None
-    held_out: int = HELD_OUT
-    clock: Clock = "wall"
-    drives: int = DRIVES
     planner: PlannerChoice | None = None
-    options: Mapping[str, str] = field(default_factory=dict)
-    falsify: bool = False
 
 
 def method_name(task: Task, given: str | None) -> str:

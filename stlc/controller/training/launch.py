@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from stlc.compile.dump import dump
 from stlc.compile.frontend.modules import library_of
 from stlc.controller.evaluation.rules import keep_rules
 from stlc.controller.run.config import ResolvedConfig
-from stlc.controller.run.run import Run, save_config, save_library, spec_hash, system_hash
+from stlc.controller.run.run import save_config, save_library, spec_hash, system_hash
 from stlc.controller.search.planner import prepared
 from stlc.controller.search.planner_policy import PlannerChoice, planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
-from stlc.controller.training.loop import Watch, prepare, run
-from stlc.diagnostics import usage
 from stlc.dynamics.functions import function_files
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.registry import METHODS, PLANNERS
@@ -111,43 +108,6 @@ def _plugins(config: ResolvedConfig) -> dict[str, dict[str, str]]:
         for each in chosen
         if each is not None
     }
-
-
-def train_here(
-    task: Task,
-    *,
-    budget: float | None = None,
-    steps: int | None = None,
-    seed: int | None = None,
-    method: str | None = None,
-    watch: Watch | None = None,
-    **options: Any,
-) -> Run:
-    """Train a policy in a new folder below `runs/` and return the run.
-
-    Args:
-        task: problem to train for; see `stlc.compile`.
-        budget: training time in seconds; None: that of the system file, or 60 if it has none and `steps` is
-            None.
-        steps: number of optimiser steps; takes precedence over `budget`.
-        seed: seed of all random numbers; None: that of the system file.
-        method: name of the method, such as `guided` (search and distil) or `gradient` (Meng and Fan 2023);
-            None: that of the system file.
-        watch: functions that are called during the training.
-        options: further fields of `stlc.controller.training.config.TrainConfig`, such as `held_out` or
-            `drives`.
-
-    Raises:
-        UsageError: U101, `budget` is not a positive number, `steps` is below 1, `seed` is negative, or there
-            is no such method.
-    """
-    if budget is not None and not 0.0 < budget < math.inf:
-        raise usage(f"a training time of {budget} s is not a positive number")
-    if (steps is not None and steps < 1) or (seed is not None and seed < 0):
-        raise usage("a training has at least 1 step, and its seed is at least 0")
-    config = TrainConfig(method=method, budget=budget, steps=steps, seed=seed, **options)
-    prepared = prepare(task, config)
-    return run(prepared, open_folder(task, config), watch).run
 
 
 def open_planner(task: Task, choice: PlannerChoice, *, seed: int, launch: Launch) -> RunDir:

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from stlc.cli.framework.options import parse_overrides, require_separate
+from stlc.cli.framework.options import require_separate
 from stlc.cli.framework.program import describe
 from stlc.diagnostics import UsageError
+from stlc.options import parse_overrides
 
 
 def test_overrides():

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stlc.cli.framework.options import MOST_SEEDS, parse_seconds, parse_seeds
 from stlc.diagnostics import UsageError
+from stlc.options import MOST_SEEDS, parse_seconds, parse_seeds
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 5)), min_size=1, max_size=5))

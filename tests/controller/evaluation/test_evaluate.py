@@ -15,7 +15,6 @@ from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, 
 from stlc.controller.evaluation.archive import save_scene, save_trace_of
 from stlc.controller.evaluation.deployment import (
     InterruptedDeploymentError,
-    as_json,
     decided,
     deploy,
     feasible_states,
@@ -331,12 +330,3 @@ def test_a_scene_is_read_back_without_pickle(recorded: DeploymentRecording, tmp_
     (tmp_path / "taken").write_text("")
     with pytest.raises(MissingError):
         save_scene(tmp_path / "taken" / "scene.npz", recorded.scene)
-
-
-def test_the_document_is_plain_data(car_task: Task) -> None:
-    found = deploy(car_task, Careful(car_task), Setting((0,), 2, 3), "paper")
-    document = as_json({"paper": found}, Setting((0,), 2, 3), {"spec": "traffic"})
-    guard = document["guards"]["paper"]
-    assert guard["units"] == {"mean_speed": "m/s", "min_gap": "m"}
-    assert set(guard["metrics"]["plan_accuracy"]) == {"mean", "low", "high", "values"}
-    assert guard["latency"]["median"] > 0

@@ -14,7 +14,7 @@ import torch
 from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.evaluation.causes import Lost
 from stlc.controller.evaluation.executed import Executed
-from stlc.controller.evaluation.rules import Rules, judge_runs, judge_runs_by_plans, rules_of, runs_json
+from stlc.controller.evaluation.rules import JudgedRuns, Rules, judge_runs, judge_runs_by_plans, rules_of
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run, task_of_run
 from stlc.controller.search.local_search import SearchResult
@@ -24,6 +24,7 @@ from stlc.diagnostics import RunError, SpecError, SystemFileError
 from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parser import parse
+from stlc.jsontext import plain
 from stlc.rundir import RunDir
 
 SYSTEM = """stlc: 1
@@ -186,7 +187,7 @@ def test_drives_are_counted(home: Path, monkeypatch: pytest.MonkeyPatch) -> None
     searched(monkeypatch, -1)
     recording = replace(driven([[0, 1, 2], [0, 3.5, 1], [-3, -2.5, 0], [0, 0, 0]], good=False), agents=2)
     drives = judge_runs(rules, task, recording, viable(4, 2, 3))
-    document = runs_json(drives, (7, 8), 2)
+    document = plain(JudgedRuns.of(drives, (7, 8), 2))
     assert json.loads(json.dumps(document)) == {
         "count": 4,
         "obeyed": 2,
@@ -274,7 +275,9 @@ def test_a_drive_that_ends_too_early_is_neither(home: Path) -> None:
     text = "spec soon\nsignal x [m]\nrequire soon: eventually[0 s, 5 s] x > 1\n"
     rules = Rules(parse(text_of(home, text)), "soon.stl")
     task = opened(run_of(home)).task
-    document = runs_json(judge_runs(rules, task, driven([[0, 2, 0], [0, 0, 0]]), viable(2)), (0,), 2)
+    document = plain(
+        JudgedRuns.of(judge_runs(rules, task, driven([[0, 2, 0], [0, 0, 0]]), viable(2)), (0,), 2)
+    )
     assert (document["obeyed"], document["undecided"], document["broken"]) == (1, 1, [])
 
 
@@ -294,4 +297,4 @@ def test_without_rules_every_start_counts() -> None:
     assert drives.viable.tolist() == [True, False]
     for none in (held[:0], np.zeros((1, 2), dtype=bool)):  # no start, and no verdict
         drives = judge_runs_by_plans(executed(none, none, viable(2)), 0.5)
-        assert runs_json(drives, (0,), 2)["undecided"] == 2
+        assert JudgedRuns.of(drives, (0,), 2).undecided == 2

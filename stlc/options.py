@@ -1,0 +1,223 @@
+"""Options of operations, declared once: a function's arguments and a command's options come from them.
+
+The options of an operation are the fields of a dataclass, each annotated with an `Option`. `taking` makes
+them the keyword arguments of the function, and `stlc.cli.framework.program` those of the command line.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, Concatenate, Literal, ParamSpec, TypeVar, get_type_hints
+
+from stlc.diagnostics import usage
+from stlc.registry import GUARDS
+
+P = ParamSpec("P")
+Subject = TypeVar("Subject")
+Options = TypeVar("Options")
+Result = TypeVar("Result")
+Clock = Literal["wall", "processor"]
+"""Clock of a budget: wall time, or processor time as on an idle machine."""
+MOST_SEED = 2**63 - 1
+"""Greatest seed of torch's random numbers."""
+RUNS = Path("runs")
+"""Folder of all runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """An option on the command line; beside it, `Annotated` may hold a function that reads its text.
+
+    Attributes:
+        help: what it is for, and its default after `; by default`; else what the docstring says.
+        metavar: placeholder of its value.
+        flags: its names; by default that of the field.
+        many: whether it may be repeated.
+        least: least value of a number.
+        most: greatest value of a number.
+        names: what its values name, `run_names` or `requirement_names`, which shells complete.
+    """
+
+    help: str = ""
+    metavar: str | None = None
+    flags: tuple[str, ...] = ()
+    many: bool = False
+    least: float | None = None
+    most: float | None = None
+    names: str = ""
+
+
+_ENTRY = re.compile(r"^ {4}(\w+)(?: \((.+)\))?: (.+(?:\n {8}.*)*)", re.MULTILINE)
+
+
+def described(options: type) -> dict[str, tuple[str | None, str]]:
+    """Placeholder and help of each option, from the attributes in the docstrings of a dataclass."""
+    text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in options.__mro__)
+    return {name: (metavar or None, " ".join(told.split())) for name, metavar, told in _ENTRY.findall(text)}
+
+
+def taking(
+    options: Callable[P, Options],
+) -> Callable[[Callable[[Subject, Options], Result]], Callable[Concatenate[Subject, P], Result]]:
+    """Return a decorator: a function of a subject and `options` takes their fields as keyword arguments."""
+
+    def decorate(function: Callable[[Subject, Options], Result]) -> Callable[Concatenate[Subject, P], Result]:
+        @wraps(function)
+        def called(subject: Subject, *given: P.args, **named: P.kwargs) -> Result:
+            return function(subject, options(*given, **named))
+
+        own, hints = inspect.signature(function), get_type_hints(options)
+        first, *_ = own.parameters.values()
+        taken = inspect.signature(options).parameters
+        rest = (each.replace(annotation=hints[name]) for name, each in taken.items())
+        called.__signature__ = own.replace(parameters=[first, *rest])  # type: ignore[attr-defined]
+        return called  # type: ignore[return-value]
+
+    return decorate
+
+
+def given(options: Any) -> dict[str, Any]:
+    """Keyword arguments that give the options of a dataclass."""
+    return {each.name: getattr(options, each.name) for each in fields(options)}
+
+
+def require_no_jobs(cluster: str | None, jobs: int) -> None:
+    """Raise UsageError (U101) if `--cluster` and `--jobs` are both given."""
+    if cluster is not None and jobs != 1:
+        raise usage("`--jobs` and `--cluster` contradict each other", "a cluster uses all of its cores")
+
+
+def checked_share(option: str, share: float) -> float:
+    """Return a share between 0 and 1, the value of `option`; any other number raises UsageError (U101)."""
+    if not 0.0 < share < 1.0:
+        raise usage(f"`{option} {share:g}` is not between 0 and 1", f"{option} .99")
+    return share
+
+
+def parse_overrides(pairs: Sequence[str] | None) -> dict[str, str]:
+    """Parse pairs such as `T_red=3 s` into a mapping such as `{"T_red": "3 s"}`.
+
+    Raises:
+        UsageError: U101, see `parse_pairs`.
+    """
+    return parse_pairs(pairs, "--set", "NAME=VALUE", "T_red=3s")
+
+
+def parse_options(pairs: Sequence[str]) -> dict[str, str]:
+    """Parse the options of a method or planner, such as `tries=500`. Raises UsageError (U101)."""
+    return parse_pairs(pairs, "--option", "NAME=VALUE", "tries=500")
+
+
+def parse_pairs(pairs: Sequence[str] | None, option: str, form: str, example: str) -> dict[str, str]:
+    """Parse the values `NAME=VALUE` of a repeated option into a mapping NAME -> VALUE.
+
+    `option`, `form` and `example` are named in error messages.
+
+    Raises:
+        UsageError: U101, a value is not of the form `NAME=VALUE`, or a name is given twice.
+    """
+    values: dict[str, str] = {}
+    for pair in pairs or ():
+        name, sign, value = (part.strip() for part in pair.partition("="))
+        if not (name and sign and value):
+            raise usage(f"`{option} {pair}` is not of the form {form}", f"write it as {option} {example}")
+        if name in values:
+            raise usage(f"`{option} {name}=…` is given twice")
+        values[name] = value
+    return values
+
+
+MOST_SEEDS = 1000
+_RANGE = re.compile(r"\s*(\d{1,18})\s*(?:\.\.\s*(\d{1,18})\s*)?")
+
+
+def parse_seconds(text: str) -> float:
+    """Parse a duration such as `60s`, `5min` or `1.5 h`; return it in seconds. A bare number is in seconds.
+
+    Raises:
+        UsageError: U101, the text is not a duration.
+    """
+    from stlc.units import parse_unit
+
+    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz ").strip()
+    unit = text.strip()[len(number) :].strip() or "s"
+    try:
+        value = float(number) * float(parse_unit(unit).scale)
+        if parse_unit(unit).dims != parse_unit("s").dims or not 0.0 < value < 1e9:
+            raise ValueError
+    except ValueError as error:
+        raise usage(f"`{text}` is not a duration", "write it as 60s or 5min") from error
+    return value
+
+
+def parse_count(text: str, option: str) -> int:
+    """Parse a whole number of at least 1, the value of `option`. Raises UsageError (U101)."""
+    if re.fullmatch(r"\s*0*[1-9]\d{0,17}\s*", text, re.ASCII):
+        return int(text)
+    raise usage(f"`{option} {text}` is no number from 1 on", f"{option} 1200")
+
+
+def parse_limit(text: str) -> float:
+    """Parse a duration and return it in seconds, infinity for `none`. Raises UsageError (U101)."""
+    return math.inf if text.strip() == "none" else parse_seconds(text)
+
+
+def parse_clock(text: str) -> Clock:
+    """Parse the clock of a budget. Raises UsageError (U101) for anything but `wall` and `processor`."""
+    match text:
+        case "wall" | "processor":
+            return text
+    raise usage(f"there is no clock `{text}`", "wall or processor")
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Parse a list of seeds such as `0..2`, `3` or `0..2,7`; return them in order, without duplicates.
+
+    Raises:
+        UsageError: U101, the text is not such a list.
+    """
+    seeds: dict[int, None] = {}
+    for part in text.split(","):
+        match = _RANGE.fullmatch(part)
+        low, high = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if high < low or high - low >= MOST_SEEDS:
+            raise usage(f"`{text}` is not a list of seeds", "write it as --seeds 0..2 or 0,3,7")
+        seeds.update(dict.fromkeys(range(low, high + 1)))
+    return tuple(seeds)
+
+
+# ------------------------------------------------------------------ options of several operations
+
+SYSTEM = Option(
+    "The system: as given, beside the spec, in systems/, in examples/, or installed.",
+    "FILE",
+    ("--system", "-s"),
+)
+SET = Option("Change a constant of the spec or a key of the system.", "NAME=VALUE", ("--set",), many=True)
+REQUIRE = Option(
+    "This requirement only; repeatable.", "NAME", ("--require",), many=True, names="requirement_names"
+)
+METHOD_OPTION = Option("An option of --method; repeatable.", "NAME=VALUE", ("--option",), many=True)
+SystemName = Annotated[str | None, SYSTEM]
+Overrides = Annotated[Mapping[str, str], SET, parse_overrides]
+MethodOptions = Annotated[Mapping[str, str], METHOD_OPTION, parse_options]
+Seconds = Annotated[float, Option(metavar="TIME"), parse_seconds]
+Seeds = Annotated[Sequence[int], Option(metavar="SEEDS"), parse_seeds]
+ClockOption = Annotated[Clock, Option(metavar="wall|processor"), parse_clock]
+Natural = Annotated[int, Option(metavar="N", least=0)]
+Positive = Annotated[int, Option(metavar="N", least=1)]
+Seed = Annotated[int, Option("Seed of everything random.", least=0, most=MOST_SEED)]
+Jobs = Annotated[int, Option("Number of processes side by side.", flags=("--jobs", "-j"), least=1)]
+GuardName = Annotated[str, Option(metavar="|".join(GUARDS.installed))]
+Cluster = Annotated[
+    str | None,
+    Option("Work on a Ray cluster, with as many processes as it has cores.", "auto|local|HOST:PORT"),
+]
+Runs = Annotated[Path, Option("Folder of all runs.", "DIR")]
+Python = Annotated[bool, Option("Run the Python that the run names: of a run that you trust.")]
