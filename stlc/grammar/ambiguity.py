@@ -49,7 +49,12 @@ def ambiguities(spec: ast.Spec, *, implications: bool = False) -> Iterator[Ambig
     """
     words = _Words(spec)
     pairs = [node for node in descendants(spec) if isinstance(node, ast.Logic | ast.Until)]
-    clashes = [part for node in pairs for part in _operands(node, words)]
+    clashes = [
+        Ambiguity(operand.span, kind, node.op)
+        for node in pairs
+        for operand, left in ((node.left, True), (node.right, False))
+        if not words.closed(operand, left=left) and (kind := _clash(node, operand, left=left)) is not None
+    ]
     unclear = [part for part in clashes if implications or part.kind != "implication"]
     words.parenthesised.update((part.span.start, part.span.end) for part in unclear)
     found = [*unclear, *(part for node in pairs for part in _scope(node, words))]
@@ -80,19 +85,6 @@ class _Words:
         if left:
             return at < len(self.items) and self.items[at].text == ")"
         return at > 0 and self.items[at - 1].text == "("
-
-
-def _operands(node: ast.Logic | ast.Until, words: _Words) -> Iterator[Ambiguity]:
-    """Yield the operands of `node` that have no parentheses and that other tools may parse differently.
-
-    An example is `p and q` in `p and q or r`.
-    """
-    for operand, left in ((node.left, True), (node.right, False)):
-        if words.closed(operand, left=left):
-            continue
-        kind = _clash(node, operand, left=left)
-        if kind is not None:
-            yield Ambiguity(operand.span, kind, node.op)
 
 
 def _clash(node: ast.Logic | ast.Until, operand: ast.Expr, *, left: bool) -> AmbiguityKind | None:

@@ -91,14 +91,10 @@ def _meaning(entry: ast.Def | ast.Region | ast.Const) -> str:
         return show_expr(entry.value)
     if isinstance(entry, ast.Const):
         return show_expr(entry.value) + (f" [{entry.unit}]" if entry.unit else "")
-    text = say(entry.value) if _is_formula(entry.value) else show_expr(entry.value)
+    formulas = ast.Compare | ast.Member | ast.Not | ast.Logic | ast.Temporal | ast.Until | ast.Quantifier
+    text = (say if isinstance(entry.value, formulas) else show_expr)(entry.value)
     names = ", ".join(formal.name for formal in entry.formals)
     return f"of {names}: {text}" if names else text
-
-
-def _is_formula(expr: ast.Expr) -> bool:
-    kinds = ast.Compare | ast.Member | ast.Not | ast.Logic | ast.Temporal | ast.Until | ast.Quantifier
-    return isinstance(expr, kinds)
 
 
 def say(expr: ast.Expr) -> str:

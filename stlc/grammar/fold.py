@@ -59,7 +59,8 @@ def fold(tree: Tree[Token], context: BuildContext, base: int) -> Any:
         meta = node.meta
         start, end = (0, 0) if meta.empty else (meta.start_pos, meta.end_pos)
         span = context.source.span(base + start, base + end)
-        rank = _rank(node)
+        chained = node.data in ("logic", "binary")
+        rank = next((rank for rank in _RANKS if chained and node.children[1] in rank), ())
         if rank:
             left, operator, right = node.children
             chain = built.pop(id(left), None)
@@ -137,13 +138,6 @@ class _Chain:
             at for step in range(high - low) for at in (middle - step, middle + step) if low < at < high
         )
         return next((at for at in places if self.operators[at - 1].text not in _INVERSE), low)
-
-
-def _rank(node: Tree[Token]) -> tuple[str, ...]:
-    """Return the operators that may stand in one chain with that of a parse-tree node; () if it has none."""
-    if node.data not in ("logic", "binary"):
-        return ()
-    return next((rank for rank in _RANKS if node.children[1] in rank), ())
 
 
 def _depth(parts: Iterable[_Built], span: Span) -> int:

@@ -110,14 +110,8 @@ def _build(piece: Piece, context: BuildContext) -> Any:
     try:
         tree = load_parser().parse(piece.text, start=piece.rule)
     except UnexpectedInput as error:
-        raise PieceError(diagnose(piece, _offset(error, piece))) from None
+        ended = getattr(getattr(error, "token", None), "type", "") == "$END"
+        offset = piece.end if ended else piece.start + (error.pos_in_stream or 0)
+        raise PieceError(diagnose(piece, offset)) from None
     assert isinstance(tree, Tree)
     return fold(tree, context, piece.start)
-
-
-def _offset(error: UnexpectedInput, piece: Piece) -> int:
-    """Return the offset in the whole text at which the parsing of the part `piece` failed."""
-    token = getattr(error, "token", None)
-    if token is not None and token.type == "$END":
-        return piece.end
-    return piece.start + (error.pos_in_stream or 0)

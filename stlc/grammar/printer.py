@@ -227,18 +227,14 @@ def _number(value: Fraction) -> str:
     places = max(twos, fives)
     digits = str(abs(value.numerator) * 10**places // value.denominator)
     sign = "-" if value < 0 else ""
+    if places > _PLAIN_DIGITS:
+        return f"{sign}{digits}e-{places}"
     if places:
-        return sign + _decimal(digits, places)
+        padded = digits.rjust(places + 1, "0")
+        return f"{sign}{padded[:-places]}.{padded[-places:]}"
     short = digits.rstrip("0")
     zeros = len(digits) - len(short)
     return sign + (f"{short}e{zeros}" if len(digits) > _PLAIN_DIGITS and zeros > 2 else digits)
-
-
-def _decimal(digits: str, places: int) -> str:
-    if places > _PLAIN_DIGITS:
-        return f"{digits}e-{places}"
-    padded = digits.rjust(places + 1, "0")
-    return f"{padded[:-places]}.{padded[-places:]}"
 
 
 def show(node: ast.Node) -> str:

@@ -36,7 +36,8 @@ def load_parser() -> lark.Lark:
     if parser is None:
         parser = build_parser(grammar)
         if store is not None:
-            store.write(name, _dumped(parser).encode())
+            parts = parser.memo_serialize([TerminalDef, Rule])
+            store.write(name, json.dumps(parts, separators=(",", ":")).encode())
     return parser
 
 
@@ -62,11 +63,6 @@ def cache_name(grammar: str) -> str:
     """Return the file name of a grammar's cached tables, for the installed versions of Lark and Python."""
     key = f"{lark.__version__} {sys.version_info[:2]} {grammar}"
     return f"grammar-{sha256(key.encode()).hexdigest()[:16]}.json"
-
-
-def _dumped(parser: lark.Lark) -> str:
-    data, memo = parser.memo_serialize([TerminalDef, Rule])
-    return json.dumps([data, memo], separators=(",", ":"))
 
 
 def _read(text: bytes | None) -> lark.Lark | None:

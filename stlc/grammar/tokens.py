@@ -172,22 +172,13 @@ def _attach(text: str, tokens: list[Token]) -> tuple[Comment, ...]:
     for index, token in enumerate(tokens):
         found, apart = _comments(text, offset, token.start, first=previous < 0)
         found = _give_trailing(tokens, previous, found)
-        inside = _inside(token)
-        tokens[index] = replace(token, before=(*found, *inside), apart=apart)
+        # `always@` and `not in` consist of two words or signs; a comment between these moves before the token
+        inside = _COMMENT.finditer(token.text) if token.kind in _WITH_BLANKS else ()
+        moved = (Comment(match[0].rstrip(), own_line=True) for match in inside)
+        tokens[index] = replace(token, before=(*found, *moved), apart=apart)
         previous, offset = index, token.end
     rest, _ = _comments(text, offset, len(text), first=previous < 0)
     return _give_trailing(tokens, previous, rest)
-
-
-def _inside(token: Token) -> tuple[Comment, ...]:
-    """Return the comments inside a token.
-
-    The tokens `always@` and `not in` can contain a comment, because they consist of two words or signs. The
-    formatter moves the comment before the token.
-    """
-    if token.kind not in _WITH_BLANKS:
-        return ()
-    return tuple(Comment(match[0].rstrip(), own_line=True) for match in _COMMENT.finditer(token.text))
 
 
 def _give_trailing(tokens: list[Token], index: int, found: tuple[Comment, ...]) -> tuple[Comment, ...]:

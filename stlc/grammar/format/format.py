@@ -197,7 +197,9 @@ def _bracket(text: Text, opening: int) -> Group:
     inside: list[Doc] = [edge]
     start = opening + 1
     while start < closing:
-        comma = _comma(text, start, closing)
+        comma = start
+        while comma < closing and text.tokens[comma].text != ",":
+            comma = behind(text, comma)
         inside += _entry(text, start, comma)
         if comma < closing:
             inside += [_word(text, comma), LINE]
@@ -205,17 +207,6 @@ def _bracket(text: Text, opening: int) -> Group:
     if len(inside) == 1:
         return Group((_word(text, opening), _word(text, closing)))
     return Group((_word(text, opening), Nest(tuple(inside)), edge, _word(text, closing)))
-
-
-def _comma(text: Text, start: int, end: int) -> int:
-    """Return the index of the first comma from `start` on that is outside of brackets.
-
-    If there is no such comma before `end`, the result is `end`.
-    """
-    index = start
-    while index < end and text.tokens[index].text != ",":
-        index = behind(text, index)
-    return index
 
 
 def _entry(text: Text, start: int, end: int) -> tuple[Doc, ...]:
@@ -251,7 +242,12 @@ def lay_out(layout: TokenLayout, unclear: Sequence[Ambiguity], *, width: int) ->
     for item in layout.items:
         first = bisect_left(spans, (item.tokens[0].start, 0))
         last = bisect_left(spans, (item.tokens[-1].end, 0))
-        _item(_with_parentheses(item, spans[first:last]), page, width)
+        tokens = _with_parentheses(item, spans[first:last]).tokens
+        tags = _tags(tokens)
+        body = tokens[sum(map(len, tags)) :]
+        for part, kind in (*((tag, "tag") for tag in tags), (body, item.rule)):
+            _comments(part[0].before, page)
+            _declaration(prepare(_bare(part)), kind, page, width)
     _comments(layout.rest, page)
     lines = align(page.columns)
     return "".join(f"{line}\n" for line in lines)
@@ -260,16 +256,6 @@ def lay_out(layout: TokenLayout, unclear: Sequence[Ambiguity], *, width: int) ->
 def _comments(comments: Sequence[Comment], page: _Page) -> None:
     for comment in comments:
         page.add(comment.text, apart=comment.apart, kind="comment")
-
-
-def _item(item: Item, page: _Page, width: int) -> None:
-    """Add the lines of an item (comments, tags, declaration) to `page`."""
-    for tag in _tags(item.tokens):
-        _comments(tag[0].before, page)
-        _declaration(prepare(_bare(tag)), "tag", page, width)
-    body = item.tokens[sum(map(len, _tags(item.tokens))) :]
-    _comments(body[0].before, page)
-    _declaration(prepare(_bare(body)), item.rule, page, width)
 
 
 def _bare(tokens: Sequence[Token]) -> tuple[Token, ...]:

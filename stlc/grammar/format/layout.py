@@ -119,10 +119,11 @@ def _fits(group: Group, rest: Sequence[_Entry], room: int) -> bool:
             inside.extend((0, flat, part) for part in reversed(doc.parts))
             continue
         width = _width(doc)
-        if isinstance(doc, Word) and flat and (doc.before or doc.after is not None):
+        commented = isinstance(doc, Word) and (bool(doc.before) or doc.after is not None)
+        if commented and flat:
             return False
         room -= width
-        if room < 0 or _ends_line(doc, flat=flat):
+        if room < 0 or commented or (isinstance(doc, Line) and not flat):
             break
     return room >= 0
 
@@ -139,13 +140,6 @@ def _width(doc: Word | Blank | Line) -> int:
             return len(text)
         case _:
             return 1
-
-
-def _ends_line(doc: Word | Blank | Line, *, flat: bool) -> bool:
-    """True for a word with a comment, and for a line break unless the text is printed `flat`."""
-    if isinstance(doc, Word):
-        return bool(doc.before) or doc.after is not None
-    return isinstance(doc, Line) and not flat
 
 
 class _Page:
