@@ -97,7 +97,8 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
     known = rigid or [arg for arg in args if not arg.bare]
     if not known:
         return tuple(args), Number(ir.Const(0.0), DIMENSIONLESS, True, True, span=span)
-    unit, sense = known[0].unit, _sense(args)
+    unit, senses = known[0].unit, {arg.sense for arg in args}
+    sense: Sense = "open" if "open" in senses else "difference" if "difference" in senses else ""
     bare = next((arg for arg in args if arg.bare), None)
     if bare is not None and sense == "open":
         scope.fail(_which(bare, SYMBOLS["degC"], span))
@@ -217,7 +218,9 @@ def _units(
     if function.rule == "same":
         return _alike(function, args, span, scope)
     scaled = _scaled_point(function, args)
-    args = _in_kelvin(function, args, span, scope)
+    if function.rule == "sign":
+        args = [_length(function, arg, span, scope) for arg in args]
+    args = [absolute(arg) for arg in args]
     match function.rule:
         case "ratio":
             return agree(args, _verb(function), span, scope)[0], Number(ir.Const(0.0), span=span)
@@ -265,17 +268,6 @@ def _alike(function: Function, args: Sequence[Number], span: Span, scope: Scope)
     elif blank.sense == "difference" and any(not arg.sense and arg.constant is None for arg in args):
         blank = replace(blank, sense="")
     return found, blank
-
-
-def _in_kelvin(function: Function, args: Sequence[Number], span: Span, scope: Scope) -> list[Number]:
-    if function.rule == "sign":
-        args = [_length(function, arg, span, scope) for arg in args]
-    return [absolute(arg) for arg in args]
-
-
-def _sense(args: Sequence[Number]) -> Sense:
-    senses = [arg.sense for arg in args]
-    return "open" if "open" in senses else "difference" if "difference" in senses else ""
 
 
 def _length_or_multiple(function: Function, args: Sequence[Number], unit: Unit) -> bool:
@@ -627,17 +619,12 @@ def _mismatch(left: Number, right: Number, what: str, span: Span) -> Diagnostic:
     preposition = {"add": "and", "subtract": "and", "take the modulo of": "and"}.get(what, "with")
     verb = f"cannot {what}" if not what.startswith("`") else f"{what} cannot combine"
     labels = tuple(
-        Label(side.span, _sided(side))
+        Label(side.span, f"[{side.unit}]" + ("" if side.origin is None else f", {side.origin.text}"))
         for side in (left, right)
         if side.span is not None and side.span != span
     )
     headline = f"{verb} [{left.unit}] {preposition} [{right.unit}]"
     return Diagnostic("E203", headline, span, labels=labels, help=_repair(left, right, span))
-
-
-def _sided(side: Number) -> str:
-    declared = f", {side.origin.text}" if side.origin is not None else ""
-    return f"[{side.unit}]{declared}"
 
 
 def _repair(left: Number, right: Number, span: Span) -> tuple[str, ...]:

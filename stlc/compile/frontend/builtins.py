@@ -456,7 +456,10 @@ def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope)
     span, exprs = call.span, [arg.value for arg in call.args]
     if name in ("deg", "rad"):
         angle = as_number(values[0], exprs[0], Expectation(f"`{name}` converts an angle"), scope)
-        return _convert(name, angle, span, scope)
+        ratio = Fraction(math.pi) / 180  # an angle in degrees is a plain number
+        (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)
+        factor = literal(1 / ratio if name == "deg" else ratio, span)
+        return replace(apply("mul", (angle, factor), span, scope), flexible=False, bare=False)
     if name == "sdist":
         point = as_vector(values[0], exprs[0], Expectation("`sdist` takes a point"), scope)
         place = values[1]
@@ -472,17 +475,6 @@ def _rewritten(name: str, call: ast.Call, values: Sequence[Value], scope: Scope)
     return (
         dot(left, right, span, scope) if name == "dot" else norm(minus(left, right, span, scope), span, scope)
     )
-
-
-def _convert(name: str, angle: Number, span: Span, scope: Scope) -> Number:
-    """Return `deg(angle)` or `rad(angle)`, by the name of the function.
-
-    Angles in degrees are plain numbers.
-    """
-    ratio = Fraction(math.pi) / 180
-    factor = literal(1 / ratio if name == "deg" else ratio, span)
-    (angle, _), _ = agree((angle, Number(ir.Const(1.0))), f"`{name}`", span, scope)
-    return replace(apply("mul", (angle, factor), span, scope), flexible=False, bare=False)
 
 
 def _indicator(call: ast.Call, values: Sequence[Value], scope: Scope) -> Number:

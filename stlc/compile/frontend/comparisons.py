@@ -89,9 +89,11 @@ def _above(big: Number, small: Number, strict: bool, span: Span, scope: Scope) -
 
     Between integers, `a > b` becomes `a - 1/2 >= b`, and `a >= b` becomes `a + 1/2 >= b`. The threshold is
     then halfway between two whole numbers. So rounding errors do not matter, and the margin agrees with that
-    of `==`.
+    of `==`. Robustness is reported in the unit of the first side that has one and varies, or else of the
+    first that has one.
     """
-    written = _compared(big, small)
+    measured = [side for side in (big, small) if side.unit.text] or [big, small]
+    written = next((side.unit for side in measured if side.constant is None), measured[0].unit)
     if (big.kind, small.kind) == ("int", "int"):
         step = half(span)
         step = in_unit(step, big.unit.interval, scope) if big.unit.offset else step
@@ -104,15 +106,6 @@ def _pred(
 ) -> typed.Predicate:
     unit = (margin.unit if written is None else written).interval
     return typed.Predicate(span, margin.num, strict, unit=unit.si, written=unit)
-
-
-def _compared(*sides: Number) -> Unit:
-    """Return the unit in which the robustness of a comparison of numbers is reported.
-
-    It is the unit of the first number that has one and varies, or else of the first that has one.
-    """
-    measured = [side for side in sides if side.unit.text] or list(sides)
-    return next((side.unit for side in measured if side.constant is None), measured[0].unit)
 
 
 def _refuse_vectors(left: Operand, right: Operand, op: str, scope: Scope) -> None:

@@ -315,19 +315,16 @@ def evaluate(expr: ast.Expr, scope: Scope) -> Value:
     before = meter.nodes
     try:
         _refuse_excess(expr.span, scope)
-        value = _value(expr, scope)
+        operation = OPERATIONS.get(type(expr))
+        if operation is None:
+            value = _HANDLERS[type(expr)](expr, scope)
+        else:
+            value = operation.value(expr, evaluate_all(operation.parts(expr), scope), scope)
         if type(expr) in _REPEATS and _REPEATS[type(expr)](expr, value):
             _charge(Cost(meter.nodes - before), expr.span, scope)
         return at(value, expr.span)
     finally:
         meter.leave()
-
-
-def _value(expr: ast.Expr, scope: Scope) -> Value:
-    operation = OPERATIONS.get(type(expr))
-    if operation is None:
-        return _HANDLERS[type(expr)](expr, scope)
-    return operation.value(expr, evaluate_all(operation.parts(expr), scope), scope)
 
 
 def evaluate_all(exprs: Sequence[ast.Expr], scope: Scope) -> list[Value]:

@@ -48,18 +48,15 @@ def read_overrides(
             try:
                 found[name] = parse_expr(Source(f"--set {name}", text))
             except SpecError as error:
-                faults.append(_unreadable(name, text, error))
+                first = error.diagnostics[0]
+                message = f"`--set {name}={text}`: {first.message}"
+                help_ = (f"write a value with its unit: `--set {name}=3s`",)
+                faults.append(Diagnostic("U101", message, first.span, help=help_))
         elif name not in systems and "." not in name:
             faults.append(_unknown(name, own, interface))
     if faults:
         raise UsageError(*faults)
     return found
-
-
-def _unreadable(name: str, text: str, error: SpecError) -> Diagnostic:
-    first = error.diagnostics[0]
-    message = f"`--set {name}={text}`: {first.message}"
-    return Diagnostic("U101", message, first.span, help=(f"write a value with its unit: `--set {name}=3s`",))
 
 
 def _unknown(name: str, own: set[str], interface: Interface | None) -> Diagnostic:

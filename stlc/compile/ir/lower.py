@@ -32,20 +32,12 @@ def as_written(requirement: typed.Requirement) -> typed.Requirement:
     If all predicates of the requirement have the same unit, the divisor of `@scale` is converted to this unit
     as well.
     """
-    unit = _one_unit(requirement.formula)
-    scale = requirement.scale if unit is None or requirement.scale == 1 else requirement.scale / unit.scale
-    return replace(requirement, formula=_in_written_units(requirement.formula), scale=scale)
-
-
-def _one_unit(formula: typed.Formula) -> Unit | None:
-    """Return the unit in which all predicates are written.
-
-    The result is None if the units differ, or if there is no predicate.
-    """
+    formula, scale = requirement.formula, requirement.scale
     units = [node.written for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard]
-    first = next(iter(units), None)
-    alike = first is not None and all(u.same_dims(first) and u.ratio == first.ratio for u in units)
-    return first if alike else None
+    alike = all(unit.same_dims(units[0]) and unit.ratio == units[0].ratio for unit in units)
+    if units and alike and scale != 1:
+        scale /= units[0].scale
+    return replace(requirement, formula=_in_written_units(formula), scale=scale)
 
 
 def _in_written_units(formula: typed.Formula) -> typed.Formula:
@@ -60,7 +52,9 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
         return num
     match num:
         case ir.Const(value):
-            return ir.Const(_divided(value, unit))
+            found = value / unit.scale
+            short = float(f"{found:.14g}")  # 120, not 120.00000000000001
+            return ir.Const(short if math.isclose(short, found, rel_tol=1e-15) else found)
         case ir.Op("mul", (inner, ir.Const(factor))) if factor == unit.scale:
             return inner
         case ir.Op(name, args) if FUNCTIONS[name].linear:
@@ -69,13 +63,6 @@ def in_unit(num: ir.Num, unit: Unit) -> ir.Num:
             return replace(num, yes=in_unit(num.yes, unit), no=in_unit(num.no, unit))
         case _:
             return ir.Op("div", (num, ir.Const(unit.scale)))
-
-
-def _divided(value: float, unit: Unit) -> float:
-    """Convert the constant `value` from SI to `unit` without rounding errors: 120, not 120.00000000000001."""
-    found = value / unit.scale
-    short = float(f"{found:.14g}")
-    return short if math.isclose(short, found, rel_tol=1e-15) else found
 
 
 def lower(formula: typed.Formula, grid: Grid, sink: list[Diagnostic]) -> ir.Formula:

@@ -83,18 +83,11 @@ def _atom(atom: ir.Predicate) -> str:
     `0.5 >= abs(s - 1)` becomes `abs(s - 1) <= 0.5`.
     """
     sign = {(1, True): ">", (1, False): ">=", (-1, True): "<", (-1, False): "<="}[atom.sign, atom.strict]
-    left, right = _sides(atom.num)
+    num = atom.num
+    left, right = num.args if isinstance(num, ir.Op) and num.name == "sub" else (num, ir.Const(0.0))
     if isinstance(left, ir.Const) and not isinstance(right, ir.Const):
         left, right, sign = right, left, _FLIPPED[sign]
     return f"{show_number(left)} {sign} {show_number(right)}"
-
-
-def _sides(num: ir.Num) -> tuple[ir.Num, ir.Num]:
-    match num:
-        case ir.Op("sub", (left, right)):
-            return left, right
-        case _:
-            return num, ir.Const(0.0)
 
 
 def shown(name: str) -> str:
