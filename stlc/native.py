@@ -76,7 +76,7 @@ class SearchOptions:
             the last steps of a plan, or all of its steps, by those of a plan in the library.
         generations: largest number of iterations, in each of which several changes of the best plan are
             tried.
-        enough: robustness at which the search for one initial state ends.
+        target: robustness at which the search for one initial state ends.
         seed: seed of the random changes.
         cycle: number of iterations after which the comparison of violating plans changes: from the least
             robustness to the sum of the shortfalls of all requirements, and back; 0 if it never does. If it
@@ -88,7 +88,7 @@ class SearchOptions:
     factors: NDArray[np.float64]
     library: NDArray[np.float64]
     generations: int
-    enough: float
+    target: float
     seed: int
     cycle: int = 0
     stop: Stop = never
@@ -149,15 +149,15 @@ class Sizes:
 
 
 class Kernel:
-    """Loaded library with the compiled functions `judge` (robustness of plans) and `climb` (local search).
+    """Loaded library with the compiled functions `judge` (robustness of plans) and `local_search`.
 
     Its C code comes from `stlc.compile.backends.c.emit`.
     """
 
     def __init__(self, library: ctypes.CDLL, sizes: Sizes) -> None:
-        self._judge, self._climb = library.judge, library.climb
+        self._judge, self._search = library.judge, library.local_search
         self._judge.argtypes = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4
-        self._climb.argtypes = [
+        self._search.argtypes = [
             *([ctypes.c_int64] * 2 + [ctypes.c_void_p] * 6),
             *(ctypes.c_int64, ctypes.c_int, ctypes.c_double, ctypes.c_uint64, ctypes.c_int),
         ]
@@ -195,7 +195,7 @@ class Kernel:
         _share(rows, batch, 1 if batch < SMALL else threads)
         return rho, seen
 
-    def climb(
+    def local_search(
         self, x0: NDArray[np.float64], plans: NDArray[np.float64], search: SearchOptions, *, threads: int = 1
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Improve plans by batched local search on the exact robustness.
@@ -221,10 +221,10 @@ class Kernel:
         x0, plans = np.ascontiguousarray(x0, dtype=np.float64), np.array(plans, dtype=np.float64, order="C")
         rho = np.full(len(x0), np.nan)
         arrays = [a.ctypes.data for a in (x0, plans, rho, search.bounds, search.factors, search.library)]
-        scalars = (len(search.library), search.generations, search.enough, search.seed, search.cycle)
+        scalars = (len(search.library), search.generations, search.target, search.seed, search.cycle)
 
         def rows(first: int, last: int) -> int:
-            done: int = self._climb(first, last, *arrays, *scalars)
+            done: int = self._search(first, last, *arrays, *scalars)
             return done
 
         _share(rows, len(x0), threads, grain=1, stop=search.stop)

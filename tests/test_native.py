@@ -73,14 +73,14 @@ def test_arrays_of_other_sizes_are_refused() -> None:
     for start, plans in ((x0, u[:1]), (x0[:1], u), (x0[:, :0], u), (x0, u[:, :4]), (x0, u[:, :, :0])):
         for call in (
             lambda: kernel.judge(start, plans),  # noqa: B023 - called at once
-            lambda: kernel.climb(start, plans, search),  # noqa: B023
+            lambda: kernel.local_search(start, plans, search),  # noqa: B023
             lambda: adjoint.pull(start, plans, slopes),  # noqa: B023
             lambda: adjoint.pull_starts(start, plans, slopes),  # noqa: B023
         ):
             with pytest.raises(ValueError, match=r"x0 \(B, 1\) and u \(B, 5, 1\)"):
                 call()
     with pytest.raises(ValueError, match="library of plans"):
-        kernel.climb(x0, u, search)
+        kernel.local_search(x0, u, search)
     for wrong in (replace(slopes, by_rho=np.ones((3, 1))), replace(slopes, by_columns=np.ones((1, 5, 4)))):
         with pytest.raises(ValueError, match="by_"):
             adjoint.pull(x0, u, wrong)

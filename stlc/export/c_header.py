@@ -1,7 +1,7 @@
 """Export of a controller as one C header (C99, C++11): policy, model, monitor and guard.
 
 The guard is that of Meng and Fan (2023). The code is that of the native kernel (the compiled code that
-evaluates plans in stlc), whose functions have short names such as `roll` and `check`. These could collide
+evaluates plans in stlc), whose functions have short names such as `rollout` and `check`. These could collide
 with names in the program that includes the header, so every name gets a prefix.
 """
 

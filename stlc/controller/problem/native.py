@@ -131,11 +131,11 @@ class NativeJudge:
             return each, {}
         return each, dict(zip(self.names, torch.from_numpy(seen).to(x0.dtype).unbind(0), strict=True))
 
-    def climb(
+    def local_search(
         self,
         x0: Tensor,
         plans: Tensor,
-        bank: Tensor,
+        library: Tensor,
         effort: Effort,
     ) -> tuple[Tensor, Tensor]:
         """Improve plans by local search on the exact robustness.
@@ -143,13 +143,13 @@ class NativeJudge:
         Args:
             x0: initial states, (B, n).
             plans: initial plans, (B, T, m).
-            bank: library of plans that satisfy the specification from other states, (k, T, m); may be empty.
+            library: plans that satisfy the specification from other states, (k, T, m); may be empty.
             effort: options of the search.
 
         Returns:
             Plans (B, T, m) and their robustness (B,), in the dtype of `x0`.
         """
-        arrays = [tensor.detach().double().contiguous().numpy() for tensor in (x0, plans, bank)]
+        arrays = [tensor.detach().double().contiguous().numpy() for tensor in (x0, plans, library)]
         how = SearchOptions(
             self._bounds,
             self._factors,
@@ -160,7 +160,7 @@ class NativeJudge:
             effort.cycle,
             effort.stop,
         )
-        best, rho = self.kernel.climb(arrays[0], arrays[1], how, threads=effort.threads)
+        best, rho = self.kernel.local_search(arrays[0], arrays[1], how, threads=effort.threads)
         return torch.from_numpy(best).to(x0.dtype), torch.from_numpy(rho).to(x0.dtype)
 
 

@@ -248,7 +248,7 @@ class Searcher:
         def climb(stop: Stop) -> SearchResult:
             cycle = CYCLE // LANES if self.task.compiled.grid.end is not None else 0
             effort = Effort(-(-tries // LANES), self.enough, seed, cycle, threads, stop)
-            best, _ = native.climb(x0, plans, bank, effort)
+            best, _ = native.local_search(x0, plans, bank, effort)
             rho = self.task.judge(x0, best, states=False).rho
             return SearchResult(x0, best, rho)
 

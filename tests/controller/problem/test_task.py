@@ -65,7 +65,7 @@ def test_plans_and_recordings_have_one_verdict_whatever_the_scale(name: str, tmp
     assert recorded.satisfied is wanted
     assert satisfied(judged.rho).tolist() == satisfied(judged.requirements).all(1).tolist() == [wanted] * 4
     assert task.native is not None
-    _, rho = task.native.climb(x0, u, u[:0], Effort(1, 0.0, 1))
+    _, rho = task.native.local_search(x0, u, u[:0], Effort(1, 0.0, 1))
     assert satisfied(rho).tolist() == [wanted] * 4
     assert bool((plan(task, x0, budget=PlanBudget(evaluations=100)).rho >= -1e-6).all()) is wanted
 

@@ -80,12 +80,12 @@ def test_a_bank_of_plans_is_tried(task: Task) -> None:
 
 
 @pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
-def test_a_native_climb_does_not_depend_on_how_it_is_shared(car_task: Task) -> None:
+def test_a_native_local_search_does_not_depend_on_how_it_is_shared(car_task: Task) -> None:
     x0 = car_task.sample(50, seed=8)
     start = torch.zeros(50, car_task.horizon, 1)
     assert car_task.native is not None
     alone, shared = (
-        car_task.native.climb(x0, start, start[:0], Effort(5, 0.02, seed=3, threads=threads))
+        car_task.native.local_search(x0, start, start[:0], Effort(5, 0.02, seed=3, threads=threads))
         for threads in (1, 3)
     )
     assert torch.equal(alone[0], shared[0])

@@ -72,9 +72,9 @@ def emit_adjoint(
             HEAD,
             _BUMP,
             *passes(motion, plan),
-            *in_parts(UNCHECK, blocks, declared(plan) | declared(plan, room="adjoint", prefix="g")),
-            "static void unroll(const lanes *restrict x, const inputs *restrict u, lanes *restrict gx,",
-            "                   inputs *restrict gu, double slope) {",
+            *in_parts(CHECK_ADJOINT, blocks, declared(plan) | declared(plan, room="adjoint", prefix="g")),
+            "static void rollout_adjoint(const lanes *restrict x, const inputs *restrict u,",
+            "                            lanes *restrict gx, inputs *restrict gu, double slope) {",
             f"  for (int k = {steps} - 1; k >= 0; --k) LANE {{",
             *(f"    {line}" for line in _step_back(motion, fixed)),
             "  }",
@@ -104,8 +104,8 @@ def _step_back(motion: Motion, fixed: Collection[str]) -> list[str]:
     return [*writer.gradients(outputs), *still]
 
 
-UNCHECK = Frame(
-    "uncheck",
+CHECK_ADJOINT = Frame(
+    "check_adjoint",
     (
         "const lanes *restrict x",
         "double *restrict room",
@@ -138,18 +138,18 @@ int pull(int64_t batch, int64_t first, int64_t last, const double *x0, const dou
       for (int k = 0; k < T; ++k) for (int i = 0; i < M; ++i) v[i][k][j] = u[(row * T + k) * M + i];
     }}
     double bad[LANES] = {{0}};
-    roll(x, (const inputs *)v, bad);
+    rollout(x, (const inputs *)v, bad);
     check(x, room, bad, out);
     memset(adjoint, 0, sizeof(double) * ROOM * LANES);
     memset(gx, 0, sizeof(lanes) * N);
     memset(gv, 0, sizeof(double) * M * T * LANES);
     for (int i = 0; i < R; ++i) for (int j = 0; j < LANES; ++j)
       out[i][j] = j < here && !(bad[j] > 0.0) ? g_rho[(at + j) * R + i] : 0.0;
-    uncheck(x, room, adjoint, out, gx);
+    check_adjoint(x, room, adjoint, out, gx);
     if (g_columns)
       for (int i = 0; i < N; ++i) for (int k = 0; k <= T; ++k) for (int j = 0; j < here; ++j)
         gx[i][k][j] += g_columns[((int64_t)i * (T + 1) + k) * batch + at + j];
-    unroll(x, (const inputs *)v, gx, gv, slope);
+    rollout_adjoint(x, (const inputs *)v, gx, gv, slope);
     if (g_x0) for (int j = 0; j < here; ++j) for (int i = 0; i < N; ++i)
       g_x0[(at + j) * N + i] = bad[j] > 0.0 ? 0.0 : gx[i][0][j];
     for (int j = 0; j < here; ++j) for (int k = 0; k < T; ++k) for (int i = 0; i < M; ++i)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from stlc.compile.backends.c.climb import CLIMB
+from stlc.compile.backends.c.local_search import LOCAL_SEARCH
 from stlc.compile.backends.c.numbers import NumberWriter
 from stlc.compile.backends.c.parts import Frame, declared, in_parts
 from stlc.compile.backends.c.plan import Plan, Storage, plan_of
@@ -87,7 +87,7 @@ class Motion:
 
 
 def emit(motion: Motion, formulas: Sequence[ir.Formula], end: End = "strict") -> str:
-    """Return the C source of the functions `judge` (robustness) and `climb` (local search).
+    """Return the C source of the functions `judge` (robustness) and `local_search`.
 
     `stlc.native` describes these functions. With `end` "truncate", windows are cut at the end of the plan.
 
@@ -103,7 +103,7 @@ def emit(motion: Motion, formulas: Sequence[ir.Formula], end: End = "strict") ->
             HEAD,
             f"static const int MOVING[] = {{{moving}}};",
             *passes(motion, plan, read),
-            (_DRIVER + CLIMB).format(
+            (_DRIVER + LOCAL_SEARCH).format(
                 states=states,
                 controls=len(motion.controls),
                 steps=steps,
@@ -120,7 +120,7 @@ def state_index(motion: Motion) -> dict[str, int]:
 
 
 def passes(motion: Motion, plan: Plan, read: Collection[str] | None = None) -> list[str]:
-    """Return the lines of the C functions `roll` (computes states) and `check` (computes robustness).
+    """Return the lines of the C functions `rollout` (computes states) and `check` (computes robustness).
 
     States that do not change are copied from the first sample to all others, or only those in `read`.
     """
@@ -129,7 +129,7 @@ def passes(motion: Motion, plan: Plan, read: Collection[str] | None = None) -> l
         "typedef double lane[LANES];",
         f"typedef double lanes[{motion.steps + 1}][LANES];",
         f"typedef double inputs[{motion.steps}][LANES];",
-        "static void roll(lanes *restrict x, const inputs *restrict u, double *restrict bad) {",
+        "static void rollout(lanes *restrict x, const inputs *restrict u, double *restrict bad) {",
         f"  for (int k = 0; k < {motion.steps}; ++k) LANE {{",
         *(f"    {line}" for line in _step(motion)),
         "  }",
@@ -252,7 +252,7 @@ int judge(int64_t batch, int64_t first, int64_t last, const double *x0, const do
       for (int k = 0; k < T; ++k) for (int i = 0; i < M; ++i) v[i][k][j] = u[(row * T + k) * M + i];
     }}
     double bad[LANES] = {{0}};
-    roll(x, (const inputs *)v, bad);
+    rollout(x, (const inputs *)v, bad);
     check(x, room, bad, out);
     for (int j = 0; j < here; ++j) for (int i = 0; i < R; ++i)
       rho[(at + j) * R + i] = bad[j] > 0.0 ? NAN : out[i][j];

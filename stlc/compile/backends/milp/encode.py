@@ -161,7 +161,7 @@ class Encoding:
 
     # ------------------------------------------------------------------ dynamics
 
-    def roll(
+    def rollout(
         self,
         x0: Mapping[str, float],
         bounds: Mapping[str, tuple[float, float]],

@@ -247,7 +247,7 @@ def _encoded(
             Demand(rule.formula, rho.times(1.0 / factor))
             for rule, factor in zip(task.rules, factors, strict=True)
         ]
-        trees = encoding.roll(x0, bounds, step.lets, step.next, task.system.horizon, wanted)
+        trees = encoding.rollout(x0, bounds, step.lets, step.next, task.system.horizon, wanted)
         for tree, factor in zip(trees, factors, strict=True):
             if maximise:
                 encoding.model.limit(rho, factor * encoding.model.most(tree))

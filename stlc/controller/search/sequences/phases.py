@@ -301,7 +301,7 @@ class Phases:
             self._bounds, np.ones(1), self._bank, effort * GENERATIONS, 0.0, int(random.integers(2**62))
         )
         self.tried += len(kept) * effort * GENERATIONS * LANES
-        best, rho = self._kernel.climb(rows, best[kept], options)
+        best, rho = self._kernel.local_search(rows, best[kept], options)
         return best, np.nan_to_num(rho, nan=-np.inf)
 
     def _twice(self, row: Numbers, ask: Ask, plans: Numbers, random: Generator) -> tuple[Numbers, Numbers]:

@@ -1,13 +1,12 @@
 """Local search over plans in C: each generation perturbs the best plan and keeps the best candidate.
 
-The code is appended to the source of `emit` and calls its functions `roll` (rollout) and `check`
-(robustness). Each initial state has its own random stream, so the result does not depend on the number of
-threads.
+The code is appended to the source of `emit` and calls its functions `rollout` and `check` (robustness).
+Each initial state has its own random stream, so the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
 
-CLIMB = """
+LOCAL_SEARCH = """
 /* Random numbers: splitmix64 (Steele, Lea & Flood, 2014); a normal one is the sum of four uniform ones. */
 static inline uint64_t draw(uint64_t *s) {{
   uint64_t z = (*s += 0x9E3779B97F4A7C15ull);
@@ -39,11 +38,12 @@ static void change(lane *restrict v, int j, int kind, double low, double high, i
   }}
 }}
 
-/* A plan that solved another state, whole or from some step on; levels over quarters while there are none. */
-static void borrow(inputs *restrict v, int j, const double *restrict bank, int64_t plans,
-                   const double *restrict low, const double *restrict high, uint64_t *s) {{
-  if (plans > 0) {{
-    const double *from = bank + (int64_t)(uniform(s) * (double)plans) * {steps} * {controls};
+/* Replaces all or the last steps of a plan by those of a plan in the library, or by four random levels if
+   the library is empty. */
+static void transplant(inputs *restrict v, int j, const double *restrict library, int64_t stored,
+                       const double *restrict low, const double *restrict high, uint64_t *s) {{
+  if (stored > 0) {{
+    const double *from = library + (int64_t)(uniform(s) * (double)stored) * {steps} * {controls};
     const int first = draw(s) & 1 ? 0 : below(s, {steps});
     for (int i = 0; i < {controls}; ++i)
       for (int k = first; k < {steps}; ++k) v[i][k][j] = from[k * {controls} + i];
@@ -64,9 +64,9 @@ static void borrow(inputs *restrict v, int j, const double *restrict bank, int64
    for rules of safety ({rules}). Plans are compared by the worst rule. If cycle > 0, this changes after so
    many generations: by the sum over rules of what each lacks, r / (1 + r) or log(1 + r), then by the worst
    rule, and so on. Of plans that violate rules, a safe one with the least sum of logarithms is returned. */
-int climb(int64_t first, int64_t last, const double *x0, double *plans, double *rho, const double *bounds,
-          const double *factors, const double *bank, int64_t banked, int generations, double enough,
-          uint64_t seed, int cycle) {{
+int local_search(int64_t first, int64_t last, const double *x0, double *plans, double *rho,
+                 const double *bounds, const double *factors, const double *library, int64_t stored,
+                 int generations, double target, uint64_t seed, int cycle) {{
   enum {{ N = {states}, M = {controls}, T = {steps}, R = {rules} }};
   const double UNSAFE = 1e6; /* more than any sum of logarithms */
   const double *low = bounds, *high = bounds + M, *turns = bounds + 2 * M;
@@ -80,19 +80,19 @@ int climb(int64_t first, int64_t last, const double *x0, double *plans, double *
     double *plan = plans + row * T * M, most = -INFINITY, best = -INFINITY; /* of all; of the present one */
     memcpy(now, plan, sizeof(double) * M * T);
     for (int i = 0; i < N; ++i) LANE x[i][0][j] = x0[row * N + i];
-    for (int g = 0; g < generations && most < enough; ++g) {{
+    for (int g = 0; g < generations && most < target; ++g) {{
       const int begins = cycle ? g % cycle == 0 : g == 0, by = cycle ? (g / cycle + 1) % 3 : 0;
       if (begins) best = -INFINITY;
       for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) LANE v[i][k][j] = now[k * M + i];
       for (int j = begins; j < LANES; ++j) {{
         const int kind = j % 4;
-        if (kind == 3) {{ borrow(v, j, bank, banked, low, high, &s); continue; }}
+        if (kind == 3) {{ transplant(v, j, library, stored, low, high, &s); continue; }}
         const int only = M > 1 && (draw(&s) & 1) ? below(&s, M) : -1;
         for (int i = 0; i < M; ++i)
           if (only < 0 || only == i) change(v[i], j, kind, low[i], high[i], turns[i] > 0.0, &s);
       }}
       double bad[LANES] = {{0}};
-      roll(x, (const inputs *)v, bad);
+      rollout(x, (const inputs *)v, bad);
       check(x, room, bad, out);
       int which = -1, top = -1;
       for (int j = 0; j < LANES; ++j) {{
@@ -110,7 +110,7 @@ int climb(int64_t first, int64_t last, const double *x0, double *plans, double *
         if (all > most) {{ most = all; top = j; }}
         if (by && value < 0.0) value = by == 1 ? -shares : -lack;
         if (value > best) {{ best = value; which = j; }}
-        if (g == 0 && most >= enough) break; /* the plan itself */
+        if (g == 0 && most >= target) break; /* the plan itself */
       }}
       if (top >= 0) for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) plan[k * M + i] = v[i][k][top];
       if (which >= 0) for (int i = 0; i < M; ++i) for (int k = 0; k < T; ++k) now[k * M + i] = v[i][k][which];
