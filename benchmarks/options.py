@@ -50,7 +50,7 @@ class Training:
     clock: Annotated[
         str,
         typer.Option(
-            "--clock",
+            "--budget-clock",
             metavar="wall|processor",
             help="What budgets count; processor time as on an idle machine, for busy ones.",
         ),

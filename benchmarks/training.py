@@ -63,7 +63,7 @@ class Length:
         """Options of `stlc train` that set this length."""
         if self.steps is not None:
             return ("--steps", str(self.steps))
-        return ("--budget", f"{self.seconds:g}s", "--clock", self.clock)
+        return ("--budget", f"{self.seconds:g}s", "--budget-clock", self.clock)
 
 
 @dataclass(frozen=True, slots=True)

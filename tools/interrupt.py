@@ -80,7 +80,7 @@ def _train(
 
 
 def _budget(name: str, spec: str, seconds: float, *options: str, **more: object) -> Kind:
-    words = ("--budget", f"{seconds:g}s", "--clock", "processor", *options)
+    words = ("--budget", f"{seconds:g}s", "--budget-clock", "processor", *options)
     return _train(f"{name}, budget", spec, *words, seconds=seconds, weight=1, budget=seconds, **more)
 
 

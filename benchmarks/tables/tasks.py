@@ -191,7 +191,7 @@ def _policy(cell: TaskCell, trace: Path, runs: Path) -> Iterator[Outcome]:
     try:
         trained = asked(
             *("train", str(cell.task.spec), "--budget", f"{cell.size.train_seconds:g}s"),
-            *("--clock", "processor", "--seed", str(cell.seed), "--runs", str(runs), "--no-pictures"),
+            *("--budget-clock", "processor", "--seed", str(cell.seed), "--runs", str(runs), "--no-pictures"),
             limit=cell.size.limit,
         )
     except NoAnswerError as error:

@@ -93,8 +93,13 @@ def test_drives_of_a_run_fill_a_row_once(
     monkeypatch.chdir(tmp_path)
     (cell,) = _cells("ship_safe", 0, Length(steps=1, clock="processor"), retrain=False, held_out=10)
     runs = Training().place("any").runs_of(cell.key)
-    words = f"train {ROOT / 'specs/ship_safe.stl'} --method guided --seed 0 --steps 1 --clock processor"
-    assert main([*words.split(), *f"--held-out 10 --drives 0 --no-pictures -q --runs {runs}".split()]) in (
+    words = f"train {ROOT / 'specs/ship_safe.stl'} --method guided --seed 0 --steps 1"
+    assert main(
+        [
+            *words.split(),
+            *f"--budget-clock processor --held-out 10 --drives 0 --no-pictures -q --runs {runs}".split(),
+        ]
+    ) in (
         0,
         1,
     )

@@ -76,7 +76,7 @@ def test_a_minute_of_training_satisfies_the_task(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With the guard that training recommends, and as often as it reports."""
-    budget = ["--budget", "60s", "--clock", "processor", "--threads", "1", "--seed", "1"]
+    budget = ["--budget", "60s", "--budget-clock", "processor", "--threads", "1", "--seed", "1"]
     words = ["train", str(TASKS / f"{name}.stl"), *budget, "--no-pictures", "--runs", str(tmp_path)]
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["result"]["closed_loop"]

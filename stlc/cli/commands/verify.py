@@ -44,12 +44,13 @@ def verify(
 ) -> Answer[Verified]:
     """Prove plans or closed loops on boxes of states.
 
-    Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion and
-    robustness show that one proposal of the network satisfies the specification from every state in it. It is
-    refuted if the policy violates the specification from a sampled state. More time proves more, and so do
-    more processes (--jobs), each of which has the whole budget if --clock is processor. With --states, boxes
-    are also searched around random initial states; the number of states with a proof bounds the share of all
-    states that have one, with 95 % confidence. Exit code: 0 all proved, 1 a counterexample was found, 4 open;
+    Each way to draw an initial state is divided into boxes. A box is proved if bounds on network, motion
+    and robustness show that one proposal of the network satisfies the specification from every state in it.
+    It is refuted if the policy violates the specification from a sampled state. More time proves more, and
+    so do more processes (--jobs); each has the whole budget if --budget-clock is processor. With --states,
+    boxes are also searched around random initial states; the number of states with a proof bounds the share
+    of all states that have one, with 95 % confidence. Exit code: 0 all proved, 1 a counterexample was
+    found, 4 open;
     with --fail-under, 0 if at least that share is proved.
 
     With --controller, a network acts on the system of SPEC once per period, and the whole horizon is proved,

@@ -14,7 +14,7 @@ OPTIONS: dict[str, str] = {
     "Method": "method option target tube seed seeds random lr batch plans held-out falsify agents steps "
     "boxes continuous stdio quick",
     "Guard": "backup guard time-limit margin known-feasible",
-    "Budget": "budget evaluations simulations drives jobs cluster device threads stream",
+    "Budget": "budget budget-clock evaluations simulations drives jobs cluster device threads stream",
     "Verdict": "at end semantics tolerance uncertain strict fail-under certify share confidence width shift",
     "Output": "out record name json junit table robustness pictures window live windows log format "
     "precision float show places guarantee check diff fix watch sort force runs",
@@ -26,11 +26,12 @@ MOVED_OPTIONS = {
     "--time": "--budget",
     "--max-drives": "--drives",
     "--ceiling": "--known-feasible",
+    "--clock": "--budget-clock",
 }
 """Former name of an option -> its name."""
 
 _TITLES = {f"--{name}": title for title, names in OPTIONS.items() for name in names.split()}
-_TITLES |= {"train --clock": "Budget", "verify --clock": "Budget", "train --steps": "Budget"}
+_TITLES |= {"train --steps": "Budget"}
 _TITLES |= {"init --spec": "Output", "init --system": "Output"}
 
 

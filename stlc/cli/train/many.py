@@ -89,7 +89,7 @@ class Many:
             "--seed": part.seed,
             "--system": self.system,
             "--budget": None if config.budget is None else f"{config.budget!r}s",
-            "--clock": config.clock,
+            "--budget-clock": config.clock,
             "--steps": config.steps,
             "--method": config.method,
             "--name": name,

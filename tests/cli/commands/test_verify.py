@@ -48,7 +48,7 @@ def test_the_document(run: str, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.slow
 def test_processes_give_the_same_result(run: str, capsys: pytest.CaptureFixture[str]) -> None:
     found = []
-    for options in ([], ["--jobs", "2"], ["--jobs", "2", "--clock", "processor"]):
+    for options in ([], ["--jobs", "2"], ["--jobs", "2", "--budget-clock", "processor"]):
         assert main(["verify", run, "--boxes", "40", "--budget", "1h", "--json", *options]) == 1
         found.append(json.loads(capsys.readouterr().out)["result"]["modes"])
     assert found[0] == found[1] == found[2]
@@ -66,7 +66,7 @@ def test_boxes_around_random_states(run: str, capsys: pytest.CaptureFixture[str]
     assert result["states"] == sum(mode["states"] for mode in result["modes"]) == 3
     assert result["states_proved"] + result["states_violated"] <= 3
     assert result["states_share"] <= result["states_proved"] / 3
-    main(["verify", run, "--boxes", "1", "--states", "3", "--clock", "processor"])
+    main(["verify", run, "--boxes", "1", "--states", "3", "--budget-clock", "processor"])
     text = capsys.readouterr().out
     assert " of 3 random initial states are in a proved box" in text
     (least,) = re.findall(r"at least (\d+\.\d\d) % of all", text)  # rounded down
@@ -80,4 +80,4 @@ def test_what_cannot_be_verified_is_refused(
     capsys.readouterr()
     assert main(["verify", shooting]) == 2
     assert "can be verified" in capsys.readouterr().err
-    assert main(["verify", run, "--clock", "moon"]) == 2
+    assert main(["verify", run, "--budget-clock", "moon"]) == 2

@@ -62,7 +62,7 @@ def test_options_out_of_range_are_usage_errors_and_make_no_run(
         ["--lr", "1e-3"],
         ["--threads", "1"],
         ["--set", "T_red=3s"],
-        ["--clock", "processor"],
+        ["--budget-clock", "processor"],
     ],
 )
 def test_what_a_resumed_run_cannot_change_is_refused(
