@@ -20,7 +20,7 @@ from stlc.compile.ir.discretize import Grid
 from stlc.diagnostics import Diagnostic
 from stlc.dynamics.declaration.deployment import BackupDecl, JudgeRef, ScenarioDecl, TestDecl, WorldRef
 from stlc.dynamics.declaration.functions import FunctionDecl
-from stlc.dynamics.declaration.init import InitDecl, Situation
+from stlc.dynamics.declaration.init import InitDecl
 from stlc.dynamics.declaration.inputs import InputDecl
 from stlc.dynamics.declaration.learning import Feedback, ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.declaration.motion import Assign, JumpDecl
@@ -232,13 +232,31 @@ def describe(decl: SystemDecl) -> str:
     moves |= {assign.name: f"= {assign.text}" for assign in decl.updates}
     apart = {*decl.hidden, *(each.name for each in decl.inputs)}
     states = [column for column in decl.signature.columns if column.name not in apart]
+    weights = sum(situation.weight for situation in decl.init.mixture) or 1.0
     blocks = (
         ("states", [_state(each, moves.get(each.name)) for each in states]),
         ("input signals", [_input(each) for each in decl.inputs]),
-        ("controls", [_control(decl, index) for index in range(len(decl.controls))]),
+        (
+            "controls",
+            [
+                (
+                    each.name,
+                    f"[{each.unit}]" * bool(each.unit.text),
+                    f"[{each.low:g}, {each.high:g}]",
+                    each.squash,
+                )
+                for each in decl.controls
+            ],
+        ),
         ("feedback beneath the plans", _feedback(decl)),
         ("jumps", jumps),
-        ("initial situations", _situations(decl.init.mixture)),
+        (
+            "initial situations",
+            [
+                (each.name or f"situation {index}", f"{100 * each.weight / weights:.3g} %")
+                for index, each in enumerate(decl.init.mixture, 1)
+            ],
+        ),
         ("kept where", [(text,) for text in decl.init.where_text]),
         ("scenarios", [(scenario.name, scenario.doc) for scenario in decl.scenarios]),
     )
@@ -268,12 +286,6 @@ def _values(column: Column) -> str:
     return f"[{column.low:g}, {column.high:g}]" + (" clamped" if column.fact else "")
 
 
-def _control(decl: SystemDecl, index: int) -> Row:
-    control = decl.controls[index]
-    unit = f"[{control.unit}]" if control.unit.text else ""
-    return control.name, unit, f"[{control.low:g}, {control.high:g}]", control.squash
-
-
 def _feedback(decl: SystemDecl) -> list[Row]:
     """Return one row per control that describes the feedback law.
 
@@ -291,14 +303,6 @@ def _feedback(decl: SystemDecl) -> list[Row]:
         unit = f"[{control.unit}]" if control.unit.text else ""
         rows.append((control.name, unit, f"actuator [{feedback.low[i]:g}, {feedback.high[i]:g}]", law))
     return rows
-
-
-def _situations(mixture: Sequence[Situation]) -> list[Row]:
-    total = sum(situation.weight for situation in mixture) or 1.0
-    return [
-        (situation.name or f"situation {index + 1}", f"{100 * situation.weight / total:.3g} %")
-        for index, situation in enumerate(mixture)
-    ]
 
 
 def _table(title: str, rows: Sequence[Row]) -> list[str]:

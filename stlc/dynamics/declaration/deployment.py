@@ -38,8 +38,8 @@ from stlc.dynamics.schema.record import (
     values_of,
     word,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Node, Scalar
 from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.schema.yaml_nodes import Node, Scalar
 from stlc.files import named_in
 from stlc.grammar import ast
 from stlc.runtime.prefixes import SAMPLES, SAMPLINGS, Sampling
@@ -336,12 +336,10 @@ def read_scenarios(node: Node | None, cx: Context) -> tuple[ScenarioDecl, ...]:
     All of them are checked, although a simulation uses only one.
     """
     return tuple(
-        _scenario(entry, cx)
+        ScenarioDecl(
+            entry.key.text,
+            **values_of(ScenarioDecl, cx.timed, entry.value, f"the scenario `{entry.key.text}`", OF),
+        )
         for entry in cx.reader.entries(node, "`scenario`")
         if cx.reader.nameable(entry.key, "the name of a scenario")
     )
-
-
-def _scenario(entry: Entry, cx: Context) -> ScenarioDecl:
-    name = entry.key.text
-    return ScenarioDecl(name, **values_of(ScenarioDecl, cx.timed, entry.value, f"the scenario `{name}`", OF))

@@ -328,12 +328,20 @@ def _draws(decl: InputDecl) -> tuple[Assign, ...]:
 def _present(decl: InputDecl, dt: Fraction) -> ir.Num:
     """Return the value of an input signal now, as an expression of the clock and the signal's numbers."""
     points: list[ir.Num] = [ir.Signal(name) for name in decl.values]
-    if decl.interpolate == "hold":
-        return _piece(points, _passed(decl, dt))
-    ends = _ends(decl)
     least = ir.Const(SLACK * float(decl.duration))
-    widths = [_largest(_minus(after, before), least) for before, after in pairwise(ends)]
+    times = [ir.Signal(name) for name in decl.times]
     now = multiply(ir.Signal(CLOCK), ir.Const(float(dt)))
+    if decl.interpolate == "hold":
+        if decl.free_times:
+            passed = [_minus(add(now, least), time) for time in times]
+        else:
+            instants = (ir.Const(float(math.ceil(end / dt))) for end in decl.ends[1:-1])
+            passed = [_minus(ir.Signal(CLOCK), instant) for instant in instants]
+        return _piece(points, passed)
+    ends: list[ir.Num] = [ir.Const(float(end)) for end in decl.ends]
+    if decl.free_times:
+        ends = [ir.Const(0.0), *times, ir.Const(float(decl.duration))]
+    widths = [_largest(_minus(after, before), least) for before, after in pairwise(ends)]
     unit = (ir.Const(0.0), ir.Const(1.0))
     shares = [
         ir.Op("clip", (_over(_minus(now, before), width), *unit))
@@ -361,24 +369,6 @@ def _piece(points: Sequence[ir.Num], passed: Sequence[ir.Num]) -> ir.Num:
     half = len(passed) // 2
     later, earlier = _piece(points[half + 1 :], passed[half + 1 :]), _piece(points[: half + 1], passed[:half])
     return ir.Where(ir.Predicate(passed[half]), later, earlier)
-
-
-def _passed(decl: InputDecl, dt: Fraction) -> tuple[ir.Num, ...]:
-    """Return one number for each piece but the first: negative before the piece begins, then 0 or more."""
-    count = ir.Signal(CLOCK)
-    if not decl.free_times:
-        return tuple(_minus(count, ir.Const(float(math.ceil(end / dt)))) for end in decl.ends[1:-1])
-    slack = ir.Const(SLACK * float(decl.duration))
-    now = add(multiply(count, ir.Const(float(dt))), slack)
-    return tuple(_minus(now, ir.Signal(name)) for name in decl.times)
-
-
-def _ends(decl: InputDecl) -> tuple[ir.Num, ...]:
-    """Return the ends of the pieces in seconds."""
-    if not decl.free_times:
-        return tuple(ir.Const(float(end)) for end in decl.ends)
-    inner = (ir.Signal(name) for name in decl.times)
-    return (ir.Const(0.0), *inner, ir.Const(float(decl.duration)))
 
 
 def _cubic(rise: ir.Num, share: ir.Num, left: ir.Num, right: ir.Num) -> ir.Num:

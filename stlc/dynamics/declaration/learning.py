@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from typing import Any
 
 from stlc.compile.frontend.arithmetic import absolute
@@ -297,7 +296,10 @@ class TrainDecl:
     """The section `train`: training settings of this system; None leaves a setting to the training method."""
 
     budget: float | None = key(
-        Kind(lambda cx, node, label: _seconds(cx.here.duration(node, label)), EXPRESSION),
+        Kind(
+            lambda cx, node, label: None if (time := cx.here.duration(node, label)) is None else float(time),
+            EXPRESSION,
+        ),
         "time for training; 60 s by default",
     )
     steps: int | None = key(integer(), "optimiser steps; takes precedence over `budget`")
@@ -309,7 +311,3 @@ class TrainDecl:
     reward: ir.Num | None = key(
         _absolute, "reward of a step by states after it and controls in it, for `reward: task`"
     )
-
-
-def _seconds(value: Fraction | None) -> float | None:
-    return None if value is None else float(value)

@@ -280,7 +280,15 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
     """
     if len(assigns) < 2:
         return tuple(assigns)
-    readers = Counter(draw for assign in assigns for draw in _samplers(assign.value))
+    readers = Counter(
+        draw
+        for assign in assigns
+        for draw in {
+            id(part)
+            for part in subexpressions(assign.value)
+            if isinstance(part, ir.Op) and part.name in _SAMPLERS
+        }
+    )
     shared = {draw for draw, count in readers.items() if count > 1}
     if not shared:
         return tuple(assigns)
@@ -299,9 +307,3 @@ def shared_draws(assigns: Sequence[Assign]) -> tuple[Assign, ...]:
 
     changed = [replace(assign, value=rewritten(assign.value)) for assign in assigns]
     return (*before, *changed)
-
-
-def _samplers(num: ir.Num) -> set[int]:
-    """Return the identities (`id`) of the samplers that occur in a number."""
-    parts = subexpressions(num)
-    return {id(part) for part in parts if isinstance(part, ir.Op) and part.name in _SAMPLERS}

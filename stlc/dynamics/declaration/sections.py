@@ -170,7 +170,11 @@ def _declaration(
     names, cx = named.cx.names, named.cx
     motion = _motion(found, named)
     sampled, flow, jumps = motion.sampled, motion.flow, motion.jumps
-    _report_set((*flow, *(each for jump in jumps for each in jump.resets)), sampled, cx)
+    computed = {each.name for each in sampled.updates}
+    assigns = (*flow, *(each for jump in jumps for each in jump.resets))
+    for name in dict.fromkeys(base_name(each.name) for each in assigns if each.name in computed):
+        message = f"`{name}` is computed at every sample, so that `flow` and jumps cannot set it"
+        reader.report("S202", message, names.places[name])
     flow += sampled.flow
     _report_idle(found.control, cx, flow, jumps)
     spec = reader.text(found.spec, "`spec`")
@@ -252,14 +256,6 @@ def _observing(policy: PolicyDecl, hidden: tuple[str, ...], cx: Context) -> Poli
         return policy
     seen = (column.name for column in cx.names.columns if column.name not in hidden)
     return replace(policy, observe=tuple(map(ir.Signal, seen)))
-
-
-def _report_set(assigns: SequenceType[Assign], sampled: Sampled, cx: Context) -> None:
-    """Report S202 where `flow` or a jump sets a column that is computed at every sample."""
-    computed = {each.name for each in sampled.updates}
-    for name in dict.fromkeys(base_name(each.name) for each in assigns if each.name in computed):
-        message = f"`{name}` is computed at every sample, so that `flow` and jumps cannot set it"
-        cx.reader.report("S202", message, cx.names.places[name])
 
 
 def _report_idle(
@@ -456,19 +452,12 @@ def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader
             inner = _replaced(old, rest, value, key, reader) if rest else value
             return node.replaced(Scalar(value.span, head), inner)
         case _:
-            return _missing(node, head, value, key, reader)
-
-
-def _missing(node: Node, head: str, value: Node, key: str, reader: Reader) -> Node:
-    """Report S101: `--set` names a field that does not exist. Return `node` unchanged.
-
-    `head` is the part of the dotted key `key` that `node` lacks. `value` gives the location of the message.
-    """
-    keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
-    near = closest(head, keys)
-    guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
-    reader.report("S101", f"`--set {key}`: there is no `{head}` in the system file", value.span, guess)
-    return node
+            keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
+            near = closest(head, keys)
+            guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
+            message = f"`--set {key}`: there is no `{head}` in the system file"
+            reader.report("S101", message, value.span, guess)
+            return node
 
 
 def _given_states(init: InitDecl, overrides: MappingType[str, str], named: _Named) -> InitDecl:

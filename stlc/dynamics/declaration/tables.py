@@ -98,7 +98,9 @@ def _table(entry: Entry, cx: Context) -> TableDecl | None:
         points = _rows(keys.at, units, f"`at` of {where}", cx)
         rows = cx.reader.items(keys.values, f"`values` of {where}")
     numbers = tuple(_numbers(row, keys.unit, f"`values` of {where}", cx) for row in rows)
-    values = tuple(tuple(map(_value, row)) for row in numbers)
+    values = tuple(
+        tuple(number.value if isinstance(number, ir.Const) else math.nan for number in row) for row in numbers
+    )
     table = TableDecl(entry.key.text, units, keys.unit, points, values, keys.extrapolate)
     if not _sound(table, keys, cx):
         return None
@@ -162,10 +164,6 @@ def _numbers(node: Node, unit: Unit, where: str, cx: Context) -> tuple[ir.Num, .
     return tuple(ir.Const(0.0) if number is None else number for number in found)
 
 
-def _value(number: ir.Num) -> float:
-    return number.value if isinstance(number, ir.Const) else math.nan
-
-
 def _sound(table: TableDecl, keys: TableKeys, cx: Context) -> bool:
     """True if the points of a table increase and its values fit them; else S204 is reported."""
     assert keys.at is not None
@@ -210,8 +208,12 @@ def body(table: TableDecl, values: Sequence[Sequence[ir.Num]], read: Sequence[st
             argument = multiply(argument, ir.Const(1.0 / unit.scale))
         found: list[ir.Num] = []
         for cell, (left, right) in enumerate(pairwise(points)):
-            share = multiply(ir.Op("sub", (argument, ir.Const(left))), ir.Const(1.0 / (right - left)))
-            lets.append((f"share{number}.{cell}", _limited(share, cell, len(points) - 1, table.extrapolate)))
+            share: ir.Num = multiply(ir.Op("sub", (argument, ir.Const(left))), ir.Const(1.0 / (right - left)))
+            if cell > 0 or table.extrapolate != "linear":
+                share = ir.Op("max", (share, ir.Const(0.0)))
+            if cell < len(points) - 2 or table.extrapolate != "linear":
+                share = ir.Op("min", (share, ir.Const(1.0)))
+            lets.append((f"share{number}.{cell}", share))
             found.append(ir.Signal(lets[-1][0]))
         return found
 
@@ -223,16 +225,6 @@ def body(table: TableDecl, values: Sequence[Sequence[ir.Num]], read: Sequence[st
     columns = [ir.Signal(f"column{index}") for index in range(len(values[0]))]
     value = _along(columns, shares(1))
     return ir.Body(("at0", "at1", *read), tuple(lets), (value,))
-
-
-def _limited(share: ir.Num, cell: int, cells: int, extrapolate: Extrapolate) -> ir.Num:
-    """Limit the share of a cell below the argument to [0, 1], except where an outermost cell extrapolates."""
-    goes_on = extrapolate == "linear"
-    if not (goes_on and cell == 0):
-        share = ir.Op("max", (share, ir.Const(0.0)))
-    if not (goes_on and cell == cells - 1):
-        share = ir.Op("min", (share, ir.Const(1.0)))
-    return share
 
 
 def _along(values: Sequence[ir.Num], shares: Sequence[ir.Num]) -> ir.Num:

@@ -43,7 +43,8 @@ def _along(num: ir.Num, slopes: Mapping[str, ir.Num]) -> ir.Num | None:
         case ir.Op("norminf", args):
             return _along(_call("max", *(_call("abs", arg) for arg in args)), slopes)
         case ir.Op(name, args):
-            return _chain(_partials(name, num, args), args, slopes)
+            partials = _PARTIALS.get(name)
+            return None if partials is None else _chain(partials(num, *args), args, slopes)
         case ir.Extern(args=args, function=ir.Body()):
             return _chain([_slope_of(num, index) for index in range(len(args))], args, slopes)
         case _:
@@ -124,10 +125,6 @@ def _call(name: str, *args: ir.Num) -> ir.Num:
     return ir.Op(name, args)
 
 
-def _if_positive(num: ir.Num, yes: float, no: float) -> ir.Num:
-    return ir.Where(ir.Predicate(num), ir.Const(yes), ir.Const(no))
-
-
 def _power(result: ir.Num, base: ir.Num, exponent: ir.Num) -> Sequence[ir.Num | None]:
     one_less = (
         ir.Const(exponent.value - 1.0) if isinstance(exponent, ir.Const) else _less(exponent, ir.Const(1.0))
@@ -166,7 +163,7 @@ _PARTIALS: Mapping[str, Partials] = MappingProxyType(
         "pow": _power,
         "square": _one(lambda _, x: multiply(ir.Const(2.0), x)),
         "abs": _one(lambda _, x: _call("sign", x)),
-        "relu": _one(lambda _, x: _if_positive(x, 1.0, 0.0)),
+        "relu": _one(lambda _, x: ir.Where(ir.Predicate(x), _ONE, ir.Const(0.0))),
         "sqrt": _one(lambda r, _: _over(ir.Const(0.5), _call("max", r, ir.Const(SMALL)))),
         "exp": _one(lambda r, _: r),
         "log": _one(lambda _, x: _over(_ONE, x)),
@@ -186,8 +183,3 @@ _PARTIALS: Mapping[str, Partials] = MappingProxyType(
     }
 )
 """Partial derivatives by name of a function; functions with steps, such as `floor`, have none."""
-
-
-def _partials(name: str, result: ir.Num, args: Sequence[ir.Num]) -> Sequence[ir.Num | None]:
-    found = _PARTIALS.get(name)
-    return (None,) * len(args) if found is None else found(result, *args)

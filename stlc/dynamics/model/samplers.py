@@ -367,21 +367,18 @@ class InitialStates:
 
     def _rejected(self, drawn: int, accepted: int) -> SystemFileError:
         message = f"of {drawn} initial states that were drawn, {accepted} meet every condition of `where`"
+        proposed = self._propose(RATED, torch.Generator().manual_seed(0))
+        rates = self._each_holds(proposed).double().mean(1).tolist()
+        told = sorted(zip(rates, self.decl.where_text, strict=True))
+        note = tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
         return SystemFileError(
-            self._finding("S301", message, "too narrow, or it contradicts `mixture`", self._rates())
+            self._finding("S301", message, "too narrow, or it contradicts `mixture`", note)
         )
 
     def _finding(self, code: str, message: str, label: str, note: tuple[str, ...] = ()) -> Diagnostic:
         """Make a diagnostic located at the conditions of `where`, with the given code, message and label."""
         advice = "draw the states closer to what `where` asks for"
         return Diagnostic(code, message, self.decl.span, label, help=(advice,), note=note)
-
-    def _rates(self) -> tuple[str, ...]:
-        """Return one line per condition with the share of proposed states that meet it, smallest first."""
-        proposed = self._propose(RATED, torch.Generator().manual_seed(0))
-        rates = self._each_holds(proposed).double().mean(1).tolist()
-        told = sorted(zip(rates, self.decl.where_text, strict=True))
-        return tuple(f"`{text}` holds for {rate:.2%} of what is drawn" for rate, text in told)
 
     def warnings(self) -> tuple[Diagnostic, ...]:
         """Return W601 if less than 1 % of the proposed states were accepted, else an empty tuple."""

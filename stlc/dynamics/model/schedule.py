@@ -217,7 +217,8 @@ class Hoist:
             case ir.Op("mul"):
                 return self._product(num)
             case ir.Where(cond, yes, no) if not columns_in(cond) & self.moving:
-                return self._choice(cond, yes, no)
+                # It stays a choice: a product with 0 is NaN where the branch not taken is not finite.
+                return ir.Where(map_parts(cond, self._steady), self.split(yes), self.split(no))
             case _:
                 return map_parts(num, self.split)
 
@@ -234,14 +235,6 @@ class Hoist:
         name = f"{self.prefix}{len(self.early)}"
         self.early[name] = num
         return ir.Signal(name)
-
-    def _choice(self, cond: ir.Formula, yes: ir.Num, no: ir.Num) -> ir.Num:
-        """Rewrite an if-then-else (`cond`, `yes`, `no`) whose condition does not change within the loop.
-
-        The numbers in the condition are computed before the loop. It stays an if-then-else, because a product
-        with 0 would be NaN where the branch that is not taken is not finite.
-        """
-        return ir.Where(map_parts(cond, self._steady), self.split(yes), self.split(no))
 
     def _sum(self, num: ir.Num) -> ir.Num:
         """Rewrite a sum: its loop-invariant terms are combined into one expression in `early`."""

@@ -28,7 +28,6 @@ from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
 from stlc.dynamics.schema.yaml_nodes import Sequence
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.uncertain import NumbersInUse, UncertainNumbers, uncertain_numbers
-from stlc.source import Span
 
 if TYPE_CHECKING:
     from stlc.dynamics.model.rollout import Columns
@@ -159,7 +158,10 @@ def _readers(decl: SystemDecl) -> Mapping[str, dict[str, None]]:
 
 def _without_effect(number: Uncertain, found: SystemKeys, decl: SystemDecl) -> SystemFileError:
     """Return the error S213 about a listed constant that changes nothing."""
-    why, span = f"nothing that moves reads `{number.text}`", _item(found, number.text)
+    why = f"nothing that moves reads `{number.text}`"
+    node = found.test.get("uncertain") if isinstance(found.test, MappingNode) else None
+    items = node.items if isinstance(node, Sequence) else ()
+    span = next((item.span for item in items if getattr(item, "text", "") == number.text), None)
     if number.states:
         why = f"`{number.text}` is 0, of which a relative error changes nothing"
     elif any(unit.offset for name, (_, unit) in decl.constants.items() if base_name(name) == number.text):
@@ -167,13 +169,6 @@ def _without_effect(number: Uncertain, found: SystemKeys, decl: SystemDecl) -> S
     message = f"an uncertain constant without effect: {why}"
     advice = "leave it out of `uncertain`, or list the constants that the dynamics read"
     return SystemFileError(Diagnostic("S213", message, span, "listed here", help=(advice,)))
-
-
-def _item(found: SystemKeys, name: str) -> Span | None:
-    """Source location of a name in the list `uncertain`."""
-    node = found.test.get("uncertain") if isinstance(found.test, MappingNode) else None
-    items = node.items if isinstance(node, Sequence) else ()
-    return next((item.span for item in items if getattr(item, "text", "") == name), None)
 
 
 def _factor(name: str) -> str:
