@@ -26,7 +26,7 @@ from stlc.dynamics.uncertainty.disturbance import Disturbance
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-    from stlc.dynamics.declaration.deployment import Starts, TestDecl
+    from stlc.dynamics.declaration.deployment import TestDecl
 
 
 REDRAWN = 50
@@ -179,7 +179,14 @@ class Worlds:
             good &= (again == x).all(1)
             x, left = again, torch.nonzero(~good).squeeze(1)
             good[left] = known(self.task, x[left])
-        raise _hopeless(self.task.system.decl.test.starts, seed, int((~good).sum()))
+        starts, left = self.task.system.decl.test.starts, int((~good).sum())
+        plan = "a safe plan" if starts == "savable" else "a plan that satisfies everything"
+        message = (
+            f"no start from which {plan} is known, in {REDRAWN} draws each, for {left} agents of seed {seed}"
+        )
+        weaker = ("`--set test.starts=savable` asks for a safe plan",) if starts == "feasible" else ()
+        ways = (*weaker, "`--set test.starts=any` takes them all")
+        raise RunError(Diagnostic("R405", message, help=ways))
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
         """Simulate step number `step` in all worlds and return the next states, (rows, n).
@@ -231,19 +238,17 @@ class Worlds:
         for world in self.worlds:
             if isinstance(world, Choosing):
                 with blamed(world, "options", "give options"):
-                    given.append(self._optional(world, world.options()))
+                    states = world.options()
+                shape = tuple(states.shape) if isinstance(states, Tensor) else ()
+                if len(shape) != 3 or (shape[0], shape[2]) != self.size:
+                    form = f"({self.size[0]}, k, {self.size[1]})"
+                    raise wrong(world, "options", f"gives no tensor of shape {form}")
+                given.append(states.detach().to(torch.float64))
         if not given:
             return None
         options = torch.cat(given)
         later = x[:, None, self.size[1] :].expand(-1, options.shape[1], -1)
         return torch.cat((options, later), 2)
-
-    def _optional(self, world: object, given: object) -> Tensor:
-        agents, states = self.size
-        shape = tuple(given.shape) if isinstance(given, Tensor) else ()
-        if not isinstance(given, Tensor) or len(shape) != 3 or (shape[0], shape[2]) != self.size:
-            raise wrong(world, "options", f"gives no tensor of shape ({agents}, k, {states})")
-        return given.detach().to(torch.float64)
 
     def choose(self, pick: Tensor, x: Tensor) -> Tensor:
         """Apply to every agent the option with the index in `pick`, (rows,), and return the new states.
@@ -330,12 +335,3 @@ def _cannot_redraw(world: object, test: TestDecl) -> SystemFileError:
             help=("`--set test.starts=any` takes them all", "a method `redraw` gives agents another start"),
         )
     )
-
-
-def _hopeless(starts: Starts, seed: int, agents: int) -> RunError:
-    plan = "a safe plan" if starts == "savable" else "a plan that satisfies everything"
-    weaker = ("`--set test.starts=savable` asks for a safe plan",) if starts == "feasible" else ()
-    message = (
-        f"no start from which {plan} is known, in {REDRAWN} draws each, for {agents} agents of seed {seed}"
-    )
-    return RunError(Diagnostic("R405", message, help=(*weaker, "`--set test.starts=any` takes them all")))

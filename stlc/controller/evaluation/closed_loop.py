@@ -31,7 +31,6 @@ from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.rules import (
     Rules,
-    RunVerdicts,
     judge_runs_by_plans,
     rules_of,
     runs_by_rules,
@@ -348,7 +347,12 @@ class _Trial:
             known.given_up = bool(known.seeds) or known.agents == 1 or self.left() <= 0.0
             known.agents = max(1, known.agents // FEWER)
             return
-        runs = self._judged(recording)
+        if self.rules is not None:
+            runs = runs_by_rules(self.rules, self.task, recording)
+        else:
+            viable = np.ones(len(recording.states), dtype=bool)
+            executed = judge_executed(self.task, recording, viable=viable)
+            runs = judge_runs_by_plans(executed, self.task.system.dt)
         known.cost = (whole - self.left()) / count
         safe, broken = runs.safe, {each.row: each for each in runs.broken}
         told = [each for each in runs.broken if any(time is not None for time in each.rules.values())]
@@ -385,13 +389,6 @@ class _Trial:
         recording = recorder.recording()
         assert recording is not None
         return recording
-
-    def _judged(self, recording: DeploymentRecording) -> RunVerdicts:
-        """Judge recorded runs by the rules, or by the specification of the plans if there are none."""
-        if self.rules is not None:
-            return runs_by_rules(self.rules, self.task, recording)
-        executed = judge_executed(self.task, recording, viable=np.ones(len(recording.states), dtype=bool))
-        return judge_runs_by_plans(executed, self.task.system.dt)
 
     def shares(self) -> tuple[Share, ...]:
         """Counts of the runs under each compared guard, from their common initial states, cheapest first.

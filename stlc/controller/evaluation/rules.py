@@ -168,8 +168,14 @@ def keep_rules(folder: RunDir, task: Task) -> None:
         SystemFileError: S210, a file of rules does not exist.
         SpecError: the rules are invalid, or use names that the system does not have.
     """
-    decl = task.system.decl
-    found = {judge.written: (judge, _fitting(judge, task)) for judge in decl.judges}
+    system, found = task.plain, {}
+    for judge in task.system.decl.judges:
+        spec = read_rules(judge)
+        changed = _own(spec, system.decl.overrides)
+        compile_spec(
+            spec, grid=system.decl.grid, interface=system.interface(), overrides=changed, purpose="check"
+        )
+        found[judge.written] = judge, spec
     index: dict[str, dict[str, str]] = {}
     for number, (written, (judge, spec)) in enumerate(found.items()):
         name = judge.path.name if number == 0 else f"{number}-{judge.path.name}"
@@ -177,19 +183,6 @@ def keep_rules(folder: RunDir, task: Task) -> None:
         save_library(folder, spec.library or {}, _library_of(name))
         index[written] = {"file": name, "path": str(judge.path)}
     folder.write_json(_INDEX, index)
-
-
-def _fitting(judge: JudgeRef, task: Task) -> ast.Spec:
-    """Read the rules that a system file names, and compile them for the states that a deployment records.
-
-    This reports errors in the rules before the training begins.
-    """
-    spec, system = read_rules(judge), task.plain
-    changed = _own(spec, system.decl.overrides)
-    compile_spec(
-        spec, grid=system.decl.grid, interface=system.interface(), overrides=changed, purpose="check"
-    )
-    return spec
 
 
 def rules_of(run: Run) -> Rules | None:

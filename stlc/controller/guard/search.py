@@ -148,7 +148,8 @@ class RelaxedSearch(GuardSearch):
 
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
         previous = plan if previous is None else previous
-        lacking = self._lacking(x, plan)
+        present = self.task.system.rollout_columns(x, plan)
+        lacking = ~satisfied(robustness_until(self._formulas, present, 0))
         found = self._plain_found(x, plan, previous, lacking)
         far = (~lacking).nonzero()[:, 0]
         if len(far):
@@ -159,14 +160,6 @@ class RelaxedSearch(GuardSearch):
             if len(close):
                 self._closer(found, close, x, self._plain.search(x[close], plan[close]).plans)
         return found
-
-    def _lacking(self, x: Tensor, plan: Tensor) -> Tensor:
-        """Mask of the agents whose present state has less than the required margin, (agents,).
-
-        `plan`: any plan from the states `x`; only its first sample, the present state, is judged.
-        """
-        columns = self.task.system.rollout_columns(x, plan)
-        return ~satisfied(robustness_until(self._formulas, columns, 0))
 
     def _plain_found(self, x: Tensor, plan: Tensor, previous: Tensor, lacking: Tensor) -> Candidates:
         """Run the stages (search methods) without margins for the agents in `lacking`.

@@ -236,18 +236,14 @@ class LocalProcesses:
         try:
             raised, value = worker.pipe.recv()
         except (EOFError, OSError):
-            return key, LostCall(self._end_of(worker))
+            self._workers.remove(worker)
+            worker.pipe.close()
+            worker.process.kill()
+            worker.process.join()
+            return key, LostCall(end_in_words(worker.process.exitcode or 0))
         if raised is not None:
             raise value from CallError(raised)
         return key, value
-
-    def _end_of(self, worker: _LocalWorker) -> str:
-        """Remove a worker that is lost, and return in words how it ended."""
-        self._workers.remove(worker)
-        worker.pipe.close()
-        worker.process.kill()
-        worker.process.join()
-        return end_in_words(worker.process.exitcode or 0)
 
     def _kill(self, _code: int = 0) -> None:
         for worker in tuple(self._workers):

@@ -147,7 +147,8 @@ class Environments:
     @torch.no_grad()
     def reset(self, states: Tensor | None = None) -> Tensor:
         """Begin all episodes at random initial states, or at `states` (N, n); return observations (N, k)."""
-        self._begin(self._starts() if states is None else states.double())
+        self.states = self._start = self._starts() if states is None else states.double()
+        self._step, self._actions = 0, self._blank()
         if self._native is not None:
             return self._native.look(self.states, 0.0)
         return self.observe(self.states, 0).float()
@@ -193,11 +194,6 @@ class Environments:
             if self._reward == "task":
                 reward = system.reward(after, system.commanded(self.states, held))
         return after, seen, torch.zeros(self.count) if reward is None else reward.float()
-
-    def _begin(self, states: Tensor) -> None:
-        self.states = self._start = states
-        self._step = 0
-        self._actions = self._blank()
 
     def _blank(self) -> Tensor:
         """Make an array of zeros, (N, T, m), to which the actions of the episodes are written."""

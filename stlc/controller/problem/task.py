@@ -91,16 +91,6 @@ class PlanVerdicts:
         )
 
 
-def _on_starts(compiled: Compiled, system: System) -> dict[str, ir.Formula]:
-    """Assumptions that restrict the initial state alone: text for messages -> condition on its columns."""
-    known = {*system.decl.signature.names}
-    return {
-        f"assume {rule.name}": rule.formula
-        for rule in compiled.assumptions
-        if is_state(rule.typed.formula) and columns_in(rule.formula) <= known
-    }
-
-
 class Task:
     """A specification compiled for a system: the problem for which a policy is trained.
 
@@ -119,7 +109,13 @@ class Task:
         if (steps := compiled.grid.steps) is not None and steps != system.horizon:
             system = system.planned_for(steps)
         self.plain = system
-        if conditions := _on_starts(compiled, system):
+        known = {*system.decl.signature.names}
+        conditions = {
+            f"assume {rule.name}": rule.formula
+            for rule in compiled.assumptions
+            if is_state(rule.typed.formula) and columns_in(rule.formula) <= known
+        }
+        if conditions:
             system = system.assuming(conditions)
         added = compiled.timers, compiled.parameters
         self.system = system.augmented(*added) if any(added) else system

@@ -146,7 +146,9 @@ class _Attempts:
         index = index[: len(needed)]
         if not len(index):
             return
-        plans = self._nearest(needed)
+        missed = torch.from_numpy(needed).flatten(1).double() @ self._missed
+        seen = torch.rand(missed.shape, generator=search.generator) < SEEN
+        plans = self._library[torch.where(seen, missed, torch.inf).argmin(1)]
         afresh = torch.rand(len(plans), generator=search.generator) < AFRESH
         plans[afresh] = search.start[self._row]
         number = self._begun + np.arange(len(index))
@@ -163,15 +165,6 @@ class _Attempts:
             self._pool = needed[order[: max(count, len(order) // KEPT)]]
         drawn, self._pool = self._pool[:count], self._pool[count:]
         return drawn
-
-    def _nearest(self, needed: NDArray[np.bool_]) -> Tensor:
-        """Select a plan for each of the k schedules `needed`, (k, T, m).
-
-        It is the plan nearest to meeting the schedule, among some plans of the library drawn at random.
-        """
-        missed = torch.from_numpy(needed).flatten(1).double() @ self._missed
-        seen = torch.rand(missed.shape, generator=self._search.generator) < SEEN
-        return self._library[torch.where(seen, missed, torch.inf).argmin(1)]
 
 
 def _improve(search: PlanSearch, row: Tensor, plans: Tensor, tries: int) -> None:

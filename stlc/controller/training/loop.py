@@ -23,7 +23,7 @@ from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, Tim
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.conflict import refuted
 from stlc.controller.training.diagnose import check_mirror
-from stlc.controller.training.failures import SHARE, FailureBank, FailureSearch
+from stlc.controller.training.failures import SHARE, FailureSearch
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.writer import RunWriter
 from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, usage
@@ -544,11 +544,21 @@ class _Session:
             self.refuted = learner.ranks.any(refuted(learner.task))
 
     def _searched_drives(self) -> bool:
-        """Make a round of falsification if one is due; return False if the user ends the training."""
+        """Make a round of falsification if one is due; return False if the user ends the training.
+
+        The recorded schedule decides when rounds are due, as far as it goes.
+        """
         learner, bank, recorded = self.learner, self.learner.failures, self.schedule.rounds
-        if bank is None or self.failures is None or not self._round_due(bank):
+        if bank is None or self.failures is None:
             return True
-        began, step = self.now(), learner.step
+        step = learner.step
+        if bank.moment < len(recorded):
+            due = step >= recorded[bank.moment].step
+        else:
+            due = bank.due(step, learner.steps) and (not recorded or step > recorded[-1].step)
+        if not due:
+            return True
+        began = self.now()
         run = Run(self.writer.folder, learner.task, learner.policy)
         if bank.moment < len(recorded):
             count, allowed = recorded[bank.moment].simulations, math.inf
@@ -571,13 +581,6 @@ class _Session:
         self.pace.irregular(self.now() - began)
         self.writer.note({"falsification": bank.summary()})
         return True
-
-    def _round_due(self, bank: FailureBank) -> bool:
-        """True if a round of falsification is due; the recorded schedule decides as far as it goes."""
-        recorded, step = self.schedule.rounds, self.learner.step
-        if bank.moment < len(recorded):
-            return step >= recorded[bank.moment].step
-        return bank.due(step, self.learner.steps) and (not recorded or step > recorded[-1].step)
 
     def _wait_for_search(self) -> bool:
         """Wait for the concurrent search; return False if the user ends the training during the wait."""

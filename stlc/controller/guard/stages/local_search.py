@@ -37,11 +37,17 @@ class LocalSearch(GuardStage):
     def propose(self, rejected: Rejected, rows: Tensor, _deadline: Deadline) -> Candidates:
         """Return the best plan of each agent: its present plan, or the result of a local search.
 
-        One local search begins at each starting plan of the agent.
+        One local search begins at each starting plan of the agent. If the previous stage stored plans for all
+        agents, these are taken; else the policy's plan and, if there is one, the previous plan.
         """
         x, found = rejected.x[rows], rejected.best.of(rows)
+        if len(rejected.tried) == 1 and len(rejected.tried[0].rows) == len(rejected.x):
+            starts = rejected.tried[0].candidates.plans[rejected.tried[0].rows.argsort()]
+        else:
+            plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
+            starts = torch.stack(plans, 1)
         every = torch.arange(len(rows), device=rows.device)
-        found.improve(every, best_climbed(self.whole, x, _starts(rejected, rows), self.tries))
+        found.improve(every, best_climbed(self.whole, x, starts[rows], self.tries))
         unsafe = (~found.is_safe).nonzero()[:, 0]
         if len(unsafe) and self._safe is not self.whole:
             starts = found.plans[unsafe][:, None]
@@ -74,19 +80,6 @@ def climbed_from(
     threads = torch.get_num_threads()
     plans = searcher.repair(rows, starts.flatten(0, 1), tries=tries, threads=threads).plans
     return Candidates.judged(task or searcher.task, x, plans.view(starts.shape), REPAIRED)
-
-
-def _starts(rejected: Rejected, rows: Tensor) -> Tensor:
-    """Starting plans for the agents with indices `rows`, (k, starts, T, m).
-
-    If the previous stage stored plans for all agents, these are taken; else the policy's plan and, if there
-    is one, the previous plan.
-    """
-    if len(rejected.tried) == 1 and len(rejected.tried[0].rows) == len(rejected.x):
-        order = rejected.tried[0].rows.argsort()
-        return rejected.tried[0].candidates.plans[order][rows]
-    plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
-    return torch.stack(plans, 1)[rows]
 
 
 STAGE = LocalSearch
