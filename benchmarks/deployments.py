@@ -71,18 +71,18 @@ class DeploymentOptions:
     out: ResultsOption = Path("benchmarks/results")
     runs_folder: TrainedOption = Path("runs/benchmarks")
 
-    def setting(self, run: Run, ceiling: int) -> Setting:
+    def setting(self, run: Run, known_feasible: int) -> Setting:
         """Return the settings of the deployments of a run, such as the numbers of agents and steps.
 
-        These numbers are at most the default numbers of the system. `ceiling` is the number of visited states
-        that are checked for a satisfying plan.
+        These numbers are at most the default numbers of the system. `known_feasible` is the number of visited
+        states that are checked for a satisfying plan.
         """
         test = run.task.system.decl.test
         agents = min(self.agents or test.agents, test.agents)
         steps = min(self.steps or test.steps, test.steps)
         limit = parse_limit(self.time_limit)
         finite = limit if math.isfinite(limit) else None
-        return Setting(parse_seeds(self.seeds), agents, steps, test.replan, finite, ceiling)
+        return Setting(parse_seeds(self.seeds), agents, steps, test.replan, finite, known_feasible)
 
     def runs(self, names: Sequence[str] | None) -> list[RunDir]:
         """Return the runs called `names`; without names, the most accurate run of each benchmark.
@@ -161,7 +161,7 @@ class Deployments:
     Attributes:
         store: file of the stored results.
         options: command-line options, such as seeds and numbers of agents.
-        ceiling: number of visited states that are checked for a satisfying plan.
+        known_feasible: number of visited states that are checked for a satisfying plan.
         driven: number of new deployments.
         kept: number of deployments whose result was already stored.
         results: results of all deployments, in order.
@@ -169,7 +169,7 @@ class Deployments:
 
     store: ResultStore
     options: DeploymentOptions
-    ceiling: int = 0
+    known_feasible: int = 0
     driven: int = 0
     kept: int = 0
     results: list[Result] = field(default_factory=list)
@@ -183,7 +183,7 @@ class Deployments:
         """
         for scenario in scenarios:
             run = Run.open(folder.path, scenario=None if scenario == NOMINAL else scenario)
-            setting = self.options.setting(run, self.ceiling)
+            setting = self.options.setting(run, self.known_feasible)
             for guard in guards:
                 self._add(key_of(run, scenario, guard, setting), run, guard, setting)
 
@@ -210,7 +210,7 @@ class Deployments:
         seconds = perf_counter() - begin
         known = self.viable(run.task, torch.from_numpy(recording.states[:, 0]))
         executed = judge_executed(run.task, recording, viable=known.numpy())
-        metrics = measure(recording, executed, feasible_states(run.task, recording, setting.ceiling))
+        metrics = measure(recording, executed, feasible_states(run.task, recording, setting.known_feasible))
         return {
             "run": run.dir.name,
             "policy": _policy_of(run.dir),
@@ -254,7 +254,7 @@ def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
             **{"scenario": scenario, "errors": None if errors is None else str(errors)},
             **{"seeds": list(setting.seeds), "agents": setting.agents, "steps": setting.steps},
             **{"replan": setting.replan, "time_limit": limit},
-            "ceiling": setting.ceiling,
+            "ceiling": setting.known_feasible,
         },
     )
 

@@ -214,7 +214,7 @@ class _Search:
         x0, start = self.states[self.open], self.plans
         if number % 2 == 0 and len(self.library):
             start = self.library[torch.randint(len(self.library), (len(self.open),), generator=generator)]
-        searcher = Searcher(self.task, generator, enough=1e-4)
+        searcher = Searcher(self.task, generator, target=1e-4)
         plans = searcher.repair(x0.float(), start, self.library, tries=TRIES).plans
         rho = self.task.judge(x0, plans.double(), states=False).rho
         better = rho > self.rho

@@ -91,16 +91,16 @@ def methods_of(task: Task, backup: StagedSearch) -> dict[str, Method]:
 
     `backup` is the search of the full guard, which is one of the methods.
     """
-    enough = TO_SPARE * task.system.decl.objective.gamma
-    ascent = GradientAscent(task, torch.Generator().manual_seed(SEED), enough=enough)
-    searcher = Searcher(task, torch.Generator().manual_seed(SEED), enough=enough)
+    target = TO_SPARE * task.system.decl.objective.gamma
+    ascent = GradientAscent(task, torch.Generator().manual_seed(SEED), target=target)
+    searcher = Searcher(task, torch.Generator().manual_seed(SEED), target=target)
 
     def local_search(x: Tensor, places: Tensor, tries: int) -> Tensor:
         return searcher.repair(x.expand(len(places), -1), places, tries=tries, threads=1).plans
 
     def steps_and_search(x: Tensor, plan: Tensor, rest: Tensor) -> Tensor:
         raised = ascent.rise(x, torch.stack((plan, rest), 1))[0]
-        if float(task.judge(x, raised[:1], states=False).rho) >= enough:
+        if float(task.judge(x, raised[:1], states=False).rho) >= target:
             return raised
         return torch.cat((raised, local_search(x, raised, SHORT)))
 

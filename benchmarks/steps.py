@@ -155,9 +155,9 @@ def _searched(trainer: Trainer) -> float:
         x0 = trainer.supply.take(trainer.config.pool)
         plans, judged = trainer.policy.plan_judged(x0)
         bad = (~satisfied(judged.rho)).nonzero()[:, 0][: trainer.config.most]
-    states, start, bank = x0[bad], plans[bad], trainer.buffer.bank
+    states, start, library = x0[bad], plans[bad], trainer.buffer.library
     before = time.process_time()
-    trainer.searcher.repair(states, start, bank)
+    trainer.searcher.repair(states, start, library)
     return (time.process_time() - before) * 1e3
 
 

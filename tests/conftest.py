@@ -58,7 +58,7 @@ SMALL = {
     "stlc.controller.training.learner.EFFORTS": (1000, 2000, 4000),
     "stlc.controller.training.conflict.JUDGED": 1000,
     "stlc.controller.training.conflict.TRIES": 1000,
-    "stlc.controller.evaluation.held_out.CEILING_TRIES": 1000,
+    "stlc.controller.evaluation.held_out.KNOWN_FEASIBLE_TRIES": 1000,
     "stlc.controller.evaluation.held_out.JUDGED": 1000,
     "stlc.controller.search.feasibility.TRIES": 1000,
     "stlc.controller.evaluation.deployment.LATENCY_SECONDS": 0.01,

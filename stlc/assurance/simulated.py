@@ -103,7 +103,7 @@ class Simulation:
     JSON: ClassVar = (
         "spec system run world scenario starts redrawn errors judge safety trace overrides "
         "seeds=setting.seeds agents=setting.agents steps=setting.steps replan=setting.replan "
-        "time_limit=setting.limit paper_time_limit=setting.paper_limit ceiling=setting.ceiling "
+        "time_limit=setting.limit paper_time_limit=setting.paper_limit ceiling=setting.known_feasible "
         "margin=setting.margin interval guards planners? scenarios? animation? report?"
     )
 
@@ -193,7 +193,7 @@ def simulation(
     size = options.agents or test.agents, options.steps or test.steps
     if (finding := _longer(run, size[1])) is not None:
         notice(finding)
-    setting = Setting(tuple(options.seeds), *size, test.replan, ceiling=options.known_feasible)
+    setting = Setting(tuple(options.seeds), *size, test.replan, known_feasible=options.known_feasible)
     setting = setting.limited(options.time_limit)
     order = _Order(run, guard, setting, parse_margins(options.margin), options, watching, beside)
     scenarios = _several(run, options.scenario)

@@ -46,8 +46,8 @@ class Halving:
         return self._run
 
     def _run(self, search: PlanSearch) -> None:
-        enough = search.budget.target or TOLERANCE
-        searcher = Searcher(search.task, search.generator, enough=enough)
+        target = search.budget.target or TOLERANCE
+        searcher = Searcher(search.task, search.generator, target=target)
         while len(rows := search.open()):
             for part in torch.split(rows, 512):
                 plans = self._random(search, len(part))
@@ -81,8 +81,8 @@ class Halving:
         plans = plans[:, :count]
         tries = max(1, search.affordable(rows, tries * count) // count)
         x0 = search.states[rows].repeat_interleave(count, 0)
-        bank = plans.new_zeros(0, *plans.shape[2:])
-        found = searcher.repair(x0, plans.flatten(0, 1), bank, tries=tries, stop=search.budget.stop)
+        library = plans.new_zeros(0, *plans.shape[2:])
+        found = searcher.repair(x0, plans.flatten(0, 1), library, tries=tries, stop=search.budget.stop)
         order = found.rho.view(-1, count).argsort(1, descending=True)
         sorted_ = found.plans.view_as(plans).gather(1, order[..., None, None].expand_as(plans))
         search.offer(rows, sorted_[:, 0], evaluations=tries * count)

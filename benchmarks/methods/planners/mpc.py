@@ -112,7 +112,7 @@ class Mpc:
             ) from None
 
     def _run(self, search: PlanSearch, shooting: Shooting, solve: Callable[..., Any]) -> None:
-        searcher = Searcher(search.task, search.generator, enough=search.budget.target or TOLERANCE)
+        searcher = Searcher(search.task, search.generator, target=search.budget.target or TOLERANCE)
         for row in search.open().tolist():
             for number in range(self.guesses):
                 if row not in search.open():

@@ -89,7 +89,7 @@ class RemovedRuns(TypedDict):
 
 
 class FalsificationRounds(TypedDict):
-    """Rounds of `stlc train --falsify`; see `stlc.controller.training.failures.FailureBank`."""
+    """Rounds of `stlc train --falsify`; see `stlc.controller.training.failures.FailureStates`."""
 
     rounds: int
     drives: int

@@ -49,9 +49,9 @@ class Setting:
         steps: number of steps.
         replan: replanning period in steps.
         limit: time limit of a decision of timed guards, in seconds per agent; None: no limit.
-        ceiling: number of visited states, over all seeds, for which feasibility is checked. A state counts as
-            feasible if the followed plan satisfies the specification, or if a search finds another plan that
-            satisfies it.
+        known_feasible: number of visited states, over all seeds, for which feasibility is checked. A state
+            counts as feasible if the followed plan satisfies the specification, or if a search finds another
+            plan that satisfies it.
         margin: name of a safety requirement -> robustness margin by which a plan must satisfy it to be
             accepted by a guard.
         paper_limit: time limit of a decision of the other guards; None: no limit.
@@ -64,7 +64,7 @@ class Setting:
     steps: int
     replan: int = 1
     limit: float | None = 0.1
-    ceiling: int = 0
+    known_feasible: int = 0
     margin: RobustnessMargins = field(default_factory=dict)
     paper_limit: float | None = None
     draws: tuple[NDArray[np.float64], ...] | None = None

@@ -55,12 +55,12 @@ class Lost:
         why: cause of the loss.
         time: instant from which on no good plan was known, in seconds from the start; for `missed`, the last
             instant at which one was known; for `rules`, that of the violation.
-        unforeseen: whether the world did what its model does not foresee when the last good plan was lost.
+        inconsistent: whether a step was not model-consistent when the last good plan was lost.
     """
 
     why: Cause
     time: float
-    unforeseen: bool = False
+    inconsistent: bool = False
 
 
 def losses(
@@ -68,7 +68,7 @@ def losses(
     recording: DeploymentRecording,
     broken: Sequence[Broken],
     safety: Collection[str],
-    enough: Stop = never,
+    stop: Stop = never,
 ) -> dict[int, Lost]:
     """Find why drives failed.
 
@@ -78,13 +78,13 @@ def losses(
         broken: the drives whose cause is wanted.
         safety: names of the rules tagged `@safety`. The first rule that a drive violated counts; if it
             violated some of these, the first of these.
-        enough: condition that ends the searches early.
+        stop: condition that ends the searches early.
 
     Returns:
         Row of a drive -> its loss. Drives whose cause cannot be determined are left out, and those for which
         the search was ended too early.
     """
-    foreseen = model_consistent(task, recording) if recording.eventless is None else recording.eventless
+    consistent = model_consistent(task, recording) if recording.eventless is None else recording.eventless
     little, dt = NEAR * task.system.decl.objective.gamma, task.system.dt
     found: dict[int, Lost] = {}
     for each in broken:
@@ -96,22 +96,22 @@ def losses(
         followed = np.flatnonzero(good[: last + 1])
         since = int(followed[-1]) + 1 if len(followed) else 0
         if since > last:
-            if located and foreseen[row, :last].all():
+            if located and consistent[row, :last].all():
                 found[row] = Lost("rules", dt * last)
             continue
         at = np.unique(np.linspace(since, last, min(LOOKS, last - since + 1)).round().astype(int))
         asked = safety_task(task) if unsafe and task.compiled.safety else task
         states = torch.from_numpy(recording.states[row, at])
-        plans = solve(asked, states, passes=PASSES, tries=TRIES, stop=enough)
+        plans = solve(asked, states, passes=PASSES, tries=TRIES, stop=stop)
         solved = np.flatnonzero(plans.solved.numpy())
-        unforeseen = since > 0 and not foreseen[row, since - 1]
+        inconsistent = since > 0 and not consistent[row, since - 1]
         if len(solved):
             if located:
-                found[row] = Lost("missed", dt * int(at[solved[-1]]), unforeseen)
-        elif not enough() or bool(torch.isfinite(plans.rho).all()):
+                found[row] = Lost("missed", dt * int(at[solved[-1]]), inconsistent)
+        elif not stop() or bool(torch.isfinite(plans.rho).all()):
             own = float(recording.policy_rho[row, since : last + 1].max(initial=-np.inf))
-            why: Cause = "told" if unforeseen else "later" if since else "start"
-            if not unforeseen and max(float(plans.rho.max()), own) > -little:
+            why: Cause = "told" if inconsistent else "later" if since else "start"
+            if not inconsistent and max(float(plans.rho.max()), own) > -little:
                 why = "near"
-            found[row] = Lost(why, dt * since, unforeseen)
+            found[row] = Lost(why, dt * since, inconsistent)
     return found

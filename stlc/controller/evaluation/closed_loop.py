@@ -364,7 +364,7 @@ class _Trial:
                 obeyed,
                 None if safe is None else bool(safe[row]),
                 broken[row].rules if row in broken else {},
-                None if (lost := why.get(row)) is None else "told" if lost.unforeseen else lost.why,
+                None if (lost := why.get(row)) is None else "told" if lost.inconsistent else lost.why,
             )
         known.seeds += count
 

@@ -124,7 +124,7 @@ def deploy(
         recording = recorder.recording()
         assert recording is not None
         search = policy.take_use() if isinstance(policy, PlannerPolicy) else None
-        found = replace(judged(guarded, recording, setting.ceiling, rules), search=search)
+        found = replace(judged(guarded, recording, setting.known_feasible, rules), search=search)
         if isinstance(policy, PlannerPolicy):
             policy.take_use()  # searches of the measured latency are none of the simulation
         return found
@@ -133,7 +133,7 @@ def deploy(
 
 
 def judged(
-    guard: Guard, recording: DeploymentRecording, ceiling: int = 0, rules: Rules | None = None
+    guard: Guard, recording: DeploymentRecording, known_feasible: int = 0, rules: Rules | None = None
 ) -> Deployment:
     """Compute the metrics, verdicts and decision latency of a deployment that was recorded under a guard.
 
@@ -141,7 +141,7 @@ def judged(
         guard: the guard under which the deployment was recorded. It makes some decisions anew, so that their
             latency can be measured.
         recording: the recorded deployment.
-        ceiling: number of visited states whose feasibility is determined; see `feasible_states`.
+        known_feasible: number of visited states whose feasibility is determined; see `feasible_states`.
         rules: specification that judges the closed-loop runs. If None, the specification of the plans judges
             them: a run must satisfy it from every sample from which a whole planning window is recorded (see
             `Executed`).
@@ -155,7 +155,7 @@ def judged(
     return Deployment(
         guard.kind.name,
         recording,
-        measure(recording, executed, feasible_states(guard.task, recording, ceiling)),
+        measure(recording, executed, feasible_states(guard.task, recording, known_feasible)),
         decided(recording),
         latency(guard, recording),
         unsafe_agents(executed, recording.agents),

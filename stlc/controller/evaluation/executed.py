@@ -158,8 +158,8 @@ def _since(
     if low == high or not rows:
         return np.full(rows, low)
     middle = (low + high) // 2
-    begun = {name: each[: middle + 1] for name, each in columns.items()}
-    early = ~satisfied(torch.from_numpy(_margin(rule, begun, 1, "upper", stop=samples)[0])).numpy()
+    prefix = {name: each[: middle + 1] for name, each in columns.items()}
+    early = ~satisfied(torch.from_numpy(_margin(rule, prefix, 1, "upper", stop=samples)[0])).numpy()
     found = np.zeros(rows, dtype=np.int64)
     for part, bounds in ((early, (low, middle)), (~early, (middle + 1, high))):
         found[part] = _since(rule, {name: each[:, part] for name, each in columns.items()}, *bounds)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from stlc.controller.policies.policy import Policy
 
-CEILING_TRIES = 8000
+KNOWN_FEASIBLE_TRIES = 8000
 """Plans tried for a held-out state before it counts as infeasible."""
 MOST_SEARCHED = 1024
 """Maximum number of failing states to search; extrapolation has a standard error of 1.6 %."""
@@ -93,7 +93,7 @@ def score(
     *,
     n: int = HELD_OUT,
     seed: int = HELD_OUT_SEED,
-    enough: Stop = never,
+    stop: Stop = never,
     report: Callable[[str], None] = silent,
 ) -> Score:
     """Judge a policy on held-out states (initial states that the training does not use).
@@ -109,13 +109,13 @@ def score(
         policy: policy to judge.
         n: number of held-out states.
         seed: seed of their random numbers.
-        enough: function that returns True to end the evaluation early. If this happens while plans are
+        stop: function that returns True to end the evaluation early. If this happens while plans are
             judged, fewer than `n` states are judged. If it happens during the searches, the interrupted batch
             of states counts as not searched, except the first batch, which always counts as searched.
         report: function that receives the progress as a short text.
     """
     states = task.sample(n, seed=seed, dtype=torch.float64)
-    states, plans, rho, each = _judged(policy, states, enough, report)
+    states, plans, rho, each = _judged(policy, states, stop, report)
     n, good = len(states), satisfied(rho)
     shares = satisfied(each).double().mean(0)
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
@@ -124,20 +124,20 @@ def score(
     known, searched = good.clone(), good.clone()
     size = TORCH_CHUNK if task.native is None else CHUNK
     for number, chunk in enumerate(torch.split(failing[:MOST_SEARCHED], size)):
-        if number and enough():
+        if number and stop():
             break
         report(f"evaluation, search of {number * size:,} of {len(failing[:MOST_SEARCHED]):,} failing starts")
         given = states[chunk], plans[chunk], plans[good]
-        found = solve(task, *given, 1, tries=CEILING_TRIES, generator=generator, stop=enough).solved
+        found = solve(task, *given, 1, tries=KNOWN_FEASIBLE_TRIES, generator=generator, stop=stop).solved
         left = torch.nonzero(~found)[:, 0]
-        if len(left) and task.native is not None and not enough():
-            found[left] = satisfied(solve(task, states[chunk[left]], stop=enough).rho)
-        if number and enough():
+        if len(left) and task.native is not None and not stop():
+            found[left] = satisfied(solve(task, states[chunk[left]], stop=stop).rho)
+        if number and stop():
             break
         known[chunk], searched[chunk] = found, True
-    if len(failing) and not bool(known.any()) and not enough():
+    if len(failing) and not bool(known.any()) and not stop():
         few = failing[:FEW]
-        known[few] = plan(task, states[few], budget=PlanBudget(torch.inf, JUDGED, stop=enough)).satisfied
+        known[few] = plan(task, states[few], budget=PlanBudget(torch.inf, JUDGED, stop=stop)).satisfied
         searched |= known
     accuracy = float(good.double().mean())
     solved, tried = int(known[failing].sum()), int(searched[failing].sum())
@@ -157,9 +157,9 @@ def score(
 
 
 def _judged(
-    policy: Policy, states: Tensor, enough: Stop, report: Callable[[str], None]
+    policy: Policy, states: Tensor, stop: Stop, report: Callable[[str], None]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Judge the policy's plans from batches of states; end early once `enough` returns True.
+    """Judge the policy's plans from batches of states; end early once `stop` returns True.
 
     At least one batch is judged.
 
@@ -171,7 +171,7 @@ def _judged(
     rho: list[Tensor] = []
     each: list[Tensor] = []
     for part in torch.split(states, policy.judged_at_once):
-        if rho and enough():
+        if rho and stop():
             break
         report(f"evaluation, {sum(map(len, rho)):,} of {len(states):,} held-out starts")
         followed, judged = policy.plan_judged(part)

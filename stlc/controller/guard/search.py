@@ -143,7 +143,7 @@ class RelaxedSearch(GuardSearch):
         self._strict = StagedSearch(strict, policy, guard, grid=grid, limits=half)
         self._plain = StagedSearch(task, policy, guard, grid=grid, limits=half)
         generator = torch.Generator().manual_seed(SEED)
-        self._searcher = Searcher(safety_task(strict), generator, enough=0.0)
+        self._searcher = Searcher(safety_task(strict), generator, target=0.0)
         self._formulas = [rule.formula for rule in strict.compiled.safety]
 
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
@@ -201,9 +201,9 @@ class RelaxedSearch(GuardSearch):
         if not len(rows):
             return rows
         tries, threads = self.limits.tries, torch.get_num_threads()
-        climbed = self._searcher.repair(x[rows], start, tries=tries, threads=threads).plans.to(x.dtype)
-        plain = Candidates.judged(self._plain.task, x[rows], climbed, REPAIRED)
-        strict = Candidates.judged(self.task, x[rows], climbed, REPAIRED)
+        improved = self._searcher.repair(x[rows], start, tries=tries, threads=threads).plans.to(x.dtype)
+        plain = Candidates.judged(self._plain.task, x[rows], improved, REPAIRED)
+        strict = Candidates.judged(self.task, x[rows], improved, REPAIRED)
         safe = plain.is_safe
         unsafe = torch.full_like(strict.safe[safe], -torch.inf)
         found.put(rows[safe], replace(strict.of(safe), safe=unsafe))

@@ -48,7 +48,7 @@ class Effort:
 
     Attributes:
         generations: number of generations of changed plans per initial state.
-        enough: robustness at which the search for an initial state ends.
+        target: robustness at which the search for an initial state ends.
         seed: seed of the random changes.
         cycle: generations after which the comparison of violating plans changes; 0 if it never does.
         threads: number of threads; the result does not depend on it.
@@ -56,7 +56,7 @@ class Effort:
     """
 
     generations: int
-    enough: float
+    target: float
     seed: int
     cycle: int = 0
     threads: int = 1
@@ -155,7 +155,7 @@ class NativeJudge:
             self._factors,
             arrays[2],
             effort.generations,
-            effort.enough,
+            effort.target,
             effort.seed,
             effort.cycle,
             effort.stop,
@@ -204,11 +204,11 @@ class NativeGradient:
             slope: k in the smooth step (1 + tanh(k x)) / 2. Jumps and conditions are true steps, with
                 derivative 0 almost everywhere. Gradients use the derivative of the smooth step instead.
         """
-        each, columns = _Judged.apply(self, x0, u, slope)  # type: ignore[no-untyped-call]
+        each, columns = _NativeRobustness.apply(self, x0, u, slope)  # type: ignore[no-untyped-call]
         return each, dict(zip(self.judge.names, columns.unbind(0), strict=True))
 
 
-class _Judged(torch.autograd.Function):
+class _NativeRobustness(torch.autograd.Function):
     """Autograd function: values by `NativeJudge.judge`, gradients by the kernel `NativeGradient.adjoint`."""
 
     @staticmethod
@@ -241,7 +241,7 @@ class _Judged(torch.autograd.Function):
 
 
 class _Once(torch.autograd.Function):
-    """Autograd function: the gradient of `_Judged` by plans `u`, which has no gradient in turn."""
+    """Autograd function: the gradient of `_NativeRobustness` by plans `u`, which has no gradient in turn."""
 
     @staticmethod
     def forward(ctx: Any, gradient: Tensor, u: Tensor) -> Tensor:  # noqa: ARG004

@@ -60,11 +60,11 @@ class GradientAscent:
     Args:
         task: specification and system.
         generator: source of the random numbers of the perturbations, which are drawn once.
-        enough: target robustness; the ascent of an agent's plans ends once one of them reaches it.
+        target: target robustness; the ascent of an agent's plans ends once one of them reaches it.
     """
 
-    def __init__(self, task: Task, generator: torch.Generator, *, enough: float) -> None:
-        self.task, self.enough = task, enough
+    def __init__(self, task: Task, generator: torch.Generator, *, target: float) -> None:
+        self.task, self.target = task, target
         self._native = task.gradient
         system = task.system
         self._low, self._high = (
@@ -76,8 +76,10 @@ class GradientAscent:
         safe = {rule.name for rule in task.compiled.safety}
         self._safe = [at for at, rule in enumerate(task.rules) if rule.name in safe]
         self._changes = self._drawn(NEAR, generator)
-        bank = extremes(task, generator).double().numpy(force=True)
-        self._far = [bank[torch.randperm(len(bank), generator=generator)[:FAR].numpy()] for _ in RATES[1:]]
+        guesses = extremes(task, generator).double().numpy(force=True)
+        self._far = [
+            guesses[torch.randperm(len(guesses), generator=generator)[:FAR].numpy()] for _ in RATES[1:]
+        ]
 
     @torch.no_grad()
     def rise(self, x: Tensor, places: Tensor, until: float = math.inf) -> Tensor:
@@ -100,13 +102,13 @@ class GradientAscent:
     def _risen(self, x: Numbers, places: Numbers, until: float) -> Numbers:
         best, value = self._raised(x, self._changed(places), RATES[0], until)
         for at, rate in enumerate(RATES[1:]):
-            left = np.flatnonzero(value[:, 0] < APART + self.enough)
+            left = np.flatnonzero(value[:, 0] < APART + self.target)
             if not len(left) or perf_counter() >= until:
                 break
             far = np.broadcast_to(self._far[at], (len(left), *self._far[at].shape))
             starts = np.concatenate((self._changed(best[left]), far), 1)
             best[left], value[left] = self._raised(x[left], starts, rate, until)
-        done = np.flatnonzero(value[:, 0] >= APART + self.enough)
+        done = np.flatnonzero(value[:, 0] >= APART + self.target)
         best[done, 0] = self._eased(x[done], places[done, 0], best[done, 0])
         return best
 
@@ -119,9 +121,9 @@ class GradientAscent:
         share = np.arange(1, SHARES)[:, None, None] / SHARES
         tried = np.concatenate((own[:, None] + share * (found - own)[:, None], found[:, None]), 1)
         each, _ = self._judged(np.repeat(x, SHARES, 0), tried.reshape(-1, *own.shape[1:]))
-        enough = each.min(1).reshape(-1, SHARES) >= self.enough
-        enough[:, -1] = True
-        eased: Numbers = tried[np.arange(len(x)), enough.argmax(1)]
+        reached = each.min(1).reshape(-1, SHARES) >= self.target
+        reached[:, -1] = True
+        eased: Numbers = tried[np.arange(len(x)), reached.argmax(1)]
         return eased
 
     def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
@@ -142,7 +144,7 @@ class GradientAscent:
             now = self._worth(each)
             better = (now > value) & ~np.repeat(solved, count)
             value[better], best[better] = now[better], rows[better]
-            solved = value.reshape(agents, count).max(1) >= APART + self.enough
+            solved = value.reshape(agents, count).max(1) >= APART + self.target
             if step == STEPS or solved.all() or perf_counter() >= until:
                 break
             which = each.argmin(1)

@@ -171,7 +171,7 @@ def _improve(search: PlanSearch, row: Tensor, plans: Tensor, tries: int) -> None
     """Improve plans, (k, T, m), by local search, with at most `tries` changed plans for each."""
     plans = plans[: search.allowed(row, len(plans))]
     tries = max(1, search.affordable(row, tries * len(plans)) // len(plans))
-    searcher = Searcher(search.task, search.generator, enough=search.budget.target or TOLERANCE)
+    searcher = Searcher(search.task, search.generator, target=search.budget.target or TOLERANCE)
     x0 = search.states[row].expand(len(plans), -1).contiguous()
     found = searcher.repair(x0, plans, plans[:0], tries=tries, stop=search.budget.stop)
     search.offer(row, found.plans[None], evaluations=tries * len(plans))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PASSES = 4
 TRIES = 20_000
 """Number of plans judged per state and pass if native code judges them."""
-ENOUGH = 1e-4
+TARGET = 1e-4
 """Target robustness at which the search from a state ends."""
 
 
@@ -68,7 +68,7 @@ def solve(
         middle = 0.5 * (task.system.control_low + task.system.control_high)
         start = middle.expand(len(x0), task.horizon, -1)
     tries = tries or (THOROUGH if task.native is None else TRIES)
-    searcher = Searcher(task, generator, enough=ENOUGH)
+    searcher = Searcher(task, generator, target=TARGET)
     best = SearchResult(x0, start.double().clone(), x0.new_full((len(x0),), -torch.inf, dtype=torch.float64))
     for number in range(passes):
         if number:

@@ -103,7 +103,7 @@ class Search:
     def __init__(self, states: Tensor, plans: Tensor, seed: int) -> None:
         self.states, self.plans, self.seed = states, plans, seed
         self._cancelled = Event()
-        self._climb: _TorchClimb | None = None
+        self._torch: _TorchSearch | None = None
         self._share = 1
         self._found: Future[SearchResult] = Future()
 
@@ -114,17 +114,17 @@ class Search:
         search._found.set_result(found)
         return search
 
-    def on_thread(self, pool: ThreadPoolExecutor, climb: Callable[[Stop], SearchResult]) -> Search:
-        """Start the search function `climb` on a thread of `pool`; return this object.
+    def on_thread(self, pool: ThreadPoolExecutor, search: Callable[[Stop], SearchResult]) -> Search:
+        """Start the search function `search` on a thread of `pool`; return this object.
 
-        `climb` receives the stop condition of the search.
+        `search` receives the stop condition of the search.
         """
-        self._found = pool.submit(climb, self._cancelled.is_set)
+        self._found = pool.submit(search, self._cancelled.is_set)
         return self
 
-    def by_steps(self, climb: _TorchClimb, steps: int) -> Search:
-        """Let the search `climb` run in `steps` equal parts, one per call of `advance`; return `self`."""
-        self._climb, self._share = climb, -(-climb.left // max(1, steps))
+    def by_steps(self, search: _TorchSearch, steps: int) -> Search:
+        """Let `search` run in `steps` equal parts, one per call of `advance`; return `self`."""
+        self._torch, self._share = search, -(-search.left // max(1, steps))
         return self
 
     def done(self) -> bool:
@@ -133,10 +133,10 @@ class Search:
 
     def advance(self) -> None:
         """Do the next part of a search in torch; do nothing for a search that runs on a thread of its own."""
-        if self._climb is not None and not self.done():
+        if self._torch is not None and not self.done():
             for _ in range(self._share):
-                if not self._climb.generation():
-                    self._found.set_result(self._climb.found)
+                if not self._torch.generation():
+                    self._found.set_result(self._torch.found)
                     break
 
     def result(self, stop: Stop = never) -> SearchResult | None:
@@ -144,7 +144,7 @@ class Search:
         while not self.done():
             if stop():
                 return None
-            if self._climb is not None:
+            if self._torch is not None:
                 self.advance()
             else:
                 with suppress(TimeoutError):
@@ -164,17 +164,17 @@ class Searcher:
         task: Task,
         generator: torch.Generator,
         *,
-        enough: float,
+        target: float,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Prepare searches for plans of `task` with a robustness of at least `enough`.
+        """Prepare searches for plans of `task` with the robustness `target`.
 
         `generator`: source of all random numbers, on the CPU. `device`: torch device of states and plans; a
         search in compiled code runs on the CPU all the same.
         """
         self.task = task
         self.generator = generator
-        self.enough = enough
+        self.target = target
         self.device = device
         self._aside = ThreadPoolExecutor(1, thread_name_prefix="search")
 
@@ -183,7 +183,7 @@ class Searcher:
         self,
         x0: Tensor,
         plans: Tensor,
-        bank: Tensor | None = None,
+        library: Tensor | None = None,
         *,
         tries: int = THOROUGH,
         stop: Stop = never,
@@ -191,28 +191,28 @@ class Searcher:
     ) -> SearchResult:
         """Improve plans until they reach the target robustness, or until `tries` plans per state were judged.
 
-        The target is the number `enough` that the constructor received.
+        The target is that of the constructor.
 
         Args:
             x0: states, (B, n).
             plans: initial plans, (B, T, m).
-            bank: library of plans that satisfy the specification from other states, (k, T, m); may be empty.
+            library: plans that satisfy the specification from other states, (k, T, m); may be empty.
             tries: maximum number of plans judged per state.
             stop: condition that ends the search early, with the best plans until then.
             threads: number of threads of compiled code; 0 for all cores.
         """
-        bank = plans[:0] if bank is None else bank
+        library = plans[:0] if library is None else library
         if self.task.native is not None:
-            climb = self._climbing(x0, plans, bank, tries, threads or cores(), self._seed())
-            return climb(stop).to(x0.device)
-        return self._climb(x0, plans, bank, tries, self._seed()).finish(stop)
+            search = self._native_search(x0, plans, library, tries, threads or cores(), self._seed())
+            return search(stop).to(x0.device)
+        return self._torch_search(x0, plans, library, tries, self._seed()).finish(stop)
 
     @torch.no_grad()
     def begin(
         self,
         x0: Tensor,
         plans: Tensor,
-        bank: Tensor,
+        library: Tensor,
         *,
         tries: int = THOROUGH,
         steps: int = 1,
@@ -226,14 +226,16 @@ class Searcher:
         seed = self._seed() if seed is None else seed
         search = Search(x0, plans, seed)
         if self.task.native is not None:
-            return search.on_thread(self._aside, self._climbing(x0, plans, bank, tries, idle_cores(), seed))
-        return search.by_steps(self._climb(x0, plans, bank, tries, seed), steps)
+            return search.on_thread(
+                self._aside, self._native_search(x0, plans, library, tries, idle_cores(), seed)
+            )
+        return search.by_steps(self._torch_search(x0, plans, library, tries, seed), steps)
 
     def _seed(self) -> int:
         return int(torch.randint(2**62, (), generator=self.generator))
 
-    def _climbing(
-        self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, threads: int, seed: int
+    def _native_search(
+        self, x0: Tensor, plans: Tensor, library: Tensor, tries: int, threads: int, seed: int
     ) -> Callable[[Stop], SearchResult]:
         """Prepare a search in compiled code; its inputs are copied.
 
@@ -243,25 +245,27 @@ class Searcher:
         """
         native = self.task.native
         assert native is not None
-        x0, plans, bank = (part.to("cpu", copy=True) for part in (x0, plans, bank))
+        x0, plans, library = (part.to("cpu", copy=True) for part in (x0, plans, library))
 
-        def climb(stop: Stop) -> SearchResult:
+        def search(stop: Stop) -> SearchResult:
             cycle = CYCLE // LANES if self.task.compiled.grid.end is not None else 0
-            effort = Effort(-(-tries // LANES), self.enough, seed, cycle, threads, stop)
-            best, _ = native.local_search(x0, plans, bank, effort)
+            effort = Effort(-(-tries // LANES), self.target, seed, cycle, threads, stop)
+            best, _ = native.local_search(x0, plans, library, effort)
             rho = self.task.judge(x0, best, states=False).rho
             return SearchResult(x0, best, rho)
 
-        return climb
+        return search
 
-    def _climb(self, x0: Tensor, plans: Tensor, bank: Tensor, tries: int, seed: int) -> _TorchClimb:
+    def _torch_search(
+        self, x0: Tensor, plans: Tensor, library: Tensor, tries: int, seed: int
+    ) -> _TorchSearch:
         rho = self.task.judge(x0, plans, states=False).rho.clone()
         found = SearchResult(x0.clone(), plans.clone(), rho)
         generator = torch.Generator().manual_seed(seed)
-        return _TorchClimb(self.task, found, bank.clone(), -(-tries // TRIES), self.enough, generator)
+        return _TorchSearch(self.task, found, library.clone(), -(-tries // TRIES), self.target, generator)
 
 
-class _TorchClimb:
+class _TorchSearch:
     """Local search in torch, by the method of the native kernel; a generation is a batch of changed plans.
 
     Attributes:
@@ -273,13 +277,13 @@ class _TorchClimb:
         self,
         task: Task,
         found: SearchResult,
-        bank: Tensor,
+        library: Tensor,
         generations: int,
-        enough: float,
+        target: float,
         generator: torch.Generator,
     ) -> None:
-        self.task, self.found, self.bank, self.left = task, found, bank, generations
-        self.enough, self.generator = enough, generator
+        self.task, self.found, self.library, self.left = task, found, library, generations
+        self.target, self.generator = target, generator
         device = found.states.device
         self.low, self.high = task.system.control_low.to(device), task.system.control_high.to(device)
 
@@ -290,14 +294,14 @@ class _TorchClimb:
         Returns:
             False if no generation is left or all plans have reached the target, else True.
         """
-        still = (self.found.rho < self.enough).nonzero()[:, 0]
+        still = (self.found.rho < self.target).nonzero()[:, 0]
         if self.left == 0 or not len(still):
             return False
         self.left -= 1
         for part in torch.split(still, max(1, MOST_TRIED // (TRIES * self.found.plans[0].numel()))):
             if stop():
                 break
-            self._keep_better(part, self._proposals(self.found.plans[part], TRIES, self.bank))
+            self._keep_better(part, self._proposals(self.found.plans[part], TRIES, self.library))
         return self.left > 0
 
     def finish(self, stop: Stop = never) -> SearchResult:
@@ -317,7 +321,7 @@ class _TorchClimb:
         found.plans[rows] = tried[better, which[better]]
         found.rho[rows] = value[better]
 
-    def _proposals(self, plans: Tensor, tries: int, bank: Tensor) -> Tensor:
+    def _proposals(self, plans: Tensor, tries: int, library: Tensor) -> Tensor:
         """Randomly changed copies of plans, within the control bounds: (B, T, m) -> (B, tries, T, m)."""
         quarter = tries // 4
         span = self.high - self.low
@@ -328,17 +332,17 @@ class _TorchClimb:
         shift = start + size * self._stretch(shape) * self._randn(*shape[:2], 1, shape[3])
         level = self.low + span * self._rand(*shape[:2], 1, shape[3])
         held = torch.where(self._stretch(shape) > 0, level, start)
-        others = self._others(plans, tries - 3 * quarter, bank)
+        others = self._others(plans, tries - 3 * quarter, library)
         return torch.cat((noise, shift, held, others), 1).clamp(self.low, self.high)
 
-    def _others(self, plans: Tensor, count: int, bank: Tensor) -> Tensor:
+    def _others(self, plans: Tensor, count: int, library: Tensor) -> Tensor:
         """Draw random plans for the B states of `plans`: (B, count, T, m).
 
-        They are taken from the library `bank`, or are piecewise constant if the library holds few plans.
+        They are taken from `library`, or are piecewise constant if the library holds few plans.
         """
         states, steps, controls = plans.shape
-        if bank.shape[0] >= 64:
-            return bank[self._randint(0, bank.shape[0], states, count)]
+        if library.shape[0] >= 64:
+            return library[self._randint(0, library.shape[0], states, count)]
         pieces = 4
         levels = self.low + (self.high - self.low) * self._rand(states, count, pieces, controls)
         return levels.repeat_interleave(-(-steps // pieces), 2)[:, :, :steps]

@@ -22,7 +22,7 @@ from stlc.compile.ir.ranges import bounds
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.semantics.tolerance import TOLERANCE, violated
 from stlc.controller.problem.task import Task
-from stlc.controller.search.feasibility import ENOUGH, solve
+from stlc.controller.search.feasibility import TARGET, solve
 from stlc.controller.search.missed import better_planner, missed
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import Diagnostic, Label
@@ -45,7 +45,7 @@ PLANNING = 2.0
 """Seconds of search beside which other planners are tried (see `better_planner`)."""
 
 
-def conflict(task: Task, enough: Stop = never) -> Diagnostic:
+def conflict(task: Task, stop: Stop = never) -> Diagnostic:
     """Find requirements that seem to conflict; return the diagnostic R404, which names them.
 
     Requirements seem to conflict if no plan was found that satisfies all of them. If bounds prove that no
@@ -53,27 +53,27 @@ def conflict(task: Task, enough: Stop = never) -> Diagnostic:
     tested one after the other. In a test, a search looks for a plan that satisfies the remaining requirements
     except the tested one. If the search finds none, the tested requirement is removed, because the others
     already conflict. The requirements that remain after all tests are named. The tests end early once
-    `enough` returns True.
+    `stop` returns True.
     """
     proved = [rule for rule in task.rules if _impossible(task, rule)]
     if proved:
-        return _told(task, proved[:1], _climbed(task, proved[:1], enough), proved=True)
+        return _told(task, proved[:1], _searched(task, proved[:1], stop), proved=True)
     core = list(task.rules)
-    nearest = first = _climbed(task, core, enough)
+    nearest = first = _searched(task, core, stop)
     for rule in task.rules:
         rest = [other for other in core if other is not rule]
-        if not rest or enough():
+        if not rest or stop():
             continue
-        found = _climbed(task, rest, enough)
+        found = _searched(task, rest, stop)
         if bool(found.solved.any()):
             continue
-        budget = PlanBudget(torch.inf, JUDGED, ENOUGH, enough)
-        if not (bool(plan(_alone(task, rest), _starts(task)[:2], budget=budget).satisfied.any()) or enough()):
+        budget = PlanBudget(torch.inf, JUDGED, TARGET, stop)
+        if not (bool(plan(_alone(task, rest), _starts(task)[:2], budget=budget).satisfied.any()) or stop()):
             core, nearest = rest, found
     said = _told(task, core, nearest, proved=False)
     listed = [f"`{each.requirement}` from {each.starts}" for each in missed(task, first.states, first.plans)]
     said = said.with_note(f"the best plans from {STARTS} starts violate {', '.join(listed)}")
-    better = None if enough() else better_planner(task, first.states, "search", PLANNING)
+    better = None if stop() else better_planner(task, first.states, "search", PLANNING)
     if better is None:
         return said
     text = f"`--method {better.method}` finds plans: in `stlc plan`, and as controller in `stlc simulate`"
@@ -98,11 +98,11 @@ def _starts(task: Task) -> torch.Tensor:
     return task.sample(STARTS, generator=torch.Generator().manual_seed(0))
 
 
-def _climbed(task: Task, rules: Sequence[CompiledRequirement], enough: Stop) -> SearchResult:
+def _searched(task: Task, rules: Sequence[CompiledRequirement], stop: Stop) -> SearchResult:
     """Search, from the tested initial states, for plans that satisfy the requirements `rules` alone."""
     alone, x0 = _alone(task, rules), _starts(task)
     nothing = x0.new_zeros(0, task.horizon, len(task.system.control_names))
-    return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=enough)
+    return solve(alone, x0, library=nothing, passes=1, tries=TRIES, stop=stop)
 
 
 def _told(

@@ -71,7 +71,7 @@ that ended early is repeated by one of as many simulations.
 
 
 @dataclass(slots=True)
-class FailureBank:
+class FailureStates:
     """States of failing drives, and the progress of the rounds that supply them.
 
     Attributes:

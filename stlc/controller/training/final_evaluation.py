@@ -102,7 +102,7 @@ class FinalEvaluation:
         def late(factor: float = 1.0) -> bool:
             return self.time.now() - self.trained > factor * self._verdict_seconds
 
-        result = score(self.task, policy, n=self.config.held_out, enough=late, report=self.report)
+        result = score(self.task, policy, n=self.config.held_out, stop=late, report=self.report)
         self.writer.held_out(self.task, result)
         why = conflict(self.task, lambda: late(2.0)) if result.feasible == 0.0 else None
         run = Run(self.writer.folder, self.task, policy)

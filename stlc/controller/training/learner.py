@@ -29,7 +29,7 @@ from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import TAILS, THOROUGH, Search, Searcher, SearchResult, remainders
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.training.diagnose import TrainingStep, diagnose
-from stlc.controller.training.failures import FailureBank
+from stlc.controller.training.failures import FailureStates
 from stlc.controller.training.method import Learner, Method, Validation
 from stlc.controller.training.mission_plans import mission_plans
 from stlc.controller.training.objective import Objective, loss
@@ -50,7 +50,7 @@ MARGIN_SHARE = 0.8
 """Margin of the loss, as a share of the median of the largest robustness that the search finds."""
 MARGIN_RANGE = (0.04, 2.0)
 """Least and greatest margin of the loss."""
-ENOUGH = 0.05
+TARGET_SHARE = 0.05
 """Robustness at which the search for a satisfying plan stops, as a share of the margin."""
 TORCH_MARGIN_STATES, TORCH_MOST, TORCH_TRIES = 32, 64, 2048
 """Limits for searches in torch, which are some hundred times slower than native ones.
@@ -135,14 +135,14 @@ class Trainer(Learner):
             whole = task.compiled.grid.end is not None
             self.margin = ranks.agree(self._begin_at_plans() if whole else self._feasible_margin())
         self.objective = self.method.objective(self)
-        self.searcher = self._searcher(ENOUGH * self.margin)
+        self.searcher = self._searcher(TARGET_SHARE * self.margin)
         self.repairing: Search | None = None
         self.barren, self.effort, self.explored = False, 0, 0
         self.accuracy, self.failing = 0.0, 0
         self.learnt = torch.empty(0, len(task.system.names), device=device)
         self.safety: Task | None = None
         if config.falsify:
-            self.failures = FailureBank(torch.empty(0, len(task.system.names), device=device))
+            self.failures = FailureStates(torch.empty(0, len(task.system.names), device=device))
             self.safety = safety_task(task) if task.compiled.safety else None
 
     def advance(self) -> float:
@@ -224,7 +224,7 @@ class Trainer(Learner):
         before = self.generator.get_state()
         starts = self.task.sample(EXPLORED, generator=self.generator)
         seed = int(torch.randint(2**62, (), generator=self.generator))
-        budget = PlanBudget(torch.inf, EFFORTS[self.effort], self.searcher.enough, stop)
+        budget = PlanBudget(torch.inf, EFFORTS[self.effort], self.searcher.target, stop)
         searched = plan(self.task, starts, budget=budget, seed=seed)
         if stop():
             self.generator.set_state(before)
@@ -317,7 +317,7 @@ class Trainer(Learner):
         `seed`: seed of its random numbers.
         """
         tries, steps = self._effort[1], self.config.every
-        return self.searcher.begin(x0, plans, self.buffer.bank, tries=tries, steps=steps, seed=seed)
+        return self.searcher.begin(x0, plans, self.buffer.library, tries=tries, steps=steps, seed=seed)
 
     @property
     def _effort(self) -> tuple[int, int]:
@@ -446,24 +446,24 @@ class Trainer(Learner):
         x0 = self.supply.take(count)
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
         start = middle.to(self.device).expand(len(x0), self.task.horizon, -1)
-        rho = self._searcher(math.inf).repair(x0, start, self.buffer.bank, tries=tries).rho
+        rho = self._searcher(math.inf).repair(x0, start, self.buffer.library, tries=tries).rho
         reached = rho[satisfied(rho)]
         return _margin(reached) if reached.numel() else MARGIN_RANGE[0]
 
     def _begin_at_plans(self) -> float:
         """Let the network begin at plans for whole missions; return the margin that these plans reach."""
-        begun = mission_plans(self.task, self.config.plans, self.generator)
-        found = begun.found.to(self.device)
+        known = mission_plans(self.task, self.config.plans, self.generator)
+        found = known.found.to(self.device)
         if not len(found.rho):
             return MARGIN_RANGE[0]
         for network in (self.network, self.average):
-            network.begin_at(begun.best.to(self.device))
+            network.begin_at(known.best.to(self.device))
         found = remainders(self.task, found, TAILS)
         self.buffer.add(found.states, found.plans)
-        return _margin(begun.found.rho)
+        return _margin(known.found.rho)
 
-    def _searcher(self, enough: float) -> Searcher:
-        return Searcher(self.task, self.generator, enough=enough, device=self.device)
+    def _searcher(self, target: float) -> Searcher:
+        return Searcher(self.task, self.generator, target=target, device=self.device)
 
     def _supply(self) -> Supply:
         """Make the source of training states.
@@ -536,7 +536,7 @@ class Trainer(Learner):
         self.effort = max(int(facts.get("effort", 0)), 0)
         self.barren = bool(facts.get("barren", 0)) and not self.exhausted
         self.objective = self.method.objective(self)
-        self.searcher = self._searcher(ENOUGH * self.margin)
+        self.searcher = self._searcher(TARGET_SHARE * self.margin)
         for prefix, module in (("network", self.network), ("average", self.average)):
             module.load_state_dict(below(tensors, prefix))
         layout = self.optimizer.state_dict()

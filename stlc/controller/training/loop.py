@@ -548,38 +548,38 @@ class _Session:
 
         The recorded schedule decides when rounds are due, as far as it goes.
         """
-        learner, bank, recorded = self.learner, self.learner.failures, self.schedule.rounds
-        if bank is None or self.failures is None:
+        learner, known, recorded = self.learner, self.learner.failures, self.schedule.rounds
+        if known is None or self.failures is None:
             return True
         step = learner.step
-        if bank.moment < len(recorded):
-            due = step >= recorded[bank.moment].step
+        if known.moment < len(recorded):
+            due = step >= recorded[known.moment].step
         else:
-            due = bank.due(step, learner.steps) and (not recorded or step > recorded[-1].step)
+            due = known.due(step, learner.steps) and (not recorded or step > recorded[-1].step)
         if not due:
             return True
         began = self.now()
         run = Run(self.writer.folder, learner.task, learner.policy)
-        if bank.moment < len(recorded):
-            count, allowed = recorded[bank.moment].simulations, math.inf
+        if known.moment < len(recorded):
+            count, allowed = recorded[known.moment].simulations, math.inf
         else:
             limit = SHARE * self.time.spent - self.falsified
             allowed = limit if self.time.allowed else math.inf
             states = learner.config.batch + learner.config.hard
-            count = bank.simulations(run, step, states) if allowed > 0.0 else 0
-        made = bank.search(
+            count = known.simulations(run, step, states) if allowed > 0.0 else 0
+        made = known.search(
             *(self.failures, run, step, count, learner.generator),
             over=lambda: self.now() - began >= allowed,
             stop=self.watch.stop,
         )
         if made is None:
             return False
-        if bank.moment > len(recorded):
+        if known.moment > len(recorded):
             self.schedule = self.schedule.with_round(step, made)
             self._note_schedule()
         self.falsified += self.now() - began
         self.pace.irregular(self.now() - began)
-        self.writer.note({"falsification": bank.summary()})
+        self.writer.note({"falsification": known.summary()})
         return True
 
     def _wait_for_search(self) -> bool:
@@ -597,10 +597,10 @@ class _Session:
         the longest search has found none.
         """
         learner = self.learner
-        enough = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
+        patience = max(BARREN_VALIDATIONS * learner.config.every, BARREN_SHARE * learner.steps)
         if not self.barren or not learner.searches:
             return False
-        return bool(self.refuted) or (self.exhausted and learner.step >= enough)
+        return bool(self.refuted) or (self.exhausted and learner.step >= patience)
 
     def _unjudged(self, *, interrupted: bool) -> TrainingOutcome:
         """Outcome of a training run that ended before its evaluation.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.controller.policies.policy import Policy
-    from stlc.controller.training.failures import FailureBank
+    from stlc.controller.training.failures import FailureStates
     from stlc.rundir import RunDir
 
 
@@ -163,7 +163,7 @@ class Learner(ABC):
             `--falsify`.
     """
 
-    failures: FailureBank | None = None
+    failures: FailureStates | None = None
 
     settles_rarely: bool = True
     searches: bool = False

@@ -62,7 +62,7 @@ def mission_plans(task: Task, count: int, generator: torch.Generator) -> Mission
     x0, plans = starts[good], searched.plans[good].to(starts.dtype)
     if not len(x0):
         return MissionPlans(SearchResult(x0, plans, searched.rho[good]), plans)
-    found = Searcher(task, generator, enough=torch.inf).repair(
+    found = Searcher(task, generator, target=torch.inf).repair(
         x0, plans, plans, tries=THOROUGH if compiled else TORCH_EFFORTS[4]
     )
     every = starts.repeat(len(x0), 1), found.plans.repeat_interleave(len(starts), 0)

@@ -256,7 +256,7 @@ class ReplayBuffer:
         return min(self.count, CAPACITY)
 
     @property
-    def bank(self) -> Tensor:
+    def library(self) -> Tensor:
         """Plans of all entries of the buffer, (entries, T, m)."""
         return self.plans[: len(self)]
 

@@ -73,7 +73,6 @@ from stlc.dynamics.schema.record import (
 )
 from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, load_node, load_yaml
 from stlc.files import named_in, read_source, real
-from stlc.registry import closest
 from stlc.signature import Signature
 from stlc.source import Source
 
@@ -452,11 +451,7 @@ def _replaced(node: Node, path: list[str], value: Node, key: str, reader: Reader
             inner = _replaced(old, rest, value, key, reader) if rest else value
             return node.replaced(Scalar(value.span, head), inner)
         case _:
-            keys = [entry.key.text for entry in node.entries] if isinstance(node, Mapping) else []
-            near = closest(head, keys)
-            guess = f"did you mean `{near}`?" if near else f"keys here: {', '.join(keys)}" if keys else ""
-            message = f"`--set {key}`: there is no `{head}` in the system file"
-            reader.report("S101", message, value.span, guess)
+            reader.report("S101", f"`--set {key}`: there is no `{head}` in the system file", value.span)
             return node
 
 

@@ -259,7 +259,7 @@ def test_a_drive_can_be_lost_later(home: Path, monkeypatch: pytest.MonkeyPatch, 
     recording = replace(recording, eventless=None if calm is None else np.array([[calm, True, True, True]]))
     (broken,) = judge_runs(rules, opened(run_of(home)).task, recording, viable(1)).broken
     assert asked == [(1, [2.0, 2.5, 3.5])]
-    assert broken.lost == Lost("later" if calm else "told", 1.0, unforeseen=not calm)
+    assert broken.lost == Lost("later" if calm else "told", 1.0, inconsistent=not calm)
     assert broken.excused == (not calm)
 
 

@@ -65,7 +65,7 @@ def test_no_time_still_gives_an_answer_of_the_papers_rule(car_task: Task) -> Non
     assert torch.isfinite(found.plans).all()
 
 
-def test_gradient_steps_mend_what_a_short_climb_does_not(
+def test_gradient_steps_mend_what_a_short_search_does_not(
     car_task: Task, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     x, plan = failing(car_task, 10.0, 100)
@@ -73,8 +73,8 @@ def test_gradient_steps_mend_what_a_short_climb_does_not(
     policy, few = Constant(car_task, 10.0), grid(lengths=(1,))
     found = StagedSearch(car_task, policy, FULL, grid=few, limits=limits).search(x, plan)
     monkeypatch.setattr(GradientAscent, "rise", _as_they_are)
-    climbed = StagedSearch(car_task, policy, FULL, grid=few, limits=limits).search(x, plan)
-    assert (found.rho >= -1e-6).sum() > (climbed.rho >= -1e-6).sum() + 5
+    improved = StagedSearch(car_task, policy, FULL, grid=few, limits=limits).search(x, plan)
+    assert (found.rho >= -1e-6).sum() > (improved.rho >= -1e-6).sum() + 5
     assert (found.source[found.rho >= -1e-6] == REPAIRED).all()
 
 

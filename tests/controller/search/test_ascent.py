@@ -19,11 +19,11 @@ from stlc.grammar.parser import parse
 from tests.controller.guard.test_prefix_shooting import F64, failing
 
 ROOT = Path(__file__).parents[3]
-ENOUGH = 0.01
+TARGET = 0.01
 
 
 def made(task: Task, *, by_torch: bool = False) -> GradientAscent:
-    found = GradientAscent(task, torch.Generator().manual_seed(0), enough=ENOUGH)
+    found = GradientAscent(task, torch.Generator().manual_seed(0), target=TARGET)
     if by_torch:
         found._native = None
     return found
@@ -65,8 +65,8 @@ def test_it_is_never_worse_than_what_it_begins_with(car_task: Task, rover_task: 
         assert (raised >= low).all()
         assert (raised <= high).all()
         value, before = worth(task, x, raised), worth(task, x, places)
-        assert (value[:, 0] >= torch.minimum(value[:, 1], before.new_tensor(APART + ENOUGH))).all()
-        assert (value[:, 0] >= before.amax(1).clamp(max=APART + ENOUGH)).all()
+        assert (value[:, 0] >= torch.minimum(value[:, 1], before.new_tensor(APART + TARGET))).all()
+        assert (value[:, 0] >= before.amax(1).clamp(max=APART + TARGET)).all()
         assert (value[:, 0] > before.amax(1) + 0.01).any()
 
 
@@ -74,18 +74,18 @@ def test_no_more_is_changed_than_is_enough(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0, 120)
     rise = made(car_task)
     found = rise.rise(x, plan[:, None])[:, 0]
-    good = car_task.judge(x, found).rho >= ENOUGH
+    good = car_task.judge(x, found).rho >= TARGET
     assert good.double().mean() > 0.6
     less = found + (plan - found) / ascent.SHARES
     changed = (found - plan).abs().amax((1, 2)) > 0.1
-    worse = car_task.judge(x, less).rho < ENOUGH
+    worse = car_task.judge(x, less).rho < TARGET
     whole = torch.from_numpy(rise._eased(*(part.numpy() for part in (x, plan, found))))
     assert torch.equal(whole[good & worse], found[good & worse])
     assert (good & worse & changed).sum() > 10
     far = torch.full_like(plan, -10.0)
-    brake = car_task.judge(x, far).rho >= ENOUGH
+    brake = car_task.judge(x, far).rho >= TARGET
     eased = torch.from_numpy(rise._eased(*(part[brake].numpy() for part in (x, plan, far))))
-    assert (car_task.judge(x[brake], eased).rho >= ENOUGH).all()
+    assert (car_task.judge(x[brake], eased).rho >= TARGET).all()
     assert (eased > far[brake]).any()
 
 
@@ -130,7 +130,7 @@ def test_without_time_the_best_of_the_beginnings_is_handed_on(car_task: Task) ->
     raised = made(car_task).rise(x, torch.stack((plan, none), 1), until=0.0)
     value = worth(car_task, x, raised)[:, 0]
     before = worth(car_task, x, torch.stack((plan, none), 1)).amax(1)
-    assert (value >= before.clamp(max=APART + ENOUGH)).all()
+    assert (value >= before.clamp(max=APART + TARGET)).all()
     full = worth(car_task, x, made(car_task).rise(x, plan[:, None]))[:, 0]
     assert (full > value).any()
 

@@ -28,7 +28,7 @@ def test_search_repairs_most_of_what_zero_plans_fail(task: Task) -> None:
     x0 = task.sample(200, seed=7)
     start = torch.zeros(200, task.horizon, 1)
     before = task.judge(x0, start).rho
-    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    searcher = Searcher(task, torch.Generator().manual_seed(0), target=0.02)
     found = searcher.repair(x0, start, start[:0], tries=1280)
     assert (found.rho >= before - 1e-6).all()
     assert torch.allclose(found.rho, task.judge(x0, found.plans).rho)
@@ -41,7 +41,7 @@ def test_search_repairs_most_of_what_zero_plans_fail(task: Task) -> None:
 def test_a_plan_that_is_good_enough_is_left_alone(task: Task) -> None:
     x0 = task.sample(100, seed=7)
     start = torch.zeros(100, task.horizon, 1)
-    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    searcher = Searcher(task, torch.Generator().manual_seed(0), target=0.02)
     found = searcher.repair(x0, start, start[:0], tries=64)
     good = task.judge(x0, start).rho >= 0.02
     assert torch.equal(found.plans[good], start[good])
@@ -61,26 +61,26 @@ def test_search_depends_on_its_generator_alone(task: Task) -> None:
 
     def run() -> torch.Tensor:
         torch.rand(3)  # the global generator must not matter
-        searcher = Searcher(task, torch.Generator().manual_seed(5), enough=0.02)
+        searcher = Searcher(task, torch.Generator().manual_seed(5), target=0.02)
         return searcher.repair(x0, start, start[:0], tries=48).plans
 
     assert torch.equal(run(), run())
 
 
-def test_a_bank_of_plans_is_tried(task: Task) -> None:
+def test_plans_of_the_library_are_tried(task: Task) -> None:
     x0 = task.sample(100, seed=9)
     start = torch.zeros(100, task.horizon, 1)
-    solved = Searcher(task, torch.Generator().manual_seed(0), enough=0.02).repair(x0, start, start[:0])
-    bank = solved.plans[solved.solved]
+    solved = Searcher(task, torch.Generator().manual_seed(0), target=0.02).repair(x0, start, start[:0])
+    library = solved.plans[solved.solved]
     few = [
-        Searcher(task, torch.Generator().manual_seed(1), enough=0.02).repair(x0, start, plans, tries=64).rho
-        for plans in (bank, bank[:0])
+        Searcher(task, torch.Generator().manual_seed(1), target=0.02).repair(x0, start, plans, tries=64).rho
+        for plans in (library, library[:0])
     ]
     assert (few[0] >= 0).double().mean() >= (few[1] >= 0).double().mean() - 0.02
 
 
 @pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
-def test_a_native_local_search_does_not_depend_on_how_it_is_shared(car_task: Task) -> None:
+def test_a_native_search_does_not_depend_on_how_it_is_shared(car_task: Task) -> None:
     x0 = car_task.sample(50, seed=8)
     start = torch.zeros(50, car_task.horizon, 1)
     assert car_task.native is not None
@@ -108,7 +108,7 @@ def test_the_buffer_forgets_the_oldest() -> None:
 def test_a_search_that_is_stopped_gives_what_it_has(task: Task) -> None:
     x0 = task.sample(40, seed=7)
     start = torch.zeros(40, task.horizon, 1)
-    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    searcher = Searcher(task, torch.Generator().manual_seed(0), target=0.02)
     found = searcher.repair(x0, start, start[:0], stop=lambda: True)
     assert torch.equal(found.plans, start)
     assert torch.allclose(found.rho, task.judge(x0, start).rho)
@@ -118,7 +118,7 @@ def test_a_search_beside_the_steps_can_be_begun_again(task: Task) -> None:
     """Results that depend on the first plan; a share of the work is done with every step."""
     x0 = task.sample(20, seed=7)
     start = torch.zeros(20, task.horizon, 1)
-    searcher = Searcher(task, torch.Generator().manual_seed(0), enough=0.02)
+    searcher = Searcher(task, torch.Generator().manual_seed(0), target=0.02)
     first = searcher.begin(x0, start, start[:0], tries=640, steps=5)
     assert task.native is not None or first.result(stop=lambda: True) is None
     again = searcher.begin(x0, start, start[:0], tries=640, steps=3, seed=first.seed)
@@ -135,7 +135,7 @@ def test_a_search_beside_the_steps_can_be_begun_again(task: Task) -> None:
 def test_a_search_that_is_cancelled_comes_to_its_end(car_task: Task) -> None:
     x0 = car_task.sample(5000, seed=7)
     start = torch.zeros(5000, car_task.horizon, 1)
-    searcher = Searcher(car_task, torch.Generator().manual_seed(0), enough=1e9)
+    searcher = Searcher(car_task, torch.Generator().manual_seed(0), target=1e9)
     search = searcher.begin(x0, start, start[:0], tries=10**6)
     if car_task.native is not None:
         search.cancel()

@@ -15,7 +15,7 @@ from stlc.controller.run.run import Run, spec_hash, system_hash
 from stlc.controller.training import loop
 from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.config import TrainConfig, resolve_config
-from stlc.controller.training.failures import MIXED, MOMENTS, POINTS, SHARE, FailureBank, SearchRound
+from stlc.controller.training.failures import MIXED, MOMENTS, POINTS, SHARE, FailureStates, SearchRound
 from stlc.controller.training.launch import Launch, open_folder
 from stlc.controller.training.learner import Trainer
 from stlc.controller.training.loop import Watch, resume, train
@@ -54,52 +54,52 @@ def _saved(run: RunDir) -> dict[str, torch.Tensor]:
 
 
 def test_kept_states_replace_a_part_of_the_fresh_ones() -> None:
-    bank, generator = FailureBank(torch.empty(0, 2)), torch.Generator().manual_seed(0)
+    known, generator = FailureStates(torch.empty(0, 2)), torch.Generator().manual_seed(0)
     fresh = torch.zeros(40, 2)
-    assert torch.equal(bank.mixed(fresh, generator), fresh)
-    bank.states = torch.ones(3, 2)
-    mixed = bank.mixed(fresh, generator)
+    assert torch.equal(known.mixed(fresh, generator), fresh)
+    known.states = torch.ones(3, 2)
+    mixed = known.mixed(fresh, generator)
     assert (len(mixed), int(mixed[:, 0].sum())) == (40, MIXED * 40)
-    assert len(bank.drawn(2, generator)) == 2
-    assert len(bank.drawn(9, generator)) == 3
+    assert len(known.drawn(2, generator)) == 2
+    assert len(known.drawn(9, generator)) == 3
 
 
 def test_rounds_are_due_at_shares_of_the_planned_steps() -> None:
-    bank = FailureBank(torch.empty(0, 1))
-    assert not bank.due(99, 1000)
-    assert bank.due(int(MOMENTS[0] * 1000), 1000)
-    bank.moment = len(MOMENTS)
-    assert not bank.due(1000, 1000)
+    known = FailureStates(torch.empty(0, 1))
+    assert not known.due(99, 1000)
+    assert known.due(int(MOMENTS[0] * 1000), 1000)
+    known.moment = len(MOMENTS)
+    assert not known.due(1000, 1000)
 
 
 def test_a_round_that_is_stopped_has_no_effect(car_task: Task) -> None:
-    bank = FailureBank(torch.empty(0, len(car_task.system.names)))
+    known = FailureStates(torch.empty(0, len(car_task.system.names)))
     generator = torch.Generator().manual_seed(4)
     before = generator.get_state()
     run: Run = Run(None, car_task, None)  # type: ignore[arg-type]
-    assert bank.search(Found(), run, 100, 3, generator, stop=lambda: True) is None
+    assert known.search(Found(), run, 100, 3, generator, stop=lambda: True) is None
     assert torch.equal(generator.get_state(), before)
-    assert bank.search(Found(), run, 90, 0, generator) == 0
+    assert known.search(Found(), run, 90, 0, generator) == 0
     assert torch.equal(generator.get_state(), before)
-    assert (bank.moment, bank.rounds, bank.last) == (1, 0, 0)
-    assert bank.search(Found(), run, 100, 3, generator) == 3
-    assert (bank.moment, bank.rounds, bank.last, len(bank.states), bank.latest) == (2, 1, 100, 30, 0.25)
-    again = FailureBank(torch.empty(0, len(car_task.system.names)))
-    again.restore(bank.tensors())
-    assert (again.summary(), again.moment) == (bank.summary(), 2)
-    assert np.array_equal(again.points, bank.points)
+    assert (known.moment, known.rounds, known.last) == (1, 0, 0)
+    assert known.search(Found(), run, 100, 3, generator) == 3
+    assert (known.moment, known.rounds, known.last, len(known.states), known.latest) == (2, 1, 100, 30, 0.25)
+    again = FailureStates(torch.empty(0, len(car_task.system.names)))
+    again.restore(known.tensors())
+    assert (again.summary(), again.moment) == (known.summary(), 2)
+    assert np.array_equal(again.points, known.points)
 
 
 def test_a_round_grows_with_the_steps_since_the_one_before(car_task: Task) -> None:
-    bank = FailureBank(torch.empty(0, 1))
+    known = FailureStates(torch.empty(0, 1))
     run: Run = Run(None, car_task, None)  # type: ignore[arg-type]
     test = car_task.system.decl.test
-    least = bank.simulations(run, 1, 1)
+    least = known.simulations(run, 1, 1)
     assert least == max(round(500 * test.replan / (test.agents * test.steps)), 2)
-    many = bank.simulations(run, 1000, 640)
+    many = known.simulations(run, 1000, 640)
     assert many == pytest.approx(0.06 * 1000 * 640 * test.replan / (test.agents * test.steps), abs=1.0)
-    bank.last = 500
-    assert bank.simulations(run, 1000, 640) == pytest.approx(many / 2, abs=1.0)
+    known.last = 500
+    assert known.simulations(run, 1000, 640) == pytest.approx(many / 2, abs=1.0)
 
 
 def test_a_resumed_run_with_rounds_equals_an_uninterrupted_one(car_task: Task, tmp_path: Path) -> None:

@@ -51,23 +51,23 @@ def puzzle(tmp_path_factory: pytest.TempPathFactory) -> Task:
     return Task.of(parse(Source("puzzle.stl", SPEC)), System.load(path))
 
 
-def test_the_planner_solves_a_puzzle_that_a_climb_does_not_solve(puzzle: Task) -> None:
+def test_the_planner_solves_a_puzzle_that_local_search_does_not_solve(puzzle: Task) -> None:
     x0 = puzzle.sample(4, seed=0, dtype=torch.float64)
     middle = torch.zeros(len(x0), puzzle.horizon, 2)
-    climbed = Searcher(puzzle, torch.Generator().manual_seed(0), enough=1e-4).repair(
+    improved = Searcher(puzzle, torch.Generator().manual_seed(0), target=1e-4).repair(
         x0.float(), middle, middle[:0], tries=1000
     )
-    assert not bool(climbed.solved.all())
+    assert not bool(improved.solved.all())
     one, other = (plan(puzzle, x0, budget=PlanBudget(torch.inf, EFFORTS[0])) for _ in range(2))
     assert bool(one.satisfied.all())
     assert torch.equal(one.plans, other.plans)
 
 
-def test_a_training_explores_where_climbing_leads_nowhere(
+def test_a_training_explores_where_local_search_leads_nowhere(
     puzzle: Task, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
-    monkeypatch.setattr("stlc.controller.training.learner.BARREN", 2.0)  # whatever a climb solves
+    monkeypatch.setattr("stlc.controller.training.learner.BARREN", 2.0)  # whatever local search solves
     engine = replace(
         resolve_config(puzzle, TrainConfig(seed=0, batch=8, threads=1)), pool=16, most=8, every=1
     )
@@ -77,6 +77,6 @@ def test_a_training_explores_where_climbing_leads_nowhere(
         trainer.advance()
         assert trainer.explore()
         rounds.append(trainer.validate())
-    assert [look.explored for look in rounds[:2]] == [0, 0]  # climbing is tried first
+    assert [look.explored for look in rounds[:2]] == [0, 0]  # local search is tried first
     assert rounds[-1].explored > 0
     assert trainer.buffer.count >= rounds[-1].explored

@@ -305,7 +305,7 @@ def test_without_a_compiler_torch_judges_in_parts(car_task: Task, monkeypatch: p
 def test_the_verdict_ends_when_its_time_is_over(car_task: Task) -> None:
     engine = resolve_config(car_task, TrainConfig(batch=16, seed=1))
     trainer = Trainer(car_task, engine, steps=9, device=torch.device("cpu"))
-    found = score(trainer.task, trainer.policy, n=1200, enough=lambda: True)
+    found = score(trainer.task, trainer.policy, n=1200, stop=lambda: True)
     assert len(found.states) == 500
     assert found.accuracy <= found.feasible
 

@@ -58,7 +58,7 @@ class Setup:
     generator: torch.Generator
 
     @property
-    def enough(self) -> float:
+    def target(self) -> float:
         """Robustness at which the search for a plan ends.
 
         It is a small share of gamma, the robustness at which training aims.

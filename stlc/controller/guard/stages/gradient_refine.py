@@ -17,7 +17,7 @@ class GradientRefine(GuardStage):
 
     def __init__(self, setup: Setup) -> None:
         self.task = setup.task
-        self.ascent = GradientAscent(setup.task, torch.Generator().manual_seed(SEED), enough=setup.enough)
+        self.ascent = GradientAscent(setup.task, torch.Generator().manual_seed(SEED), target=setup.target)
 
     def wanted(self, best: Candidates) -> Tensor:
         """Mask of all agents: the stage always searches."""

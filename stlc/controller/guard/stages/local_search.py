@@ -26,13 +26,13 @@ class LocalSearch(GuardStage):
     def __init__(self, setup: Setup) -> None:
         task, generator = setup.task, setup.generator
         self.task, self.tries = task, setup.limits.tries
-        self.whole = self._safe = Searcher(task, generator, enough=setup.enough)
+        self.whole = self._safe = Searcher(task, generator, target=setup.target)
         if 0 < len(task.compiled.safety) < len(task.rules):
-            self._safe = Searcher(safety_task(task), generator, enough=setup.enough)
+            self._safe = Searcher(safety_task(task), generator, target=setup.target)
 
     def wanted(self, best: Candidates) -> Tensor:
         """Mask of the agents whose plan has less than the target robustness."""
-        return best.rho < self.whole.enough
+        return best.rho < self.whole.target
 
     def propose(self, rejected: Rejected, rows: Tensor, _deadline: Deadline) -> Candidates:
         """Return the best plan of each agent: its present plan, or the result of a local search.
@@ -47,16 +47,16 @@ class LocalSearch(GuardStage):
             plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
             starts = torch.stack(plans, 1)
         every = torch.arange(len(rows), device=rows.device)
-        found.improve(every, best_climbed(self.whole, x, starts[rows], self.tries))
+        found.improve(every, best_improved(self.whole, x, starts[rows], self.tries))
         unsafe = (~found.is_safe).nonzero()[:, 0]
         if len(unsafe) and self._safe is not self.whole:
             starts = found.plans[unsafe][:, None]
-            climbed = best_climbed(self._safe, x[unsafe], starts, self.tries, self.task)
-            found.improve(unsafe, climbed)
+            improved = best_improved(self._safe, x[unsafe], starts, self.tries, self.task)
+            found.improve(unsafe, improved)
         return found
 
 
-def best_climbed(
+def best_improved(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
     """Run a local search from each starting plan, (agents, k, T, m); return the best plan per agent.
@@ -64,11 +64,11 @@ def best_climbed(
     `task`: task that judges the plans found; that of `searcher` if None. `tries`: number of plans judged per
     search.
     """
-    found = climbed_from(searcher, x, starts, tries, task)
+    found = improved_from(searcher, x, starts, tries, task)
     return found.pick(found.standing.argmax(1))
 
 
-def climbed_from(
+def improved_from(
     searcher: Searcher, x: Tensor, starts: Tensor, tries: int, task: Task | None = None
 ) -> Candidates:
     """Run a local search from each starting plan, (agents, k, T, m); return their results, (agents, k).

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup
-from stlc.controller.guard.stages.local_search import climbed_from
+from stlc.controller.guard.stages.local_search import improved_from
 from stlc.controller.search.local_search import Searcher
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class SampledShooting(GuardStage):
     def __init__(self, setup: Setup) -> None:
         self.task, self.limits = setup.task, setup.limits
         self.prefixes = SampledPrefixes(setup.task, setup.policy, setup.grid, setup.limits.drawn)
-        self._searcher = Searcher(setup.task, setup.generator, enough=setup.enough)
+        self._searcher = Searcher(setup.task, setup.generator, target=setup.target)
 
     def wanted(self, best: Candidates) -> Tensor:
         """Mask of the agents whose plan does not satisfy the specification.
@@ -105,12 +105,12 @@ class SampledShooting(GuardStage):
         picked = tried.standing.topk(min(self.limits.places, tried.rho.shape[1]), 1).indices
         agents = torch.arange(len(rows), device=rows.device)
         best = tried.pick(picked[:, 0])
-        climbed = climbed_from(self._searcher, x, tried.plans[agents[:, None], picked], self.limits.again)
-        place = climbed.standing.argmax(1)
+        improved = improved_from(self._searcher, x, tried.plans[agents[:, None], picked], self.limits.again)
+        place = improved.standing.argmax(1)
         length = tried.prefix_length[agents, picked[agents, place]]
-        climbed = climbed.pick(place)
-        source = torch.full_like(climbed.source, BACKUP)
-        best.improve(agents, replace(climbed, source=source, prefix_length=length))
+        improved = improved.pick(place)
+        source = torch.full_like(improved.source, BACKUP)
+        best.improve(agents, replace(improved, source=source, prefix_length=length))
         safe = best.is_safe.nonzero()[:, 0]
         found.put(safe, best.of(safe))
         return found

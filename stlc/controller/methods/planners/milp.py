@@ -87,11 +87,11 @@ class Milp:
         """Run a short local search for all initial states together, and offer its plans to `search`."""
         rows, task = search.open(), search.task
         with search.charged(rows):
-            searcher = Searcher(task, search.generator, enough=search.budget.target or TOLERANCE)
-            bank = extremes(task, search.generator).double()
+            searcher = Searcher(task, search.generator, target=search.budget.target or TOLERANCE)
+            guesses = extremes(task, search.generator).double()
             count = search.affordable(rows, self.tries)
             found = searcher.repair(
-                search.states[rows], search.start[rows], bank, tries=count, stop=search.budget.stop
+                search.states[rows], search.start[rows], guesses, tries=count, stop=search.budget.stop
             )
             search.offer(rows, found.plans, evaluations=count)
 

@@ -77,7 +77,7 @@ class SearchPlanner:
         orders.begin(search)
         budget, tries, number = search.budget, self.tries, 0
         target = budget.target if budget.target else TOLERANCE
-        searcher = Searcher(search.task, search.generator, enough=target)
+        searcher = Searcher(search.task, search.generator, target=target)
         while len(search.open()):
             orders.advance(number)
             if not len(rows := search.open()):

@@ -44,7 +44,7 @@ WEIGHTS = 4
 """Number of groups of predicates whose shortfalls are weighed differently in different plans."""
 GENERATIONS = 8
 """Generations of a local search in a round of the search for a phase."""
-CLIMBED = 5
+IMPROVED = 5
 """Number of plans that it improves."""
 STEERED = 5
 """Number of plans that Gauss-Newton steps improve."""
@@ -154,7 +154,7 @@ class Phases:
         self._bounds = np.stack((low, high, turns))
         self._middle = 0.5 * (low + high)
         held = levels(low, self._middle, high, most=MOST_HELD)
-        self._bank = np.repeat(held[:, None], steps, 1)
+        self._constant = np.repeat(held[:, None], steps, 1)
         self._switches = _begins(steps, SWITCHES)
         self._known = [deque["Numbers"](maxlen=KEPT) for _ in targets]
         names = frozenset(system.names)
@@ -228,7 +228,7 @@ class Phases:
 
         `effort` is a factor of the generations of local searches.
         """
-        row, middle = self._row(state, ask), np.broadcast_to(self._middle, self._bank[0].shape)
+        row, middle = self._row(state, ask), np.broadcast_to(self._middle, self._constant[0].shape)
         plans, rho = self._remembered(row, ask, middle)
         for _ in range(min(ROUNDS[0] + effort - 1, ROUNDS[1])):
             if rho.max() < 0.0:
@@ -289,7 +289,7 @@ class Phases:
         best, rho = self._twice(row, ask, plans, random)
         if rho.max() >= 0.0:
             return best, rho
-        kept = (-rho).argsort(kind="stable")[:CLIMBED]
+        kept = (-rho).argsort(kind="stable")[:IMPROVED]
         steered, found = self._steered(row, ask, best[kept[:STEERED]], NEWTON)
         if found.max() >= 0.0:
             return steered, found
@@ -298,7 +298,7 @@ class Phases:
         own = len(self._names) + 3
         rows[1:, own : own + WEIGHTS] = np.exp(SPREAD * random.standard_normal((len(kept) - 1, WEIGHTS)))
         options = SearchOptions(
-            self._bounds, np.ones(1), self._bank, effort * GENERATIONS, 0.0, int(random.integers(2**62))
+            self._bounds, np.ones(1), self._constant, effort * GENERATIONS, 0.0, int(random.integers(2**62))
         )
         self.tried += len(kept) * effort * GENERATIONS * LANES
         best, rho = self._kernel.local_search(rows, best[kept], options)
@@ -319,9 +319,9 @@ class Phases:
 
         Those are the best for each level or, if some reach the target, one of those that do so first.
         """
-        steps, levels = self.steps, len(self._bank)
+        steps, levels = self.steps, len(self._constant)
         before = np.arange(steps) < self._switches[:, None]
-        switched = np.where(before[None, None, :, :, None], plans[:, None, None], self._bank[:, None])
+        switched = np.where(before[None, None, :, :, None], plans[:, None, None], self._constant[:, None])
         whole = switched.swapaxes(0, 1).reshape(levels, -1, *plans.shape[1:])
         rows, own = np.repeat(row, levels, 0), len(self._names) + 3
         rows[1:, own : own + WEIGHTS] = np.exp(SPREAD * random.standard_normal((levels - 1, WEIGHTS)))

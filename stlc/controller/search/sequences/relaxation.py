@@ -53,7 +53,7 @@ Sort: TypeAlias = Literal["mode", "timed", "driven", "unknown"]
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class RelaxedStep:
     """A step of a relaxed plan: a jump, or a wait.
 
     Attributes:
@@ -165,7 +165,7 @@ class Relaxation:
         self._trees: dict[int, tuple[ir.Formula, Tree]] = {}
         self._sorts = [self._sort(literal) for literal in self._literals]
         self._jumps = len(jumps)
-        waits = (Step(each, each) for each in self._ways)
+        waits = (RelaxedStep(each, each) for each in self._ways)
         self.steps = (*jumps, *groups, *waits)
         self._first_wait = len(jumps) + len(groups)
         self._wait = {step.condition: i for i, step in enumerate(self.steps) if i >= self._first_wait}
@@ -246,7 +246,7 @@ class Relaxation:
         lack = -float(_values([literal], env)[0, 0])
         return max(lack, 0.0) / max(self._rates.get(literal, 0.0), PROBE)
 
-    def _group(self, formula: ir.Formula, samples: float) -> Iterator[Step]:
+    def _group(self, formula: ir.Formula, samples: float) -> Iterator[RelaxedStep]:
         """Yield the motion that makes a conjunction true on which a timer runs; none if only modes do.
 
         It stays true for the number of samples that the timer needs, unless these are many.
@@ -256,11 +256,11 @@ class Relaxation:
         if len(modes) < len(parts):
             last = math.ceil(samples - PROBE)
             target = ir.Temporal("always", ir.Window(0, last), formula) if last <= LONGEST else formula
-            yield Step(joined("and", modes), target, last if last <= LONGEST else 0)
+            yield RelaxedStep(joined("and", modes), target, last if last <= LONGEST else 0)
 
     def _step(
         self, jump: JumpDecl, clauses: Sequence[Sequence[ir.Formula]], orders: Sequence[ir.Until]
-    ) -> Step:
+    ) -> RelaxedStep:
         """Return a jump as a step, with what safety requirements and orders ask when it happens."""
         fixed = {each.name: each.value for each in jump.resets if isinstance(each.value, ir.Const)}
         extra = [self._left(clause, fixed) for clause in clauses]
@@ -270,10 +270,10 @@ class Relaxation:
         condition = joined("and", (jump.guard, *extra))
         controls = frozenset(self._controls)
         if not columns_in(jump.guard) & controls:
-            return Step(condition, condition, 1, jump)
+            return RelaxedStep(condition, condition, 1, jump)
         free = rejoined(jump.guard, lambda part: YES if columns_in(part) & controls else part)
         effects = (_equal(name, value) for name, value in fixed.items())
-        return Step(joined("and", (free, *extra)), joined("and", effects), 0, jump)
+        return RelaxedStep(joined("and", (free, *extra)), joined("and", effects), 0, jump)
 
     def _left(self, clause: Sequence[ir.Formula], fixed: Mapping[str, ir.Num]) -> ir.Formula:
         """Return what a clause, a disjunction, asks before a jump that sets the states `fixed`."""

@@ -95,7 +95,7 @@ def test_nearly_robust_plans_are_repaired(boat: System) -> None:
     rows = torch.tensor([0])
     search.offer(rows, torch.zeros(1, 8, 2))  # p = 2 at the end
     search.budget = PlanBudget(20.0, target=0.5)
-    Mpc()._mend(search, rows, Searcher(task, search.generator, enough=0.5))
+    Mpc()._mend(search, rows, Searcher(task, search.generator, target=0.5))
     assert float(search.rho) >= 0.5
 
 
