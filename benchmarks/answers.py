@@ -7,7 +7,6 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -85,16 +84,11 @@ def _document(*words: str) -> dict[str, Any]:
 
 
 def _of_diagnostic(record: dict[str, Any], files: Files) -> Remark:
-    near = " ".join([*record["help"], *record["note"], record["label"], *_lines(record, files)])
-    return Remark(record["code"], record["message"], record["severity"], frozenset(_WORD.findall(near)))
-
-
-def _lines(record: dict[str, Any], files: Files) -> Iterator[str]:
-    """Yield the lines of the specification in which a diagnostic lies."""
-    place = record["range"]
+    place, lines = record["range"], []
     if place is not None and str(record["file"]).endswith(".stl"):
-        lines = files.spec.splitlines()
-        yield from lines[place["start"]["line"] - 1 : place["end"]["line"]]
+        lines = files.spec.splitlines()[place["start"]["line"] - 1 : place["end"]["line"]]
+    near = " ".join([*record["help"], *record["note"], record["label"], *lines])
+    return Remark(record["code"], record["message"], record["severity"], frozenset(_WORD.findall(near)))
 
 
 def _of_fact(record: dict[str, Any], requirement: str) -> Remark:

@@ -6,7 +6,7 @@ baseline. If it is not refuted, it is confirmed only for those baselines that ar
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 OURS = "guided"
@@ -79,26 +79,19 @@ def claims(standings: Iterable[Standing]) -> list[Claim]:
 Known = dict[tuple[str, str], Standing]
 
 
-def _rivals(known: Known, benchmark: str) -> list[Standing]:
-    found = (known.get((benchmark, name)) for name in BASELINES)
-    return [each for each in found if each is not None]
-
-
-def _against(rivals: Sequence[Standing]) -> str:
-    missing = len(BASELINES) - len(rivals)
-    return f"; {missing} of {len(BASELINES)} baselines not measured or refused" if missing else ""
-
-
 def _compared(known: Known, benchmark: str) -> tuple[Standing, Standing, str] | None:
     """Return the result of our method on a benchmark, that of the best baseline, and a text with both.
 
     None is returned if either of the two is not measured.
     """
-    ours, rivals = known.get((benchmark, OURS)), _rivals(known, benchmark)
+    ours = known.get((benchmark, OURS))
+    rivals = [each for name in BASELINES if (each := known.get((benchmark, name))) is not None]
     if ours is None or not rivals:
         return None
     best = max(rivals, key=lambda each: each.accuracy)
-    text = f"{OURS} {ours.accuracy:.3f}, best baseline {best.method} {best.accuracy:.3f}{_against(rivals)}"
+    text = f"{OURS} {ours.accuracy:.3f}, best baseline {best.method} {best.accuracy:.3f}"
+    if missing := len(BASELINES) - len(rivals):
+        text += f"; {missing} of {len(BASELINES)} baselines not measured or refused"
     return ours, best, text
 
 

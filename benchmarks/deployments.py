@@ -271,7 +271,7 @@ def _policy_of(folder: RunDir) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class DeploymentRow:
     """Results of one policy in one scenario.
 
     Attributes:
@@ -304,7 +304,7 @@ class Row:
         return f"{self.seeds} x {self.agents} x {self.steps}"
 
 
-def rows_of(results: Iterable[Result]) -> list[Row]:
+def rows_of(results: Iterable[Result]) -> list[DeploymentRow]:
     """Group results into rows, one per specification, scenario and size, and sort the rows.
 
     Specifications come in the order of the paper, then others; scenarios come in the order of `SCENARIOS`.
@@ -314,15 +314,15 @@ def rows_of(results: Iterable[Result]) -> list[Row]:
         key = each["key"]
         group = (key["spec"], key["scenario"], len(key["seeds"]), int(key["agents"]), int(key["steps"]))
         groups.setdefault(group, {})[key["guard"]] = each
-    return sorted((Row(*key, guards) for key, guards in groups.items()), key=_place)
+    return sorted((DeploymentRow(*key, guards) for key, guards in groups.items()), key=_place)
 
 
-def _place(row: Row) -> tuple[Any, ...]:
+def _place(row: DeploymentRow) -> tuple[Any, ...]:
     scenario = SCENARIOS.index(row.scenario) if row.scenario in SCENARIOS else len(SCENARIOS)
     return *benchmark_order(row.spec), scenario, row.scenario, row.seeds, row.agents, row.steps
 
 
-def policy_lines(rows: Iterable[Row]) -> list[str]:
+def policy_lines(rows: Iterable[DeploymentRow]) -> list[str]:
     """Return Markdown bullets with the training method, the training time and the accuracy of each policy."""
     lines = []
     for result in (each for row in rows for each in row.guards.values()):
@@ -343,7 +343,7 @@ def publish_deployments(
     deployments: Deployments,
     output: Output,
     section: Callable[[Sequence[Result]], list[str]],
-    table: Callable[[Sequence[Row]], Table[Any, Any]],
+    table: Callable[[Sequence[DeploymentRow]], Table[Any, Any]],
 ) -> None:
     """Write all stored deployments into the documentation page, and print the requested ones.
 

@@ -40,7 +40,7 @@ of a row may come from different machines, which the end of the section lists.
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class LearnedRow:
     """Results of one method on one benchmark with one training time, over all seeds.
 
     Attributes:
@@ -96,14 +96,14 @@ class Row:
         return min((accuracy / known for accuracy, known in pairs if known), default=None)
 
 
-def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
+def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> LearnedRow:
     """Return the row with the mean results of `group`: training runs that differ only in the seed.
 
     `known` maps the name of a benchmark to the share of states from which a satisfying plan is known.
     """
     cell, results, judged = group.cell, group.results, group.judged
     found = known.get(cell.benchmark)
-    return Row(
+    return LearnedRow(
         *(cell.benchmark, cell.contender, cell.length.text, group.seeds, group.accuracies),
         interval=interval_over_seeds(group.accuracies, judged),
         judged=judged,
@@ -118,8 +118,8 @@ def row_of(group: SeedGroup, known: Mapping[str, KnownFeasible]) -> Row:
     )
 
 
-FIRST: Columns[Row] = {"benchmark": "{benchmark}", "method": "{method}", "budget": "{length}"}
-SHOWN: Columns[Row] = {
+FIRST: Columns[LearnedRow] = {"benchmark": "{benchmark}", "method": "{method}", "budget": "{length}"}
+SHOWN: Columns[LearnedRow] = {
     **FIRST,
     "seeds": lambda row: ", ".join(map(str, row.seeds)),
     "accuracy": lambda row: (
@@ -132,7 +132,7 @@ SHOWN: Columns[Row] = {
     "steps": lambda row: " to ".join(f"{each:,}" for each in sorted({min(row.steps), max(row.steps)})),
     "inputs": lambda row: inputs_text(row.outdated),
 }
-REQUIREMENTS: Columns[Row] = {
+REQUIREMENTS: Columns[LearnedRow] = {
     **FIRST,
     "requirements": lambda row: ", ".join(f"{name} {share:.4f}" for name, share in row.requirements.items()),
 }

@@ -12,7 +12,6 @@ from benchmarks.cells import BUDGETS
 from benchmarks.claims import Claim, claims
 from benchmarks.comparison import (
     Learned,
-    Line,
     accuracies,
     deployments,
     latencies,
@@ -24,7 +23,7 @@ from benchmarks.comparison import (
 from benchmarks.drives import DriveRow
 from benchmarks.feasible import known_feasible
 from benchmarks.learned import detailed, learned
-from benchmarks.plannings import ALONE, SEED, STARTS, Ceiling, PlanRow, ceilings
+from benchmarks.plannings import ALONE, SEED, STARTS, FeasibleBounds, PlanRow, feasible_bounds
 from benchmarks.roster import roster
 from benchmarks.store import BENCHMARKS, ResultStore
 from benchmarks.table import Columns, listed, provenance
@@ -32,7 +31,7 @@ from benchmarks.training import Cell, Place
 
 Row = TypeVar("Row", PlanRow, DriveRow)
 CLAIMS: Columns[Claim] = {"claim": "{claim}", "here": "{here}", "verdict": "{verdict}", "why": "{why}"}
-CEILINGS: Columns[Ceiling] = {
+FEASIBLE_BOUNDS: Columns[FeasibleBounds] = {
     **{"benchmark": "{benchmark}", "starts": "{starts:,}"},
     **{"a plan is known": "{known:.3f}", "proved: no plan exists": "{proved:.3f}"},
     "neither": lambda row: f"{1.0 - row.known - row.proved:.3f}",
@@ -123,8 +122,8 @@ def section(stored: Stored, page: Path) -> list[str]:
     plans, drives, trained = stored.plan_rows(), stored.drive_rows(), learned(results)
     cells = [(Cell.of(each), float(each["accuracy"])) for each in results]
     judged = {(cell.benchmark, cell.label): accuracy for cell, accuracy in cells}
-    ceiling = ceilings(stored.plans.all().values())
-    drawn = draw(facets(trained, plans, ceiling), page.parent)
+    bounds = feasible_bounds(stored.plans.all().values())
+    drawn = draw(facets(trained, plans, bounds), page.parent)
     pictures = [f"![{what}]({path})" for what, path in zip(_PICTURES, (BARS, TIMES), strict=True) if drawn]
     contenders = roster().values()
     lines = accuracies(
@@ -132,6 +131,8 @@ def section(stored: Stored, page: Path) -> list[str]:
         [each for each in contenders if each.plans],
         *(trained, plans, BUDGETS),
     )
+    timed = latencies(plans)
+    decisions = markdown(timed, filled=False) if timed else ["Nothing is measured yet."]
     return [
         *("## The paper's comparison", ""),
         *_search_first(plans),
@@ -139,9 +140,11 @@ def section(stored: Stored, page: Path) -> list[str]:
         *((BARS_TEXT, "") if drawn else ()),
         *("### Plan accuracy", "", COMPARED, *markdown(lines), "", *refusals(plans), ""),
         *_block(
-            "### Known and proved ceilings", CEILING, listed("c", [*ceiling.values()], CEILINGS).markdown()
+            "### Known and proved feasible shares",
+            FEASIBLE_TEXT,
+            listed("c", [*bounds.values()], FEASIBLE_BOUNDS).markdown(),
         ),
-        *_block("### A decision", DECIDED, _lines(latencies(plans))),
+        *_block("### A decision", DECIDED, decisions),
         *_block("### Closed loop", DEPLOYED, markdown(deployments(drives, judged, contenders))),
         *("### The paper's claims", "", *listed("claims", stored.claims(), CLAIMS).markdown(), ""),
         *provenance(stored.plans.all().values(), "planner cells"),
@@ -157,7 +160,7 @@ _PICTURES = (
 BARS_TEXT = """\
 A bar is the longest training of a method, which is an hour for `sac:robustness` where the table has one, or
 its largest planning time. The dashed line is the known feasible share."""
-CEILING = """\
+FEASIBLE_TEXT = """\
 On the planners' starts: the share for which any cell found a satisfying plan, and the share that `plan:milp`
 proved to have none. A contradiction would be a start with both.
 """
@@ -165,10 +168,6 @@ proved to have none. A contradiction would be a start with both.
 
 def _block(title: str, text: str, lines: Sequence[str]) -> list[str]:
     return [title, "", text, *lines, ""]
-
-
-def _lines(lines: Sequence[Line]) -> list[str]:
-    return markdown(lines, filled=False) if lines else ["Nothing is measured yet."]
 
 
 def _search_first(plans: Sequence[PlanRow]) -> list[str]:
@@ -186,7 +185,9 @@ def _search_first(plans: Sequence[PlanRow]) -> list[str]:
     ]
 
 
-def facets(trained: Iterable[Learned], plans: Sequence[PlanRow], ceiling: dict[str, Ceiling]) -> list[Facet]:
+def facets(
+    trained: Iterable[Learned], plans: Sequence[PlanRow], bounds: dict[str, FeasibleBounds]
+) -> list[Facet]:
     """Return the data of the figures, one `Facet` per benchmark; outdated results are left out.
 
     The bar of each method shows its result with the longest training, or with the largest time budget.
@@ -207,7 +208,7 @@ def facets(trained: Iterable[Learned], plans: Sequence[PlanRow], ceiling: dict[s
     return [
         Facet(
             *(name, tuple(sorted(own.values(), key=lambda bar: names.index(bar.label)))),
-            *(tuple(points[name]), ceiling[name].known if name in ceiling else None),
+            *(tuple(points[name]), bounds[name].known if name in bounds else None),
         )
         for name, own in bars.items()
     ]

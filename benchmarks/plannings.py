@@ -229,7 +229,7 @@ def is_outdated(result: Result) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Ceiling:
+class FeasibleBounds:
     """Shares of a benchmark's initial states (starts) that are known to be feasible, or proved infeasible.
 
     They are computed from the stored results of all planners and policies together.
@@ -249,7 +249,7 @@ class Ceiling:
     contradictions: int
 
 
-def ceilings(results: Iterable[Result]) -> dict[str, Ceiling]:
+def feasible_bounds(results: Iterable[Result]) -> dict[str, FeasibleBounds]:
     """Return for each benchmark the shares of starts with a known plan, and with a proof that no plan exists.
 
     Of each benchmark, only the results with the greatest number of starts are used.
@@ -267,7 +267,7 @@ def ceilings(results: Iterable[Result]) -> dict[str, Ceiling]:
             any(flags) for flags in zip(*(unpack(each["infeasible"], starts) for each in same), strict=True)
         ]
         both = sum(a and b for a, b in zip(known, none, strict=True))
-        found[name] = Ceiling(name, starts, sum(known) / starts, sum(none) / starts, both)
+        found[name] = FeasibleBounds(name, starts, sum(known) / starts, sum(none) / starts, both)
     return found
 
 

@@ -82,7 +82,7 @@ AXES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class AblationRow:
     """Results for one value of a hyperparameter and one training time, over all seeds.
 
     Attributes:
@@ -117,7 +117,7 @@ class Row:
         return f"{self.accuracy:.3f}{spread}"
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[AblationRow] = {
     **{"": "{value}", "budget": "{length}", "seeds": "{seeds}", "training": "{training:.3f}"},
     "held out": "{spread}",
     "paper: training": lambda row: f"{row.reported[0]:.3f}" if row.reported else "",
@@ -146,7 +146,7 @@ def cells_of(axes: Sequence[str], trainings: Sequence[tuple[int, Length]], held_
     ]
 
 
-def table(results: Sequence[Result], axes: Sequence[str]) -> Table[Any, Row]:
+def table(results: Sequence[Result], axes: Sequence[str]) -> Table[Any, AblationRow]:
     """Return the table of the hyperparameters `axes`: a row for each value, including the default value."""
     groups = grouped(results)
     cells = [
@@ -161,8 +161,8 @@ def table(results: Sequence[Result], axes: Sequence[str]) -> Table[Any, Row]:
     return Table("ablation", cells, lambda cell: _row(*cell), COLUMNS)
 
 
-def _row(axis: Axis, value: str, group: SeedGroup) -> Row:
-    return Row(
+def _row(axis: Axis, value: str, group: SeedGroup) -> AblationRow:
+    return AblationRow(
         *(axis.name, value, group.cell.length.text, len(group.seeds), group.mean("training_accuracy")),
         *(group.accuracies, axis.reported.get(value), group.outdated),
     )

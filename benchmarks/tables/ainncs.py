@@ -113,7 +113,7 @@ CASES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class AinncsRow:
     """Result for one closed loop.
 
     Attributes:
@@ -144,7 +144,7 @@ class Row:
         return "falsified" if self.violated else "verified" if self.proved >= 1.0 - 1e-9 else "unknown"
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[AinncsRow] = {
     "instance": "{name}",
     "result": "{result}",
     "proved": "{proved:.1%}",
@@ -190,8 +190,8 @@ def ainncs(
     known = _texts(tools) if published is None else _others(published)
     results = [_verified(case, models, parse_seconds(budget), store) for case in chosen]
 
-    def rows(every: Sequence[Result]) -> list[Row]:
-        return [Row(**each["row"], published=known.get(each["row"]["name"], "")) for each in every]
+    def rows(every: Sequence[Result]) -> list[AinncsRow]:
+        return [AinncsRow(**each["row"], published=known.get(each["row"]["name"], "")) for each in every]
 
     def section() -> list[str]:
         every = [*store.all().values()]

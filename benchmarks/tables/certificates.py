@@ -47,7 +47,7 @@ with 95 % confidence, for a number fixed in advance and for any stopping time.
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class CertificatesRow:
     """Coverage of bounds in one world.
 
     Attributes:
@@ -77,7 +77,7 @@ class Row:
     needed_any_time: int
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[CertificatesRow] = {
     "world": "{spec}",
     "drives x steps": "{drives} x {steps}",
     "satisfied": "{satisfied}",
@@ -90,7 +90,7 @@ COLUMNS: Columns[Row] = {
 }
 
 
-def coverage(result: Result, recalibrations: int, drives: int) -> Row:
+def coverage(result: Result, recalibrations: int, drives: int) -> CertificatesRow:
     """Recalibrate the bounds on stored drives, and compare them with the whole population."""
     good, robustness, other = (np.array(result[name], dtype=float) for name in ("good", "rho", "shifted"))
     rng, share = np.random.default_rng(0), float(good.mean())
@@ -107,7 +107,7 @@ def coverage(result: Result, recalibrations: int, drives: int) -> Row:
         bet = betting_lower(Tally.counted(total, drives), CONFIDENCE) <= share
         found.append((exact, bet, here[0], after[1], after[0]))
     exact_, betting_, next_drive, shifted, unaware = map(float, np.mean(found, axis=0))
-    return Row(
+    return CertificatesRow(
         spec=str(result["key"]["spec"]),
         steps=int(result["key"]["steps"]),
         drives=len(good),
@@ -148,7 +148,7 @@ def certificates(
     store = ResultStore("certificates", out)
     results = [_drives_of(RunDir.open(name), drives, steps, store) for name in runs or ["latest"]]
 
-    def table(every: Sequence[Result]) -> Table[Any, Row]:
+    def table(every: Sequence[Result]) -> Table[Any, CertificatesRow]:
         rows = [coverage(each, recalibrations, min(100, drives)) for each in every]
         return listed("certificates", rows, COLUMNS)
 

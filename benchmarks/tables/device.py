@@ -36,7 +36,7 @@ _OUTPUT = Output()
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class DeviceRow:
     """Elapsed time of a training step on two devices.
 
     Attributes:
@@ -59,7 +59,7 @@ class Row:
         return self.processor / self.device
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[DeviceRow] = {
     **{"benchmark": "{benchmark}", "network": "{network}", "states": "{batch:,}"},
     **{"processor": "{processor:.1f}", "GPU": "{device:.1f}", "processor / GPU": "{ratio:.2f}"},
 }
@@ -84,7 +84,7 @@ def device(
     names = chosen(only, BENCHMARKS, "benchmark")
     sizes = [(each, width, batch) for each in names for width in WIDTHS for batch in BATCHES]
 
-    def row(size: tuple[str, int, int]) -> Row:
+    def row(size: tuple[str, int, int]) -> DeviceRow:
         here = torch.device("cpu")
         made = [step_time(*size, place, seconds=seconds, warm=warm) for place in (here, there)]
         return replace(made[0], device=made[1].device)
@@ -102,7 +102,9 @@ def device(
         torch.set_num_threads(before)
 
 
-def step_time(name: str, width: int, batch: int, place: torch.device, *, seconds: float, warm: int) -> Row:
+def step_time(
+    name: str, width: int, batch: int, place: torch.device, *, seconds: float, warm: int
+) -> DeviceRow:
     """Measure the elapsed time of a training step on one device; both times of the result are that one.
 
     Args:
@@ -138,4 +140,4 @@ def step_time(name: str, width: int, batch: int, place: torch.device, *, seconds
         times.append(time.monotonic() - before)
     trainer.close()
     each = 1e3 * median(times)
-    return Row(name, "x".join(map(str, engine.hidden)), batch, each, each)
+    return DeviceRow(name, "x".join(map(str, engine.hidden)), batch, each, each)

@@ -122,7 +122,7 @@ class Drives:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class FailuresRow:
     """Failing drives of a benchmark under one guard.
 
     Attributes:
@@ -165,7 +165,7 @@ def _share(failing: int | None, drives: int) -> str:
     return f"{100 * failing / drives:.2f} % [{100 * low:.2f}, {100 * high:.2f}]"
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[FailuresRow] = {
     "benchmark": "{benchmark}",
     "guard": "{guard}",
     "simulations x agents x steps": "{simulations} x {agents} x {steps}",
@@ -265,7 +265,7 @@ def failures(
         of_seeds = listed("failures of seeds", seed_rows_of(results), SEED_COLUMNS).markdown()
         return [TEXT, *table().markdown(), "", SEEDS_TEXT, *of_seeds, "", *provenance(results, "searches")]
 
-    def table() -> Table[Any, Row]:
+    def table() -> Table[Any, FailuresRow]:
         return listed("failures", rows_of([*store.all().values()]), COLUMNS)
 
     publish("failures", output, section, {"rows": table()}, driven=new, failed=failed)
@@ -318,7 +318,7 @@ def _told(result: Result) -> str:
     return f"{result['failing']} of {result['drives']} drives fail, {result['seconds']:.0f} s"
 
 
-def rows_of(results: Sequence[Result]) -> list[Row]:
+def rows_of(results: Sequence[Result]) -> list[FailuresRow]:
     """Rows of the stored results, in the order of the benchmarks; incomplete ones are left out.
 
     A row compares the largest two searches of equal size, and equal numbers of fresh drives of both
@@ -341,7 +341,7 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
             newest = max(after, key=lambda each: str(each["key"]["trained"]), default=None)
             key = searched["key"]
             rows.append(
-                Row(
+                FailuresRow(
                     *(benchmark, guard, key["simulations"], key["agents"], key["steps"]),
                     *(random["least"], searched["least"], random["failing"], searched["failing"]),
                     *(searched["drives"], before["drives"], before["failing"]),

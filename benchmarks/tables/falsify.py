@@ -146,7 +146,7 @@ CASES = tuple(
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class FalsifyRow:
     """Searches for a violation of one requirement, one for each seed.
 
     Attributes:
@@ -182,7 +182,7 @@ class Row:
     remark: str
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[FalsifyRow] = {
     "requirement": "{case}",
     "falsified": "{falsified} of {seeds}",
     "mean": "{mean:.1f}",
@@ -272,14 +272,14 @@ def _record(search: ViolationSearch, seed: int) -> Mapping[str, Any]:
     }
 
 
-def _row(case: Case, result: Result) -> Row:
+def _row(case: Case, result: Result) -> FalsifyRow:
     every: Sequence[Mapping[str, Any]] = result["searches"]
     good = [each for each in every if each["margin"] is not None]
     counts = [int(each["simulations"]) for each in good]
     firsts = [int(each["first"]) for each in every if each["first"] is not None]
     missed = [float(each["least"]) for each in every if each["margin"] is None]
     halves = [float(each["half_step"]) for each in good if each["half_step"] is not None]
-    return Row(
+    return FalsifyRow(
         case.name,
         len(every),
         case.most,

@@ -81,7 +81,7 @@ FAMILIES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class FamilyRow:
     """Results of a family at one value of its parameter and one training time, over all seeds.
 
     Attributes:
@@ -112,7 +112,7 @@ class Row:
         return self.accuracy / self.feasible if self.feasible else None
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[FamilyRow] = {
     "value": lambda row: f"{row.value:g} {_named(row.family).unit}".join(("", "") if row.inside else "**"),
     "budget": "{length}",
     "seeds": lambda row: ", ".join(map(str, row.seeds)),
@@ -170,7 +170,7 @@ def _verdict(run: Path, family: Family, value: float, held_out: int) -> Mapping[
     return score(opened.task, opened.policy, n=held_out).summary()
 
 
-def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]:
+def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, FamilyRow]:
     """Return the table, with rows ordered by family, training time and value."""
     cells = [
         (family, value, group, found)
@@ -183,10 +183,10 @@ def table(trainings: Sequence[Result], verdicts: ResultStore) -> Table[Any, Row]
     return Table("family", cells, lambda cell: _row(*cell), COLUMNS)
 
 
-def _row(family: Family, value: float, group: SeedGroup, verdicts: Sequence[Result]) -> Row:
+def _row(family: Family, value: float, group: SeedGroup, verdicts: Sequence[Result]) -> FamilyRow:
     low, high = family.sampled()
     accuracies = [float(each["accuracy"]) for each in verdicts]
-    return Row(
+    return FamilyRow(
         *(family.name, value, low <= value <= high, group.cell.length.text),
         tuple(int(each["key"]["training"]["seed"]) for each in verdicts),
         fmean(accuracies),
@@ -196,7 +196,7 @@ def _row(family: Family, value: float, group: SeedGroup, verdicts: Sequence[Resu
     )
 
 
-def section(trainings: Sequence[Result], made: Table[Any, Row]) -> list[str]:
+def section(trainings: Sequence[Result], made: Table[Any, FamilyRow]) -> list[str]:
     """Return the lines of the page's section, which has one table per family."""
     lines = ["## One policy for a family", "", TEXT.rstrip()]
     for family in FAMILIES:

@@ -45,7 +45,7 @@ _OUTPUT = Output()
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class LatencyRow:
     """Latency of the decisions of one policy with one guard.
 
     Attributes:
@@ -63,7 +63,7 @@ class Row:
     acting: Times | None
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[LatencyRow] = {
     **{"benchmark": "{benchmark}", "guard": "{guard}"},
     **{"median": "{every.median:.2f}", "99 %": "{every.p99:.2f}"},
     **{"where it acts: median": "{acting.median:.2f}", "where it acts: 99 %": "{acting.p99:.2f}"},
@@ -95,7 +95,7 @@ def latency(
         publish("latency", output, lines, {"rows": table})
 
 
-def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
+def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[LatencyRow]:
     """Yield the rows of a run: first the policy alone, then each guard.
 
     Args:
@@ -113,11 +113,11 @@ def rows_of(run: Run, samples: int, seeds: tuple[int, ...]) -> Iterator[Row]:
         return process_time() - begin
 
     names = run.task.compiled.name, run.dir.name
-    yield Row(*names, POLICY, Times.of(after_warm_up(plan, [*even])), None)
+    yield LatencyRow(*names, POLICY, Times.of(after_warm_up(plan, [*even])), None)
     for mode, guard in guards.items():
         every, there = _timed(guard, recording, even), _timed(guard, recording, acted)
         acting = [seconds for seconds, source in (*every, *there) if source]
-        yield Row(*names, mode, Times.of([seconds for seconds, _ in every]), Times.of(acting))
+        yield LatencyRow(*names, mode, Times.of([seconds for seconds, _ in every]), Times.of(acting))
 
 
 def _guards(run: Run) -> Iterator[tuple[str, Guard]]:

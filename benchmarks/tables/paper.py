@@ -7,7 +7,7 @@ from pathlib import Path
 from benchmarks.cells import Selection
 from benchmarks.drives import DriveRow, budget_text, driven
 from benchmarks.feasible import known_feasible, prove_on, search_on
-from benchmarks.learned import SHOWN, Row, row_of, tables
+from benchmarks.learned import SHOWN, LearnedRow, row_of, tables
 from benchmarks.options import Comparing, OnlyOption, Output, Training, chosen
 from benchmarks.page import CLAIMS, Stored, section
 from benchmarks.plannings import PlanRow, planned
@@ -17,7 +17,7 @@ from benchmarks.table import Columns, listed, publish
 from benchmarks.training import filled
 from stlc.cli.framework.program import command
 
-__all__ = ["SHOWN", "Row", "paper", "row_of"]
+__all__ = ["SHOWN", "LearnedRow", "paper", "row_of"]
 _TRAINING, _COMPARING, _OUTPUT = Training(clock="processor"), Comparing(), Output(Path("docs/results.md"))
 PLANS: Columns[PlanRow] = {
     **{"benchmark": "{benchmark}", "planner": lambda row: row.label or row.method},

@@ -126,7 +126,7 @@ class Solution:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class PlanningRow:
     """Results of one method for one problem.
 
     `reason` says why the method cannot solve the problem; it is "" if `solution` is given.
@@ -142,7 +142,7 @@ class Row:
     published: str
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[PlanningRow] = {
     "problem": "{problem}",
     "method": "{method}",
     "budget": lambda row: f"{row.budget:g} s" + ("" if row.target == inf else f", rho ≥ {row.target:g}"),
@@ -179,7 +179,7 @@ def planning(
         show("planning", {"rows": table}, as_json=as_json)
 
 
-def measured(problem: Problem, method: str, store: ResultStore) -> Row:
+def measured(problem: Problem, method: str, store: ResultStore) -> PlanningRow:
     """Return the row of a problem and a method, from the stored result or from a new measurement.
 
     If the method cannot solve the problem, the row contains the reason.
@@ -201,9 +201,9 @@ def measured(problem: Problem, method: str, store: ResultStore) -> Row:
         )
         none = len(_impossible(problem, inputs, store)) if problem.tasks else 0
     except StlcError as why:
-        return Row(*shown, None, str(why), problem.published)
+        return PlanningRow(*shown, None, str(why), problem.published)
     found = Solution(**{each.name: kept[each.name] for each in fields(Solution)})
-    return Row(*shown, replace(found, starts=found.starts - none), "", problem.published)
+    return PlanningRow(*shown, replace(found, starts=found.starts - none), "", problem.published)
 
 
 def _impossible(problem: Problem, inputs: Mapping[str, Any], store: ResultStore) -> list[int]:

@@ -11,7 +11,7 @@ from types import UnionType
 from typing import Any, Literal, NotRequired, TypedDict, Union, get_args, get_origin, get_type_hints
 
 from benchmarks.claims import Claim
-from benchmarks.deployments import Row as DeploymentRow
+from benchmarks.deployments import DeploymentRow
 from benchmarks.drives import DriveRow
 from benchmarks.episodes import EpisodeSpeed
 from benchmarks.feasible import KnownFeasible
@@ -64,25 +64,25 @@ class Facts(TypedDict):
 
 ROWS: dict[str, dict[str, type]] = {
     "paper": {
-        **{"rows": paper.Row, "known_feasible": KnownFeasible},
+        **{"rows": paper.LearnedRow, "known_feasible": KnownFeasible},
         **{"plans": PlanRow, "drives": DriveRow, "claims": Claim},
     },
-    "ablation": {"rows": ablation.Row},
-    "failures": {"rows": failures.Row},
-    "falsify": {"rows": falsify.Row},
-    "family": {"rows": family.Row},
+    "ablation": {"rows": ablation.AblationRow},
+    "failures": {"rows": failures.FailuresRow},
+    "falsify": {"rows": falsify.FalsifyRow},
+    "family": {"rows": family.FamilyRow},
     "worlds": {"rows": DeploymentRow},
     "disturbed": {"rows": DeploymentRow},
-    "latency": {"rows": latency.Row},
-    "device": {"rows": device.Row},
+    "latency": {"rows": latency.LatencyRow},
+    "device": {"rows": device.DeviceRow},
     "repair": {"rows": Mended},
     "step": {"steps": StepTiming, "speeds": Speed},
     "robustness": {"rows": Timing},
     "uncertain": {"rows": uncertain.Overhead},
     "gym": {"rows": EpisodeSpeed},
-    "certificates": {"rows": certificates.Row},
-    "verify": {"rows": verify.Row},
-    "ainncs": {"rows": ainncs.Row},
+    "certificates": {"rows": certificates.CertificatesRow},
+    "verify": {"rows": verify.VerifyRow},
+    "ainncs": {"rows": ainncs.AinncsRow},
     "tasks": {"rows": tasks.TaskRow},
 }
 """Name of a table -> key in its result -> record of a row."""

@@ -113,8 +113,8 @@ class TaskCell:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """Outcome of one command: judged plans or drives, with times.
+class TaskOutcome:
+    """TaskOutcome of one command: judged plans or drives, with times.
 
     Attributes:
         what: `plans`, `controller`, or `policy` and its guard.
@@ -150,10 +150,10 @@ def measure(cell: TaskCell, runs: Path) -> Result:
     return {"outcomes": [asdict(each) for each in found]}
 
 
-def _outcome(what: str, cell: TaskCell, trace: Path, making: Callable[[], Outcome]) -> Outcome:
+def _outcome(what: str, cell: TaskCell, trace: Path, making: Callable[[], TaskOutcome]) -> TaskOutcome:
     """Return the outcome of `making`, which writes `trace`, with the verdicts of the judge."""
     trace.unlink(missing_ok=True)
-    made = Outcome(what)
+    made = TaskOutcome(what)
     try:
         made = replace(making(), what=what)
         verdicts = judged(cell.task, trace)
@@ -162,7 +162,7 @@ def _outcome(what: str, cell: TaskCell, trace: Path, making: Callable[[], Outcom
         return replace(made, cause=str(error))
 
 
-def _plans(cell: TaskCell, trace: Path) -> Outcome:
+def _plans(cell: TaskCell, trace: Path) -> TaskOutcome:
     size = cell.size
     result = asked(
         *("plan", str(cell.task.spec), "--starts", str(size.starts), "--budget", f"{size.seconds:g}s"),
@@ -171,10 +171,10 @@ def _plans(cell: TaskCell, trace: Path) -> Outcome:
     )
     times = result["seconds"]
     said = f"{result['satisfied']} of {result['starts']} satisfied, to {end_of(trace):g} s"
-    return Outcome("", median_ms=1e3 * times["median"], p99_ms=1e3 * times["most"], said=said)
+    return TaskOutcome("", median_ms=1e3 * times["median"], p99_ms=1e3 * times["most"], said=said)
 
 
-def _drives(cell: TaskCell, trace: Path, subject: str, *options: str, guard: str = "none") -> Outcome:
+def _drives(cell: TaskCell, trace: Path, subject: str, *options: str, guard: str = "none") -> TaskOutcome:
     result = asked(
         *("simulate", subject, *options, *cell.size.worlds(cell.seed), "--guard", guard),
         *("--record", str(trace), "--no-pictures"),
@@ -183,10 +183,10 @@ def _drives(cell: TaskCell, trace: Path, subject: str, *options: str, guard: str
     driven = result["guards"][guard]
     times, drives = driven["latency"], driven.get("drives")
     said = "" if drives is None else f"{drives['obeyed']} of {drives['count']} obeyed"
-    return Outcome("", median_ms=1e3 * times["median"], p99_ms=1e3 * times["p99"], said=said)
+    return TaskOutcome("", median_ms=1e3 * times["median"], p99_ms=1e3 * times["p99"], said=said)
 
 
-def _policy(cell: TaskCell, trace: Path, runs: Path) -> Iterator[Outcome]:
+def _policy(cell: TaskCell, trace: Path, runs: Path) -> Iterator[TaskOutcome]:
     """Train a policy, then drive with each guard."""
     try:
         trained = asked(
@@ -195,7 +195,7 @@ def _policy(cell: TaskCell, trace: Path, runs: Path) -> Iterator[Outcome]:
             limit=cell.size.limit,
         )
     except NoAnswerError as error:
-        yield Outcome("policy", cause=str(error))
+        yield TaskOutcome("policy", cause=str(error))
         return
     told = _told(trained)
     for guard in GUARDS:
@@ -242,7 +242,7 @@ class TaskRow:
     causes: tuple[str, ...]
 
     @classmethod
-    def of(cls, task: str, what: str, outcomes: Mapping[int, Outcome]) -> TaskRow:
+    def of(cls, task: str, what: str, outcomes: Mapping[int, TaskOutcome]) -> TaskRow:
         """Return the row of the outcomes by seed."""
         own = [*outcomes.values()]
         medians = [each.median_ms for each in own if each.median_ms is not None]
@@ -275,10 +275,10 @@ COLUMNS: Columns[TaskRow] = {
 
 def rows_of(results: Iterable[Result]) -> list[TaskRow]:
     """Return the rows of stored results, in the order in which tasks and parts come first."""
-    groups: dict[tuple[str, str], dict[int, Outcome]] = {}
+    groups: dict[tuple[str, str], dict[int, TaskOutcome]] = {}
     for each in results:
         key = each["key"]
-        for outcome in (Outcome(**one) for one in each["outcomes"]):
+        for outcome in (TaskOutcome(**one) for one in each["outcomes"]):
             groups.setdefault((key["task"], outcome.what), {})[key["seed"]] = outcome
     return [TaskRow.of(*names, outcomes) for names, outcomes in groups.items()]
 

@@ -46,7 +46,7 @@ has one thread.
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class VerifyRow:
     """Result for one mode of the initial states of a policy.
 
     Attributes:
@@ -83,7 +83,7 @@ class Row:
         return clopper_pearson_lower(self.with_proof, self.states) if self.states else 0.0
 
 
-COLUMNS: Columns[Row] = {
+COLUMNS: Columns[VerifyRow] = {
     "policy": "{spec}",
     "network": "{network}",
     "initial states": "{mode}",
@@ -129,8 +129,8 @@ def verify(
         _verified(folder, _Sizes(parse_seconds(budget), states, points, jobs), store) for folder in folders
     ]
 
-    def rows(every: Sequence[Result]) -> list[Row]:
-        return [Row(**mode) for each in every for mode in each["modes"]]
+    def rows(every: Sequence[Result]) -> list[VerifyRow]:
+        return [VerifyRow(**mode) for each in every for mode in each["modes"]]
 
     def section() -> list[str]:
         stored = store.all()

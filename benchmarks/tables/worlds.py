@@ -119,7 +119,7 @@ def worlds(
     guards: Annotated[
         str, typer.Option("--guards", metavar="NAMES", help=f"Some of {','.join(GUARDS)}.")
     ] = "none,paper,full",
-    ceiling: Annotated[
+    known_feasible: Annotated[
         int,
         typer.Option("--known-feasible", metavar="N", min=0, help="Visited states to check for plans."),
     ] = 1000,
@@ -132,7 +132,7 @@ def worlds(
     settings are reused. Scenarios with a world of their own are simulated, too.
     """
     modes = [mode for mode in GUARDS if mode in chosen(guards, GUARDS.names, "guard")]
-    deployments = Deployments(ResultStore("worlds", options.out), options, ceiling)
+    deployments = Deployments(ResultStore("worlds", options.out), options, known_feasible)
     for folder in options.runs(runs):
         declared = Run.open(folder.path).task.system.decl.scenarios
         deployments.add(folder, (NOMINAL, *(each.name for each in declared if each.world)), modes)

@@ -15,7 +15,7 @@ from helpers.documents import misfits
 from benchmarks.__main__ import main as measure
 from benchmarks.store import ResultStore, load, spec_path
 from benchmarks.table import Table
-from benchmarks.tables.family import COLUMNS, FAMILIES, Family, Row, section
+from benchmarks.tables.family import COLUMNS, FAMILIES, Family, FamilyRow, section
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place
 from stlc.compile.semantics.tolerance import satisfied
@@ -142,7 +142,7 @@ def _of(family: Family, values: tuple[float, ...]) -> Family:
 
 def test_the_tables_have_one_row_a_value_and_mark_what_was_never_seen() -> None:
     rows = [
-        Row("stop_time", value, value <= 1.4, "60 s", (0, 1), 0.9, (0.89, 0.91), feasible)
+        FamilyRow("stop_time", value, value <= 1.4, "60 s", (0, 1), 0.9, (0.89, 0.91), feasible)
         for value, feasible in ((1.0, 0.95), (1.8, 0.0))
     ]
     text = "\n".join(section([], Table("family", rows, lambda row: row, COLUMNS)))

@@ -18,7 +18,7 @@ from benchmarks.claims import FAILS, HOLDS, OPEN, Claim, Standing, claims
 from benchmarks.comparison import Learned, accuracies, deployments, standings, upsets
 from benchmarks.drives import Drive, DriveRow, driven
 from benchmarks.options import Comparing
-from benchmarks.plannings import PlanCell, PlanRow, ceilings, improves, measure, planned
+from benchmarks.plannings import PlanCell, PlanRow, feasible_bounds, improves, measure, planned
 from benchmarks.roster import Contender, learners, planners, roster
 from benchmarks.store import BENCHMARKS, ResultStore, load
 from benchmarks.tables.schema import document_schema
@@ -151,16 +151,16 @@ def test_a_long_cell_is_measured_where_time_helps(tmp_path: Path) -> None:
     assert improves(tiny(seconds=0.1), store)
 
 
-def test_ceilings_are_of_all_plans_together(tmp_path: Path) -> None:
+def test_feasible_bounds_are_of_all_plans_together(tmp_path: Path) -> None:
     store = ResultStore("plans", tmp_path)
     flags = [True, False, False, False], [False, True, False, False], [False, False, True, False]
     for cell, solved in zip((tiny(), tiny(seconds=0.003)), flags[:2], strict=True):
         store.put(cell.key, {"solved": pack(solved), "infeasible": pack(flags[2])})
-    found = ceilings(store.all().values())["reach_n_avoid"]
+    found = feasible_bounds(store.all().values())["reach_n_avoid"]
     assert (found.known, found.proved, found.contradictions) == (0.5, 0.25, 0)
     wrong = {"solved": pack(flags[0]), "infeasible": pack(flags[0])}
     store.put(tiny(seconds=0.004).key, wrong)
-    assert ceilings(store.all().values())["reach_n_avoid"].contradictions == 1
+    assert feasible_bounds(store.all().values())["reach_n_avoid"].contradictions == 1
 
 
 @pytest.mark.apart

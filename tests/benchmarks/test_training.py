@@ -377,7 +377,7 @@ def cell_result(benchmark: str, method: str, seed: int, accuracy: float, **chang
     return {"key": {**key, **changes}, **numbers, "requirements": {"stop": accuracy}}
 
 
-def paper_rows(documents: list[dict[str, Any]], known: dict[str, float]) -> list[paper.Row]:
+def paper_rows(documents: list[dict[str, Any]], known: dict[str, float]) -> list[paper.LearnedRow]:
     found = {name: KnownFeasible(name, share, (0.0, 1.0), 0, None, 0, 0, 0) for name, share in known.items()}
     return paper.tables(documents, found)["rows"].rows
 

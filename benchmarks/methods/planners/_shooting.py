@@ -227,7 +227,10 @@ class Shooting:
         if not step:
             return {}
         moved = ArrayProgram(step)(known, CASADI, self._switch)
-        return {name: _tall(column, steps) for name, column in moved.items()}
+        return {
+            name: column if len(column) == steps else CASADI.cat([column] * steps)
+            for name, column in moved.items()
+        }
 
     def _values(self, demands: Sequence[ScaledFormula], rows: Mapping[str, SymbolicColumn]) -> Any:
         """Scaled robustness of the required conditions, as a column (conditions, 1).
@@ -347,8 +350,3 @@ def _require_smooth(num: ir.Num, reached: frozenset[str]) -> None:
 def _holds(row: SymbolicColumn) -> bool:
     """True if `row` is a nonnegative constant, so that the condition with this robustness always holds."""
     return bool(row.entries.is_constant()) and float(row.entries) >= 0.0
-
-
-def _tall(column: SymbolicColumn, rows: int) -> SymbolicColumn:
-    """Repeat `column` over `rows` samples if it is a single value; otherwise return it unchanged."""
-    return column if len(column) == rows else CASADI.cat([column] * rows)

@@ -87,9 +87,9 @@ class Cem:
         entries = search.task.system.horizon * len(search.task.system.control_names) * self.population
         while len(rows := search.open()):
             for part in torch.split(rows, max(1, MOST // entries)):
-                self._climb(search, part, space)
+                self._search(search, part, space)
 
-    def _climb(self, search: PlanSearch, rows: Tensor, space: _Space) -> None:
+    def _search(self, search: PlanSearch, rows: Tensor, space: _Space) -> None:
         """Make up to `rounds` rounds for each of the initial states with indices `rows`, (k,).
 
         The rounds for a state end when the Gaussian has converged, a plan has reached the target robustness,

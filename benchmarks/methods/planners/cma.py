@@ -45,10 +45,10 @@ class Cma:
         for row in range(len(search.states)):
             restarts = 0
             while row in search.open():
-                self._climb(search, row, strategy, restarts)
+                self._search(search, row, strategy, restarts)
                 restarts += 1
 
-    def _climb(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
+    def _search(self, search: PlanSearch, row: int, strategy: Any, restarts: int) -> None:
         """Run CMA-ES once for the initial state with index `row`.
 
         The run ends once it has converged, reached the target robustness, or spent the budget. The first run
