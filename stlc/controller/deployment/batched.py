@@ -179,10 +179,10 @@ class Worlds:
             good &= (again == x).all(1)
             x, left = again, torch.nonzero(~good).squeeze(1)
             good[left] = known(self.task, x[left])
-        starts, left = self.task.system.decl.test.starts, int((~good).sum())
+        starts, bad = self.task.system.decl.test.starts, int((~good).sum())
         plan = "a safe plan" if starts == "savable" else "a plan that satisfies everything"
         message = (
-            f"no start from which {plan} is known, in {REDRAWN} draws each, for {left} agents of seed {seed}"
+            f"no start from which {plan} is known, in {REDRAWN} draws each, for {bad} agents of seed {seed}"
         )
         weaker = ("`--set test.starts=savable` asks for a safe plan",) if starts == "feasible" else ()
         ways = (*weaker, "`--set test.starts=any` takes them all")
