@@ -150,9 +150,9 @@ class PetsPolicy(Policy):
         size = max(1, ROWS // (self._config.population * math.prod(self._shape)))
         guesses = [None] * len(x0) if guess is None else torch.split(guess, size)
         parts = zip(torch.split(x0, size), guesses, strict=False)
-        return torch.cat([self._optimised(part, steps, generator, start) for part, start in parts])
+        return torch.cat([self._searched(part, steps, generator, start) for part, start in parts])
 
-    def _optimised(self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None) -> Tensor:
+    def _searched(self, x0: Tensor, steps: int, generator: torch.Generator, guess: Tensor | None) -> Tensor:
         """Search for controls by the cross-entropy method, for all states in one batch.
 
         The arguments and the result are those of `_optimised`. Each round samples from a Gaussian, whose mean

@@ -14,8 +14,8 @@ from benchmarks.deployments import (
     SCENARIOS,
     USUAL,
     DeploymentOptions,
+    DeploymentRow,
     Deployments,
-    Row,
     guard_of,
     mean_and_half,
     policy_lines,
@@ -51,11 +51,11 @@ METRICS = {"safe agents": "saved", "safe starts": "saved_starts", "satisfied": "
 _OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
 
-def table(rows: Sequence[Row]) -> Table[Row, Row]:
+def table(rows: Sequence[DeploymentRow]) -> Table[DeploymentRow, DeploymentRow]:
     """Return the table: one row per policy and scenario, one column per metric and guard."""
     guards = _guards(rows)
     first = [next(group) for _, group in groupby(rows, lambda row: row.spec)]
-    columns: Columns[Row] = {
+    columns: Columns[DeploymentRow] = {
         "": lambda row: f"{row.spec}, {row.size}" if any(row is each for each in first) else "",
         "scenario": "{scenario}",
         **{
@@ -67,7 +67,7 @@ def table(rows: Sequence[Row]) -> Table[Row, Row]:
     return listed("disturbed", rows, columns)
 
 
-def _guards(rows: Sequence[Row]) -> list[str]:
+def _guards(rows: Sequence[DeploymentRow]) -> list[str]:
     """Return the names of all guards in `rows`, in the order of the columns."""
     found = {guard.partition("+") for row in rows for guard in row.guards}
     ordered = sorted(found, key=lambda parts: (named_guard(parts[0]).cost, parts[2]))
@@ -81,7 +81,7 @@ def _title(guard: str) -> str:
     return title + (" with margin" if margin == AUTO else f" with margin {margin}" if margin else "")
 
 
-def _shown(metric: str, guard: str) -> Callable[[Row], str]:
+def _shown(metric: str, guard: str) -> Callable[[DeploymentRow], str]:
     return lambda row: mean_and_half(row.metric(guard, metric))
 
 
@@ -92,7 +92,7 @@ def section(results: Sequence[Result]) -> list[str]:
     """
     rows = rows_of(results)
     lost = [row.spec for row in rows if row.scenario == NOMINAL and _lost_to_the_world(row)]
-    columns: Columns[Row] = {
+    columns: Columns[DeploymentRow] = {
         "": "{spec}",
         "scenario": "{scenario}",
         "share of starts": _shown("quiet", GUARDS.default),
@@ -106,7 +106,7 @@ def section(results: Sequence[Result]) -> list[str]:
     ]
 
 
-def _lost_to_the_world(row: Row) -> bool:
+def _lost_to_the_world(row: DeploymentRow) -> bool:
     """True if unsafe runs with the full guard are caused by exogenous events, which no plan accounts for.
 
     This is so if safety is clearly higher for initial states without such events.

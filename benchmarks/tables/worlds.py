@@ -13,8 +13,8 @@ import typer
 from benchmarks.deployments import (
     NOMINAL,
     DeploymentOptions,
+    DeploymentRow,
     Deployments,
-    Row,
     mean_and_half,
     policy_lines,
     publish_deployments,
@@ -38,7 +38,7 @@ their 95 % intervals (Student's t).
 """
 _OPTIONS, _OUTPUT = DeploymentOptions(), Output(Path("docs/worlds.md"))
 
-Line = tuple[Row, str]
+Line = tuple[DeploymentRow, str]
 """A row and one of its guards."""
 
 
@@ -69,7 +69,7 @@ COLUMNS: Columns[Line] = {
 }
 
 
-def table(rows: Sequence[Row]) -> Table[Line, Line]:
+def table(rows: Sequence[DeploymentRow]) -> Table[Line, Line]:
     """Return the table: one line per simulation and guard.
 
     The first line of a simulation names it, with its size (seeds x agents x steps).
@@ -89,7 +89,7 @@ def section(results: Sequence[Result]) -> list[str]:
     return [TEXT, *table(rows).markdown(), "", *told, *policy_lines(rows), *made]
 
 
-def wholly_viable(row: Row) -> Iterator[str]:
+def wholly_viable(row: DeploymentRow) -> Iterator[str]:
     """Yield lines with metrics for the seeds in which a safe plan is known from the start of every agent.
 
     No line is yielded if this holds for all seeds, or for none.

@@ -17,8 +17,8 @@ from benchmarks.deployments import (
     NOMINAL,
     SCENARIOS,
     DeploymentOptions,
+    DeploymentRow,
     Deployments,
-    Row,
     mean_and_half,
     rows_of,
 )
@@ -177,11 +177,11 @@ def test_seeds_without_lost_starts_are_told_apart() -> None:
         return {"metrics": {name: {"values": each} for name, each in values.items()}}
 
     guards = {"none": document([0.6, 0.1, 0.8], [0.5, 0, 0.5]), "full": document([0.9, 0, 0.7], [1, 0, 1])}
-    line = " ".join(part.strip() for part in wholly_viable(Row("a", "b", 3, 2, 1, guards)))
+    line = " ".join(part.strip() for part in wholly_viable(DeploymentRow("a", "b", 3, 2, 1, guards)))
     assert "in the 2 of 3 seeds" in line
     assert line.endswith("none 0.700 and 0.500; full 0.800 and 1.000")
     guards = {"none": {"metrics": {"savable": {"values": [1.0]}}}}
-    assert list(wholly_viable(Row("a", "b", 1, 2, 1, guards))) == []
+    assert list(wholly_viable(DeploymentRow("a", "b", 1, 2, 1, guards))) == []
 
 
 def test_without_policies_that_is_said(
