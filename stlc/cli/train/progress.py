@@ -18,8 +18,7 @@ from stlc.units import time_text
 from stlc.view.learning import driven_lines
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.assured import FalsificationRounds
-    from stlc.cli.framework.documents import TrainedRun
+    from stlc.cli.framework.documents import FalsificationRounds, TrainedRun
 
 LINE_EVERY = 25.0  # seconds between lines without a terminal
 BLOCKS = "▁▂▃▄▅▆▇█"
