@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import gymnasium
 import numpy as np
@@ -23,7 +23,6 @@ from stlc.controller.world import ModelWorld, world_type
 from stlc.diagnostics import usage
 from stlc.gym.pictures import MODES, Picture, Pictures, RenderMode, snapshot
 from stlc.gym.spaces import Floats, initial_state, of_actuators, of_observation
-from stlc.view.scene import DrawScene
 
 Reward: TypeAlias = Literal["robustness", "accuracy", "task", "dense"]
 """Name of a reward. `dense` rewards add up to the robustness of the episode less that of its first state."""
@@ -96,7 +95,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self.observation_space = self._bounds.space(unit=normalised)
         self._formulas = [rule.formula for rule in task.rules]
         in_world = self.steps > task.horizon if world is None else world
-        self._motion: _Motion = _InWorld(task, self.steps) if in_world else _OnModel(task)
+        self._motion = _InWorld(task, self.steps) if in_world else _OnModel(task)
         self.render_mode, dt = render_mode, task.system.dt
         self.metadata = {"render_modes": MODES, "render_fps": max(round(1.0 / dt), 1)}
         self._pictures = Pictures(render_mode, self._motion.draw, dt)
@@ -201,31 +200,8 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         }
 
 
-class _Motion(Protocol):
-    """Motion of the agent, on the model of a system or in its world. States are (1, n) float64."""
-
-    def seed(self, seed: int) -> None:
-        """Set the seed of all random numbers; it takes effect with the next episode."""
-
-    def begin(self, state: Tensor | None) -> Tensor:
-        """Begin an episode at `state`, or at a random state if None; return the initial state."""
-
-    def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:
-        """State after step number `step` under the controls `plan`, (1, m)."""
-
-    @property
-    def draw(self) -> DrawScene:
-        """Function that draws a frame of a scene: of snapshots, stacked over time."""
-
-    def snapshot(self) -> Mapping[str, NDArray[Any]]:
-        """Arrays from which a picture of the present instant is drawn, name -> array."""
-
-    def seen(self, x: Tensor, step: int) -> Tensor:
-        """State `x` as the agent measures it at `step`, with sensor noise if there is any."""
-
-
 class _OnModel:
-    """Motion of the agent on the model of the system, without disturbances."""
+    """Motion of the agent on the model of the system, without disturbances. States are (1, n) float64."""
 
     draw = staticmethod(ModelWorld.draw)
 
@@ -234,23 +210,30 @@ class _OnModel:
         self.seed = self._episodes.seed
 
     def begin(self, state: Tensor | None) -> Tensor:
+        """Begin an episode at `state`, or at a random state if None; return the initial state."""
         self._episodes.reset(state)
         self._x = self._episodes.states
         return self._x
 
     def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:  # noqa: ARG002
+        """State after step number `step` under the controls `plan`, (1, m)."""
         self._x = self._episodes.step(plan).states
         return self._x
 
     def snapshot(self) -> Mapping[str, NDArray[Any]]:
+        """Arrays from which a picture of the present instant is drawn, name -> array."""
         return snapshot(self._episodes.task, self._x)
 
     def seen(self, x: Tensor, step: int) -> Tensor:  # noqa: ARG002
+        """State `x` as the agent measures it at `step`, with sensor noise if there is any."""
         return x
 
 
 class _InWorld:
-    """Motion of the agent in the world of the system (closed-loop simulation), a new one in each episode."""
+    """Motion of the agent in the world of the system (closed-loop simulation), a new one in each episode.
+
+    It has the methods of `_OnModel`.
+    """
 
     def __init__(self, task: Task, steps: int) -> None:
         self._task, self._steps, self._type = task, steps, world_type(task.system.decl)
