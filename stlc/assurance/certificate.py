@@ -580,7 +580,6 @@ def _assumptions(found: Assessment) -> Iterator[str]:
 
 
 def _units(noun: Noun, most: int) -> Iterator[str]:
-    """Conditions on what one observation is."""
     match noun:
         case "trace":
             yield "the traces are independent of each other, and none was chosen or left out by its result"

@@ -142,14 +142,10 @@ def certify(run: Run | Path | str | None, options: CertifyOptions) -> Certificat
             found = certificate(order, progress)
             write_atomic(path, dumps(found, indent=2) + "\n")
             if not progress.done:
-                _tell(progress)
+                overall, noun = progress.assessment.overall, progress.assessment.noun
+                low, high = overall.shares.lower, overall.shares.upper
+                PULSE.tell(f"{overall.units:,} {noun}s: share from {floored(low)} to {raised(high)}")
     return replace(found, path=path, shown=shown)
-
-
-def _tell(progress: Progress) -> None:
-    found = progress.assessment.overall
-    low, high = found.shares.lower, found.shares.upper
-    PULSE.tell(f"{found.units:,} {progress.assessment.noun}s: share from {floored(low)} to {raised(high)}")
 
 
 def certificate(order: Campaign, progress: Progress) -> Certificate:

@@ -36,8 +36,6 @@ from stlc.registry import GUARDS
 from stlc.rundir import MOST_ARRAYS, RunDir
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from stlc.controller.deployment.simulator import DeploymentRecording, Watch
     from stlc.controller.problem.task import Task
     from stlc.controller.run.run import Run
@@ -70,47 +68,24 @@ def sample_of(
         UsageError: U101, there is no such requirement.
         SpecError: the rules use names that the system does not have.
     """
-    if rules is None:
-        found = _judged_by_plans(task, recording)
+    rows = len(recording.states)
+    if rules is None:  # undecided where a drive ends before a window does
+        bounds = executed_robustness(task, recording)
+        lows = ((rule, *bounds[rule.name]) for rule in task.rules)
+        judged = tuple(Judged(each.name, each.unit, satisfied(a), violated(b), a) for each, a, b in lows)
+        states = np.moveaxis(recording.states, -1, 0).swapaxes(1, 2)
+        inside = in_scope(task, dict(zip(task.system.names, states, strict=True)))
+        weights: Mapping[str, float] = {rule.name: rule.factor for rule in task.rules}
     else:
         verdict = verdict_on_runs(rules, task, recording)
-        inside = np.broadcast_to(verdict.scope, (len(recording.states),))
-        found = _Verdicts(tuple(map(Judged.by, verdict)), verdict.factors, inside)
-    counted = chosen(found.judged, require)
-    rows = len(recording.states)
+        judged, weights = tuple(map(Judged.by, verdict)), verdict.factors
+        inside = np.broadcast_to(verdict.scope, (rows,))
+    counted = chosen(judged, require)
     alone = recording.agents == 1 or independent_agents(world_type(task.system.decl))
     units = np.arange(rows) if alone else np.arange(rows) // recording.agents
     noun: Noun = "drive" if alone and recording.agents > 1 else "world"
-    return Sample(together(counted, found.weights), counted, units, noun, recording.rho).in_scope(
-        found.inside
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Verdicts:
-    """Verdicts on recorded drives.
-
-    Attributes:
-        judged: verdicts under each requirement.
-        weights: requirement -> factor of its robustness, weight / scale.
-        inside: whether the assumptions of the specification hold, (drives,).
-    """
-
-    judged: tuple[Judged, ...]
-    weights: Mapping[str, float]
-    inside: NDArray[np.bool_]
-
-
-def _judged_by_plans(task: Task, recording: DeploymentRecording) -> _Verdicts:
-    """Verdicts by the specification of the plans; undecided where a drive ends before a window does."""
-    found = executed_robustness(task, recording)
-    judged = tuple(
-        Judged(rule.name, rule.unit, satisfied(low), violated(high), low)
-        for rule, (low, high) in ((rule, found[rule.name]) for rule in task.rules)
-    )
-    columns = dict(zip(task.system.names, np.moveaxis(recording.states, -1, 0).swapaxes(1, 2), strict=True))
-    weights = {rule.name: rule.factor for rule in task.rules}
-    return _Verdicts(judged, weights, in_scope(task, columns))
+    sample = Sample(together(counted, weights), counted, units, noun, recording.rho)
+    return sample.in_scope(inside)
 
 
 # ---------------------------------------------------------------------- deploying

@@ -255,7 +255,10 @@ def _replayed(source: _Source, path: Path) -> ReplayedCounterexample | ReplayedF
         overrides={**kept.overrides, **source.options.overrides},
     )
     simulator = replace(source, options=again).load()
-    point = _point(stored.point, simulator.space.dim, path)
+    point = np.array(stored.point, dtype=np.float64)
+    if point.shape != (simulator.space.dim,) or not bool(((point >= 0.0) & (point <= 1.0)).all()):
+        message = f"the counterexample `{path}` does not belong to this system"
+        raise usage(message, "the system may have changed")
     if isinstance(stored, StoredFinding):
         return _failed_again(_plant_of(simulator, path), point, stored)
     require_known([stored.requirement], simulator.requirements)
@@ -323,16 +326,6 @@ def _stored(path: Path) -> StoredCounterexample | StoredFinding:
         message = f"`{path}` is not a counterexample"
         raise UsageError(Diagnostic("U101", message, help=help_, note=(why,))) from None
     return stored
-
-
-def _point(values: Sequence[float], dim: int, path: Path) -> np.ndarray:
-    """The point of a stored counterexample, (dim,). Raises UsageError (U101) if it is not of this system."""
-    point = np.array(values, dtype=np.float64)
-    if point.shape != (dim,) or not bool(((point >= 0.0) & (point <= 1.0)).all()):
-        raise usage(
-            f"the counterexample `{path}` does not belong to this system", "the system may have changed"
-        )
-    return point
 
 
 def _different(stored: Trace, again: Trace) -> list[str]:

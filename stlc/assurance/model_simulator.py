@@ -262,7 +262,6 @@ def in_scope(task: Task, columns: Columns) -> NDArray[np.bool_]:
 
 @cache
 def _kernel(task: Task) -> NativeJudge | None:
-    """Native kernel of a task's dynamics alone."""
     return NativeJudge.of(task.system, ())
 
 

@@ -179,7 +179,9 @@ def simulation(
     if isinstance(subject, str | Path):
         spec = Path(subject)
         if planner is not None and (spec.suffix == ".stl" or spec.is_file()):
-            subject = _planner_run(str(subject), planner, options)
+            task = load_task(str(subject), options.system, options.overrides, whole=True)
+            launch = Launch(root=options.runs, overrides=options.overrides, command=sys.argv[1:])
+            subject = open_planner(task, planner, seed=0, launch=launch).path
         else:
             beside = planner
         run = Run.open(subject, root=options.runs, overrides=options.overrides)
@@ -218,13 +220,6 @@ def _planner(options: SimulateOptions) -> PlannerChoice | None:
         if value is not None:
             raise usage(f"`{name}` is for a planner", "stlc simulate SPEC --method search")
     return None
-
-
-def _planner_run(spec: str, choice: PlannerChoice, options: SimulateOptions) -> Path:
-    """Create the folder of a run whose policy is a planner, and return its path."""
-    task = load_task(spec, options.system, options.overrides, whole=True)
-    launch = Launch(root=options.runs, overrides=options.overrides, command=sys.argv[1:])
-    return open_planner(task, choice, seed=0, launch=launch).path
 
 
 def _longer(run: Run, steps: int) -> Diagnostic | None:

@@ -82,7 +82,6 @@ def _distances(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray
 
 
 def _matern(distances: NDArray[np.float64], length: float) -> NDArray[np.float64]:
-    """Correlations at distances."""
     scaled = math.sqrt(5.0) / length * distances
     found: NDArray[np.float64] = (1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled)
     return found

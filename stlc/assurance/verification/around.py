@@ -101,7 +101,7 @@ def narrowed(
     boxes: Sequence[Box],
     states: Floats,
     *,
-    spare: Callable[[Box], None] | None = None,
+    others: Callable[[Box], None] | None = None,
 ) -> list[Box]:
     """Halve boxes around states until they are proved; return the proved ones.
 
@@ -110,8 +110,8 @@ def narrowed(
         mode: mode of the boxes.
         boxes: the boxes.
         states: coordinates of a state in each box, (boxes, coordinates).
-        spare: receives the other halves, and boxes that stay open, so that all of them together are the given
-            boxes. If it is given, proved boxes lie within the conditions of `where`.
+        others: receives the other halves, and boxes that stay open, so that all of them together are the
+            given boxes. If it is given, proved boxes lie within the conditions of `where`.
     """
     coordinates = len(mode.coordinates)
     axes = max(1, coordinates // 4)
@@ -124,27 +124,27 @@ def narrowed(
         for i, box in enumerate(active):
             effects = verdicts.effects[i]
             if verdicts.low[i] >= -PROVED:
-                known = box if box.inside or spare is None else plans.within(mode, box)
+                known = box if box.inside or others is None else plans.within(mode, box)
                 if isinstance(known, Box):
                     proved.append(known)
                     continue
                 effects = known
-            active[i] = _halved(box, states[i], effects, axes, spare)
+            active[i] = _halved(box, states[i], effects, axes, others)
             left.append(i)
         if not left:
             return proved
         active, states, index = [active[i] for i in left], states[left], index[left]
-    if spare is not None:
+    if others is not None:
         for box in active:
-            spare(box)
+            others(box)
     return proved
 
 
-def _halved(box: Box, state: Floats, effects: Floats, axes: int, spare: Callable[[Box], None] | None) -> Box:
+def _halved(box: Box, state: Floats, effects: Floats, axes: int, others: Callable[[Box], None] | None) -> Box:
     """The part of a box around a state, half as wide in the `axes` coordinates with the greatest effects."""
     for axis in np.argsort(-effects)[:axes]:
         low, high = box.split(int(axis))
         box, other = (high, low) if state[axis] >= box.centre[axis] else (low, high)
-        if spare is not None:
-            spare(other)
+        if others is not None:
+            others(other)
     return box

@@ -277,7 +277,6 @@ def _options(num: ir.Num, name: str) -> list[tuple[float, ir.Num]] | None:
 
 
 def _label(name: str, num: ir.Num, values: Sequence[ir.Num]) -> str:
-    """Words for discrete values of one assignment."""
     if num == ir.Signal("?0") and values[0] in (ir.Const(0.0), ir.Const(1.0)):
         return f", {name}" if values[0] == ir.Const(1.0) else f", not {name}"
     shown = [f"{value.value:g}" if isinstance(value, ir.Const) else "a number" for value in values]

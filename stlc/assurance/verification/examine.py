@@ -143,7 +143,7 @@ class Examiner:
         chosen = np.flatnonzero(good).tolist()
         if chosen:
             boxes = [replace(batch.boxes[i], refuted=False) for i in chosen]
-            found.proved += narrowed(self._plans, mode, boxes, at[chosen], spare=found.left.append)
+            found.proved += narrowed(self._plans, mode, boxes, at[chosen], others=found.left.append)
 
     def _examine(self, found: BatchResult, mode: Mode, batch: BoxBatch, rng: np.random.Generator) -> None:
         boxes = self._admitted(found, mode, batch)

@@ -348,7 +348,6 @@ def _computed(program: ArrayProgram, env: Mapping[str, Forms]) -> _Env:
 
 
 def _full(form: Forms, batch: int) -> Forms:
-    """The form with one element per plan."""
     if form.shape == (batch,):
         return form
     count = len(form.generators)

@@ -209,7 +209,6 @@ class Verifier:
         return Verification(tuple(found), self._clock() - begun)
 
     def _chosen(self, fronts: list[_Front], most: float) -> list[BoxBatch]:
-        """Batches of the next round."""
         found: list[BoxBatch] = []
         while len(found) < ROUND:
             ready = [i for i, front in enumerate(fronts) if len(front) and front.planned < most]
