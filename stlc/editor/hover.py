@@ -112,7 +112,6 @@ def _code(item: ast.Item) -> str:
 
 
 def _comment(doc: str) -> str:
-    """Return the text of a `##` comment with Markdown characters escaped."""
     return "\n".join(map(markdown, doc.split("\n")))
 
 

@@ -186,7 +186,6 @@ def _completion(server: Server, params: lsp.CompletionParams) -> lsp.CompletionL
 
 
 def _item(offer: Offer, place: lsp.Range) -> lsp.CompletionItem:
-    """Convert the proposal `offer` to an LSP completion item that replaces the partial word at `place`."""
     return lsp.CompletionItem(
         label=offer.text,
         kind=lsp.CompletionItemKind[offer.kind],
@@ -272,7 +271,6 @@ def _formatting(server: Server, params: lsp.DocumentFormattingParams) -> list[ls
 
 
 def _actions(server: Server, params: lsp.CodeActionParams) -> list[lsp.CodeAction]:
-    """Return the automatic repairs of the findings in a range of the text, as LSP code actions."""
     document = server.document(params)
     first, last = (server.offset(document, place) for place in (params.range.start, params.range.end))
     actions = []

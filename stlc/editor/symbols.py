@@ -29,7 +29,6 @@ Kind: TypeAlias = Literal[
 
 
 def _kind(item: ast.Item) -> Kind:
-    """Return the kind of a declaration, which is its keyword."""
     return cast("Kind", type(item).__name__.lower())
 
 
@@ -172,7 +171,6 @@ def _arguments(item: ast.Item) -> dict[str, Symbol]:
 
 
 def _bound(node: ast.Node) -> dict[str, Symbol]:
-    """Return the variables that a quantifier or a freeze operator binds, by name."""
     match node:
         case ast.Quantifier(span, _, var):
             return {var: _symbol(_words(span)[1], "variable", span)}

@@ -131,7 +131,6 @@ def _unused(message: str, span: Span, where: str = "") -> Diagnostic:
 
 
 def _uses(root: ast.Node) -> Iterator[str]:
-    """Yield every name that is read in the subtree of a node."""
     return (node.name for node in descendants(root) if isinstance(node, ast.Name | ast.TypeRef))
 
 

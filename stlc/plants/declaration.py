@@ -348,8 +348,6 @@ def parse_plant(source: Source, path: Path) -> PlantDecl:
 
 
 class _Reading:
-    """The reading of one plant file."""
-
     def __init__(self, reader: Reader, root: MappingNode) -> None:
         self.reader, self.root = reader, root
         self.cx = Context.of(reader, Names())
@@ -407,7 +405,6 @@ class _Reading:
         self.reader.report(code, message, first_line(span), *advice)
 
     def _chosen(self) -> tuple[str, dict[str, Any]]:
-        """Return the kind of plant, and the options of that kind."""
         given = {name: node for name in KINDS if (node := getattr(self.keys, name, None)) is not None}
         if len(given) != 1:
             wanted = ", ".join(f"`{name}`" for name in KINDS)
@@ -556,7 +553,6 @@ class _Reading:
     def _connected(
         self, controller: ControllerLayout, inputs: tuple[PlantInput, ...], names: list[str]
     ) -> None:
-        """Report names in `reads` and `writes` that do not exist."""
         free = [name for name in names if name not in controller.writes]
         own = [each.name for each in inputs]
         for section, used, known in (("reads", controller.reads, free), ("writes", controller.writes, own)):

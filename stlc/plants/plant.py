@@ -328,8 +328,6 @@ class Plant:
 
 
 class _Simulation:
-    """One simulation in one process."""
-
     def __init__(
         self, plant: Plant, process: PlantProcess, point: Floats, seed: int, deadline: float
     ) -> None:

@@ -96,7 +96,6 @@ class PlantProcess:
             raise
 
     def _open(self) -> None:
-        """Open the plant. Raises the errors of the class."""
         decl = self._decl
         limit = max(float(decl.limits.time), OPENING)
         try:
@@ -163,7 +162,6 @@ class PlantProcess:
         raise self._faulty("crash", self._end_in_words())
 
     def _faulty(self, reason: Reason, message: str) -> FaultyError:
-        """End the process, and return the error."""
         self.end()
         return FaultyError(Fault(reason, message, None, self._said()))
 
@@ -214,7 +212,6 @@ class PlantProcess:
         return self._tail.decode(errors="replace").strip()
 
     def _end_in_words(self) -> str:
-        """Describe in one line how the process ended."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_LEAVING)
         code = self._process.returncode

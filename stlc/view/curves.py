@@ -79,7 +79,6 @@ def _draw_share(axes: Axes, seconds: NDArray[np.float64], shares: NDArray[np.flo
 
 
 def _legend(axes: Axes, rows: int) -> None:
-    """Draw the legend, of `rows` rows, below the axes."""
     axes.legend(
         loc="upper left",
         bbox_to_anchor=(-0.02, -0.17),

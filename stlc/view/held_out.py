@@ -401,7 +401,6 @@ def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signa
 
 
 def _draw_region(axes: Axes, weakness: Weakness, x0: NDArray[np.float64]) -> None:
-    """Draw the outline of the failure region over the two states on the axes."""
     from matplotlib.patches import Rectangle
 
     if len(x0) == 0 or not any(c.column in weakness.axes and c.op != "=" for c in weakness.conditions):

@@ -301,7 +301,6 @@ def learning_of(
 
 
 def _without_plan(commands: Commands, *, proved: bool) -> Learning:
-    """The verdict on a training run if no satisfying plan is known from any start."""
     level: Level = "infeasible" if proved else "no plan known"
     sentence = "neither the policy nor search found a satisfying plan for any start"
     more = "more training hardly helps where there is no plan"

@@ -290,7 +290,6 @@ def _scene_panel(found: RecordedScene, title: str) -> RunPanel:
 
 
 def _trace_panels(run: RunDir) -> list[RunPanel]:
-    """Panel of the recorded trace: its paths over regions, or its signals."""
     animation = _signal_animation(run, "")
     if animation is None:
         return []
@@ -330,7 +329,6 @@ def _scenario(run: RunDir) -> str | None:
 
 
 def _signal_animation(run: RunDir, title: str) -> Animation | None:
-    """Animation of the trace: its paths over regions or, without regions, its signals."""
     trace = archived(run, TRACE, load_trace)
     if trace is None:
         return None

@@ -278,7 +278,6 @@ def _rows(trace: Trace, margins: Margins) -> list[tuple[str, str]]:
 
 
 def _legend(figure: Figure, trace: Trace, marks: Marks, judged: bool) -> None:
-    """Draw the legend of thresholds, deciding values, robustness margins and decisions."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -346,7 +345,6 @@ def _broken(values: Floats) -> Floats:
 
 
 def _draw_discrete(axes: Axes, trace: Trace, values: Floats, column: Column) -> None:
-    """Draw a discrete signal as coloured intervals with their labels inside."""
     labels = {value: label for label, value in column.labels} or {0.0: "", 1.0: "yes"}
     levels = sorted({*labels, *np.unique(values[np.isfinite(values)]).tolist()})
     tints = (FAINT, SKY, MUTED, BLUE, GREEN)

@@ -62,8 +62,6 @@ def open_fmu(layout: Layout) -> Fmu:
 
 
 class _Variables:
-    """The variables of an FMU that the plant file names, by section."""
-
     def __init__(self, description: Any, layout: Layout) -> None:
         self.major = 2 if description.fmiVersion.startswith("2.") else 3
         self._known = {each.name: each for each in description.modelVariables}

@@ -110,7 +110,6 @@ class Path:
 
 
 def _structures(value: object) -> bool:
-    """True if a field contains an array of structures."""
     return isinstance(value, (list, tuple)) and bool(value) and isinstance(value[0], dict)
 
 
