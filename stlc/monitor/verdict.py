@@ -98,6 +98,7 @@ class Monitor:
             self._system, self._interface = system_of(found, self.spec, self._overrides)
         self.resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
+        self._reads: dict[tuple[str, ...], frozenset[str]] = {}
         self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}
         known = self._given.or_else(self._system)
         if not self._lacks(known):  # else the first trace may give the time step
@@ -110,9 +111,13 @@ class Monitor:
 
     def reads(self, require: Sequence[str] = ()) -> frozenset[str]:
         """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
-        rules = chosen(self.resolved.requirements, require)
-        formulas = [each.formula for each in (*rules, *self.resolved.assumptions)]
-        return frozenset().union(*(columns_in(num) for formula in formulas for num in numbers(formula)))
+        key = tuple(require)
+        if key not in self._reads:
+            rules = chosen(self.resolved.requirements, require)
+            formulas = [each.formula for each in (*rules, *self.resolved.assumptions)]
+            read = (columns_in(num) for formula in formulas for num in numbers(formula))
+            self._reads[key] = frozenset[str]().union(*read)
+        return self._reads[key]
 
     @property
     def compiled(self) -> Compiled:
@@ -292,7 +297,7 @@ class Monitor:
         step = recorded.or_else(Times(self._given.dt)).or_else(Times(self._system.dt))
         whole = Times(None, self._given.horizon).or_else(self._system).or_else(recorded)
         known = Times(step.dt, whole.horizon, step.trace)
-        if not self._lacks(known):
+        if known.grid() in self._compiled or not self._lacks(known):
             return self._compile(known)
         named = named_times(self.spec, self._overrides)
         if named is not None:
