@@ -269,7 +269,7 @@ def within(reach: Reach, run: IndexRange, domain: TraceDomain) -> IndexRange:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ScheduleStep:
     """Computation of one formula at a range of instants.
 
     Attributes:
@@ -301,7 +301,7 @@ class Schedule:
     """
 
     domain: TraceDomain
-    steps: tuple[Step, ...]
+    steps: tuple[ScheduleStep, ...]
     roots: tuple[int, ...]
 
 
@@ -312,7 +312,7 @@ class StepScope:
     `known` maps a formula and a range of instants to the number of the step that computes its values there.
     """
 
-    steps: list[Step] = field(default_factory=list)
+    steps: list[ScheduleStep] = field(default_factory=list)
     known: dict[tuple[ir.Formula, IndexRange], int] = field(default_factory=dict)
 
 
@@ -340,7 +340,7 @@ class Scheduler:
     def scheduled(self, node: ir.Formula, run: IndexRange) -> int:
         """Add steps for the operands of `node`, then a step for `node`; return the number of the latter."""
         args = tuple(self.place(part, its) for part, its in operands(node, run, self.domain))
-        return self.add(Step(node, run, args, number=self.number(run)))
+        return self.add(ScheduleStep(node, run, args, number=self.number(run)))
 
     def number(self, run: IndexRange) -> int:  # noqa: ARG002 - back ends allocate memory for it
         """Return the next free step number.
@@ -350,7 +350,7 @@ class Scheduler:
         self._count += 1
         return self._count - 1
 
-    def add(self, step: Step) -> int:
+    def add(self, step: ScheduleStep) -> int:
         """Append a step; return its number."""
         self.scope.steps.append(step)
         return step.number

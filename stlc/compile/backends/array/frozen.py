@@ -50,7 +50,9 @@ class Freezer:
 
     def values(self, node: ir.Freeze, run: IndexRange) -> Array:
         """Robustness of a `freeze` formula at the instants `run`, `(count, batch)`."""
-        bound = within(_combined_reach(node, self.domain), run, self.domain)
+        reaches = [reads(num, self.domain) for _, num in node.bindings]
+        reach = Reach(max(r.past for r in reaches), max(r.future for r in reaches))
+        bound = within(reach, run, self.domain)
         if bound.count <= 0:
             parts = list(self._unbound(node, run))
         else:
@@ -163,11 +165,6 @@ class Freezer:
     @property
     def _batch(self) -> int:
         return int(self._like.shape[1])
-
-
-def _combined_reach(node: ir.Freeze, domain: TraceDomain) -> Reach:
-    reaches = [reads(num, domain) for _, num in node.bindings]
-    return Reach(max(r.past for r in reaches), max(r.future for r in reaches))
 
 
 def _neighbourhood(body: ir.Formula) -> tuple[float, float]:

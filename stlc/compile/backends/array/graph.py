@@ -235,17 +235,15 @@ class RobustnessGraph:
 
         `env` maps the name of a signal to an array `(time, batch)`.
         """
-        rows = self._rows(env, ops, semantics_of(self.semantics, smoothing))
+        semantics = semantics_of(self.semantics, smoothing)
+        laws = semantics.associative, semantics.idempotent
+        if laws not in self._formulas:
+            self._formulas[laws] = [rule.under(semantics) for rule in self.rules]
+        rows = evaluate(self._formulas[laws], env, ops=ops, semantics=semantics, end=self.end)
         if not rows:
             like = next(iter(env.values()))
             return ops.full((*like.shape[1:], 0), math.inf, like)
         return ops.cat(rows).T
-
-    def _rows(self, env: Mapping[str, Array], ops: Ops, semantics: Semantics) -> list[Array]:
-        laws = semantics.associative, semantics.idempotent
-        if laws not in self._formulas:
-            self._formulas[laws] = [rule.under(semantics) for rule in self.rules]
-        return evaluate(self._formulas[laws], env, ops=ops, semantics=semantics, end=self.end)
 
     def _columns(self, x: Array) -> tuple[dict[str, Array], Ops]:
         if x.shape[-1] != len(self.signature):

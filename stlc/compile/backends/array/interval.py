@@ -140,11 +140,6 @@ class Intervals:
         found = self._ends = self._ends.rounded()
         return found
 
-    def _shifted(self) -> Ends:
-        """Both ends, which may have a rounding error."""
-        found = self._ends = self._ends.shifted()
-        return found
-
     def _bound(self) -> float:
         """Number above the magnitudes of all ends, with their error."""
         ends = self._ends
@@ -187,7 +182,8 @@ class Intervals:
         transposition. The ends keep their rounding error. Moving an end outward is a non-decreasing function
         of its computed value (`_moved_apart`), so the selection may come first.
         """
-        low, high, error, *_ = self._shifted()
+        self._ends = self._ends.shifted()
+        low, high, error, *_ = self._ends
         first = function(low)
         return Intervals(first, first if low is high else function(high), error)
 

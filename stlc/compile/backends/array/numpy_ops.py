@@ -177,12 +177,9 @@ def _by_kernel(operands: Sequence[Array], pick: Pick, window: Sliding) -> Array 
     if kernel is None:
         return None
     out = np.empty((window.count, first.shape[1]), first.dtype)
-    kernel.run([_strided(each) for each in (*operands, out)])
+    arrays = (*operands, out)
+    kernel.run([Strided(x.ctypes.data, *(stride // x.itemsize for stride in x.strides)) for x in arrays])
     return out
-
-
-def _strided(x: Array) -> Strided:
-    return Strided(x.ctypes.data, *(stride // x.itemsize for stride in x.strides))
 
 
 for _function in FUNCTIONS.values():

@@ -22,7 +22,7 @@ from stlc.compile.backends.schedule import (
     PICKS,
     IndexRange,
     Schedule,
-    Step,
+    ScheduleStep,
     TraceDomain,
     neutral,
     reads,
@@ -113,7 +113,9 @@ def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDom
     return ArrayPlan(found, batches, predicates, sum(max(min(stop), 0) for stop in stops))
 
 
-def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
+def _batches(
+    steps: Sequence[ScheduleStep], domain: TraceDomain
+) -> tuple[tuple[Batch, ...], dict[int, StepSource]]:
     """Group the predicates that are evaluated at the same instants into programs.
 
     Returns the programs, and a mapping from the step number of a predicate to the source of its values. A
@@ -127,7 +129,8 @@ def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, .
             if inside.count > 0 and isinstance(step.node.num, ir.Signal) and step.node.sign > 0:
                 predicates[index] = StepSource(None, step.node.num.name, inside)
             elif inside.count > 0:
-                wanted.setdefault(_signed(step.node), []).append((inside, index))
+                margin = step.node.num if step.node.sign > 0 else ir.Op("neg", (step.node.num,))
+                wanted.setdefault(margin, []).append((inside, index))
     grouped: dict[IndexRange, dict[ir.Num, list[tuple[IndexRange, int]]]] = {}
     for num, ranges in wanted.items():
         for merged, indices in _merged(ranges):
@@ -139,10 +142,6 @@ def _batches(steps: Sequence[Step], domain: TraceDomain) -> tuple[tuple[Batch, .
         for i, indices in enumerate(nums.values()):
             predicates.update({index: StepSource(number, str(i), inside) for inside, index in indices})
     return tuple(batches), predicates
-
-
-def _signed(atom: ir.Predicate) -> ir.Num:
-    return atom.num if atom.sign > 0 else ir.Op("neg", (atom.num,))
 
 
 def _merged(ranges: list[tuple[IndexRange, int]]) -> list[tuple[IndexRange, list[tuple[IndexRange, int]]]]:
@@ -223,7 +222,7 @@ class Machine:
 
         return kernel
 
-    def bind(self, step: Step) -> Kernel:
+    def bind(self, step: ScheduleStep) -> Kernel:
         """Return the function that computes the values of `step` from the values of its operands.
 
         A step is one sub-formula at a range of instants. The formula must not be a predicate or a `freeze`.
@@ -371,7 +370,7 @@ def _too_far(plan: ArrayPlan) -> Diagnostic:
     )
 
 
-def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
+def _runner(plan: ArrayPlan, step: ScheduleStep, machine: Machine) -> Runner:
     if isinstance(step.node, ir.Freeze):
         return _frozen(step.node, step.run, machine)
     if isinstance(step.node, ir.Predicate):
@@ -383,7 +382,7 @@ def _runner(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
     return lambda values, _, __, like: kernel([values[part] for part in parts], like)
 
 
-def _predicate(plan: ArrayPlan, step: Step, machine: Machine) -> Runner:
+def _predicate(plan: ArrayPlan, step: ScheduleStep, machine: Machine) -> Runner:
     """Return the function that computes the values of `step`, whose formula is a predicate.
 
     The function reads the margin of the predicate from an output of a program, or directly from a signal.

@@ -233,17 +233,17 @@ class GradientTape:
             return a if a == b else self.emit(kernel, *sorted((a, b)))
         low, high, inner = -math.inf, math.inf, a
         if self.code[a].kernel == "clamp":
-            low, high = _bounds(self.code[a])
+            below, above = self.code[a].params
+            low = below if isinstance(below, float) else low
+            high = above if isinstance(above, float) else high
             inner = int(self.code[a].args[0])
-        return self._clamp(inner, pick(low, b), pick(high, b))
-
-    def _clamp(self, x: int, low: float, high: float) -> Operand:
+        low, high = pick(low, b), pick(high, b)
         if low == high:
             return low
         if (low, high) == (-math.inf, math.inf):
-            return x
+            return inner
         bounds = (None if low == -math.inf else low, None if high == math.inf else high)
-        return self.emit("clamp", x, params=bounds)
+        return self.emit("clamp", inner, params=bounds)
 
     def norm(self, *parts: Operand) -> Operand:
         """Euclidean norm of a vector given by its components."""
@@ -287,11 +287,3 @@ def _constant_last(a: Operand, b: Operand) -> tuple[Operand, Operand]:
     if isinstance(a, float):
         return (a, b) if isinstance(b, float) else (b, a)
     return (b, a) if isinstance(b, int) and b < a else (a, b)
-
-
-def _bounds(clamp: Instr) -> tuple[float, float]:
-    low, high = clamp.params
-    return (
-        low if isinstance(low, float) else -math.inf,
-        high if isinstance(high, float) else math.inf,
-    )

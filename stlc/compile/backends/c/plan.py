@@ -24,7 +24,7 @@ from stlc.compile.backends.schedule import (
     LoopIndex,
     Schedule,
     Scheduler,
-    Step,
+    ScheduleStep,
     StepScope,
     TraceDomain,
     earliest,
@@ -90,7 +90,7 @@ class Loop:
     """
 
     index: str
-    steps: tuple[Step, ...]
+    steps: tuple[ScheduleStep, ...]
     own: tuple[int, ...]
     root: int
 
@@ -300,7 +300,7 @@ class _Planner(Scheduler):
             for i, item in enumerate(items)
             if i not in taken
         )
-        return args[0] if len(args) == 1 else self.add(Step(node, run, args, number=self.number(run)))
+        return args[0] if len(args) == 1 else self.add(ScheduleStep(node, run, args, number=self.number(run)))
 
     def _families(self, formulas: Sequence[ir.Formula]) -> list[Family]:
         found = families(formulas, self._loops + 1)
@@ -314,7 +314,7 @@ class _Planner(Scheduler):
             root = self._needed(family.shape, run)
         self._loops += 1
         loop = Loop(f"p{self._loops}", tuple(inner.steps), tuple(inner.own), root)
-        return self.add(Step(Tabled(table, pick, loop), run, (), number))
+        return self.add(ScheduleStep(Tabled(table, pick, loop), run, (), number))
 
     def _freeze(self, node: ir.Freeze, run: IndexRange) -> int:
         for _, num in node.bindings:
@@ -326,7 +326,7 @@ class _Planner(Scheduler):
             bound = tuple(self.number(_FIRST) for _ in node.bindings)
             root = self._needed(node.body, IndexRange(now, now))
         loop = Loop(now.text, tuple(inner.steps), tuple(inner.own), root)
-        return self.add(Step(Frozen(node, bound, loop), run, (), number))
+        return self.add(ScheduleStep(Frozen(node, bound, loop), run, (), number))
 
     def _check(self, num: ir.Num, run: IndexRange) -> None:
         """Check that an expression is defined at the instants `run`, and schedule the function calls in it.
@@ -347,7 +347,7 @@ class _Planner(Scheduler):
         whole, called = IndexRange(0, self.domain.samples - 1), Called(replace(num, args=key[1], output=0))
         with self._inside(self.scopes[:1]):
             first, *_ = [self.number(whole) for _ in called.components]
-            self.calls[key] = self.add(Step(called, whole, (), number=first))
+            self.calls[key] = self.add(ScheduleStep(called, whole, (), number=first))
 
 
 def call_of(num: ir.Num) -> CallKey | None:
@@ -359,13 +359,10 @@ def call_of(num: ir.Num) -> CallKey | None:
     if not isinstance(num, ir.Extern) or not isinstance(num.function, ir.Body):
         return None
     leaves = [arg for arg in num.args if isinstance(arg, (ir.Signal, ir.ShiftedSignal))]
-    if len(leaves) < len(num.args) or len({_offset(leaf) for leaf in leaves}) > 1:
+    shifts = {(arg.steps, arg.clamped) if isinstance(arg, ir.ShiftedSignal) else (0, False) for arg in leaves}
+    if len(leaves) < len(num.args) or len(shifts) > 1:
         return None
     return num.name, tuple(ir.Signal(leaf.name) for leaf in leaves)
-
-
-def _offset(leaf: ir.Signal | ir.ShiftedSignal) -> tuple[int, bool]:
-    return (leaf.steps, leaf.clamped) if isinstance(leaf, ir.ShiftedSignal) else (0, False)
 
 
 def _frozen_names(formula: ir.Formula) -> frozenset[str]:
@@ -394,7 +391,7 @@ def _split(formula: ir.Formula) -> ir.Formula:
     """
     if not isinstance(formula, ir.Predicate) or formula.guard or not isinstance(formula.num, ir.Op):
         return formula
-    if not _large(formula.num):
+    if next(islice(subexpressions(formula.num), LARGE, None), None) is None:
         return formula
     num = _distributed(formula.num)
     name, args = num.name, num.args
@@ -436,7 +433,3 @@ def _operands(op: str, items: Sequence[ir.Formula]) -> list[ir.Formula]:
     for item in map(_split, items):
         found += _operands(op, item.items) if isinstance(item, ir.BoolOp) and item.op == op else [item]
     return found
-
-
-def _large(num: ir.Num) -> bool:
-    return next(islice(subexpressions(num), LARGE, None), None) is not None

@@ -22,7 +22,7 @@ from stlc.compile.backends.c.numbers import LISTED, NumberWriter, literal
 from stlc.compile.backends.c.plan import Buffer, Called, Frozen, Loop, Plan, Tabled, call_of
 from stlc.compile.backends.c.slopes import COUNTED, SlopeWriter
 from stlc.compile.backends.numbers import Leaf
-from stlc.compile.backends.schedule import PICKS, IndexRange, Step, earliest, latest, neutral
+from stlc.compile.backends.schedule import PICKS, IndexRange, ScheduleStep, earliest, latest, neutral
 from stlc.compile.ir import nodes as ir
 from stlc.compile.namespace import Pick
 
@@ -51,22 +51,22 @@ class StepPrinter:
     index: Mapping[str, int]
     held: HeldBuffers = field(default_factory=dict)
 
-    def forward(self, steps: Sequence[Step]) -> list[str]:
+    def forward(self, steps: Sequence[ScheduleStep]) -> list[str]:
         """Return C statements that compute the values of all steps."""
         return [line for step in steps for line in self._form(step).forward()]
 
-    def backward(self, steps: Sequence[Step]) -> list[str]:
+    def backward(self, steps: Sequence[ScheduleStep]) -> list[str]:
         """Return C statements that propagate the gradient back through all steps."""
         return [line for step in reversed(steps) for line in self._form(step).backward()]
 
-    def _form(self, step: Step) -> StepForm:
+    def _form(self, step: ScheduleStep) -> StepForm:
         return FORMS[type(step.node)](self, step)
 
 
 class StepForm(ABC):
     """Printer of the C code of one step: `forward` for its values, `backward` for the gradients."""
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         self.printer, self.plan, self.step = printer, printer.plan, step
         self.node: Any = step.node
         self.run = step.run
@@ -207,7 +207,7 @@ class _Margin(StepForm):
 class _Call(StepForm):
     """C code of a function call with signals as arguments: all its results, at all samples."""
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         super().__init__(printer, step)
         self.parts: list[ir.Extern] = self.node.components
         self.outs = self.plan.buffers[step.number : step.number + len(self.parts)]
@@ -278,7 +278,7 @@ class _AtStart(StepForm):
 class _Shifted(StepForm):
     """C code of an operator whose value is that of its operand some samples later or earlier."""
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         super().__init__(printer, step)
         self.there = f"k + ({self.node.steps})"
 
@@ -313,7 +313,7 @@ class _Windowed(StepForm):
     lanes = ""
     """" LANE" if the adjoint of a window branches by lane."""
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         super().__init__(printer, step)
         self.back = self.node.back
         self.pick = _MACRO[PICKS[self.node.op]]
@@ -390,7 +390,7 @@ class _Windowed(StepForm):
 class _WindowExtremum(_Windowed):
     """C code of the minimum or maximum of one operand over a window."""
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         super().__init__(printer, step)
         self.next = f"k {'-' if self.back else '+'} {self.window.lo}"
         """Sample that the window gains in a step of the recursion."""
@@ -429,7 +429,7 @@ class _Until(_Windowed):
 
     lanes = " LANE"
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         super().__init__(printer, step)
         self.dual = _DUAL[self.pick]
         self.recursive = self.recursive and not self.window.lo
@@ -507,7 +507,7 @@ class _Until(_Windowed):
 class _Repeated(StepForm):
     """C code of a step that is a loop over other steps."""
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         super().__init__(printer, step)
         self.loop: Loop = self.node.loop
         self.root = self.plan.buffers[self.loop.root]
@@ -521,7 +521,7 @@ class _Repeated(StepForm):
 class _FreezeLoop(_Repeated):
     """C code of a `freeze`: each iteration binds the values at one instant, then computes the body."""
 
-    def __init__(self, printer: StepPrinter, step: Step) -> None:
+    def __init__(self, printer: StepPrinter, step: ScheduleStep) -> None:
         super().__init__(printer, step)
         index = self.loop.index
         self.bound = [
@@ -642,7 +642,7 @@ def _listed(kind: str, row: str, entries: Mapping[str, Iterable[str]]) -> list[s
     return [f"static const {kind} {kind[0]}{row}[{len(rows)}][{len(entries)}] = {{", *rows, "};"]
 
 
-FORMS: Mapping[type, Callable[[StepPrinter, Step], StepForm]] = {
+FORMS: Mapping[type, Callable[[StepPrinter, ScheduleStep], StepForm]] = {
     ir.Truth: _Constant,
     ir.Predicate: _Margin,
     ir.BoolOp: _Extremum,
