@@ -370,7 +370,7 @@ def _proposing(task: Task, network: PlanProposer) -> str:
     parts |= {
         "MIRRORED": int(mirror is not None),
         "SIDE": 0 if mirror is None else mirror.side,
-        "BEGUN": "0" if network.clock is None else f"(int)(x[STLC_STATES - {-network.clock}] + 0.5)",
+        "ELAPSED": "0" if network.clock is None else f"(int)(x[STLC_STATES - {-network.clock}] + 0.5)",
         "IMAGE_STATE": "" if mirror is None else _block(_assigned("image", images, states)),
         "IMAGE_ACTION": "" if mirror is None else _block(_assigned("image", reflected, inputs)),
     }

@@ -13,8 +13,8 @@ from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
 
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, require_numbers, written
-from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value, joined
+from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph, Value, joined
+from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, build_graph, require_numbers
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.kinds.exact import Exact
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------- rollout
 
 
-def rolled(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
+def rollout(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, Value]) -> Columns:
     """Return the states under plans. Conditions in the dynamics are evaluated exactly, without smoothing.
 
     Args:
@@ -100,8 +100,8 @@ class _Rollout:
             self._enter(state, ONNX.cat([self.start[state], self._full(source)]))
         for state, source in stage.sums.items():
             parts = ONNX.cat([self.start[state], self._full(source)])
-            axis = parts.sheet.constant(0, "int64")
-            (total,) = parts.sheet.emit("CumSum", (parts, axis), [parts.shape], parts.kind)
+            axis = parts.graph.constant(0, "int64")
+            (total,) = parts.graph.emit("CumSum", (parts, axis), [parts.shape], parts.kind)
             self._enter(state, total)
         if stage.blocks:
             self._loop(stage)
@@ -126,9 +126,9 @@ class _Rollout:
         kept = list(dict.fromkeys((*sources, *stage.lets)))
 
         def turn(
-            sheet: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
+            graph: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
         ) -> tuple[Sequence[Value], Sequence[Value]]:
-            env = {name: self.now[name].on(sheet) for name in steady}
+            env = {name: self.now[name].on(graph) for name in steady}
             env |= dict(zip(timed, rows, strict=False))
             env |= dict(zip(moving, now, strict=True))
             for block in blocks:
@@ -138,9 +138,9 @@ class _Rollout:
 
         carried = [self.start[name] for name in moving]
         rows = [self.now[name] for name in timed] or [
-            carried[0].sheet.constant([[float(k)] for k in range(self.steps)])
+            carried[0].graph.constant([[float(k)] for k in range(self.steps)])
         ]
-        seen = carried[0].sheet.repeated(carried, rows, turn)
+        seen = carried[0].graph.repeated(carried, rows, turn)
         history = dict(zip(kept, seen, strict=True))
         for state, source in stage.stepped.items():
             self._enter(state, ONNX.cat([self.start[state], history[source]]))
@@ -183,11 +183,11 @@ def proposed(task: Task, network: PlanProposer, state: Mapping[str, Value]) -> V
     raw = _layers(network, _observed(task, folded).T.cast("float32"))
     raw = raw.reshaped(BATCH, network.plans, task.horizon, raw_width(task.system.decl.controls))
     if network.clock is not None:  # outputs are a plan for the whole mission: what is left of it now
-        begun = list(state.values())[network.clock].reshaped(BATCH, 1, 1, 1)
-        steps = raw.sheet.constant([[[[float(k)] for k in range(task.horizon)]]])
-        index = ONNX_OPS.clamp(begun + steps, 0.0, task.horizon - 1.0).cast("int64")
+        elapsed = list(state.values())[network.clock].reshaped(BATCH, 1, 1, 1)
+        steps = raw.graph.constant([[[[float(k)] for k in range(task.horizon)]]])
+        index = ONNX_OPS.clamp(elapsed + steps, 0.0, task.horizon - 1.0).cast("int64")
         index = index.expand(*raw.shape, like=next(iter(state.values())))
-        (raw,) = raw.sheet.emit("GatherElements", (raw, index), [raw.shape], raw.kind, {"axis": 2})
+        (raw,) = raw.graph.emit("GatherElements", (raw, index), [raw.shape], raw.kind, {"axis": 2})
     controls = _squashed(task.system.decl.controls, raw.transposed(3, 0, 1, 2).rows())
     if swapped is not None:
         mask = swapped.reshaped(1, BATCH, 1, 1)
@@ -208,9 +208,9 @@ def _closed_loop(task: Task, network: ClosedLoopActor, state: Mapping[str, Value
     moving = list(step.next)
 
     def turn(
-        sheet: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
+        graph: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
     ) -> tuple[Sequence[Value], Sequence[Value]]:
-        env = {name: value.on(sheet) for name, value in state.items()} | dict(zip(moving, now, strict=True))
+        env = {name: value.on(graph) for name, value in state.items()} | dict(zip(moving, now, strict=True))
         seen = joined([_observed(task, env), rows[0].expand(1, BATCH, like=now[0])])
         raw = _squashed(network.outputs, _layers(network, seen.T.cast("float32")).T.rows())
         actions = {
@@ -224,8 +224,8 @@ def _closed_loop(task: Task, network: ClosedLoopActor, state: Mapping[str, Value
         return later, list(actions.values())
 
     carried = [state[name] for name in moving]
-    elapsed = carried[0].sheet.constant([[k / task.horizon] for k in range(task.horizon)])
-    controls = carried[0].sheet.repeated(carried, [elapsed], turn)
+    elapsed = carried[0].graph.constant([[k / task.horizon] for k in range(task.horizon)])
+    controls = carried[0].graph.repeated(carried, [elapsed], turn)
     planes = [each.reshaped(1, task.horizon, BATCH) for each in controls]
     return joined(planes).transposed(2, 1, 0).reshaped(BATCH, 1, task.horizon, len(controls))
 
@@ -266,12 +266,12 @@ def _layers(network: PlanProposer, seen: Value) -> Value:
         if place:
             x = x.apply({"relu": "Relu", "tanh": "Tanh"}[layers.activation])
         parts = (x, _weights(seen, weight), _weights(seen, bias))
-        (x,) = seen.sheet.emit("Gemm", parts, [(BATCH, len(bias))], "float32", {"transB": 1})
+        (x,) = seen.graph.emit("Gemm", parts, [(BATCH, len(bias))], "float32", {"transB": 1})
     return x
 
 
 def _weights(like: Value, tensor: Tensor) -> Value:
-    return like.sheet.constant(tensor.detach().numpy(force=True), "float32")
+    return like.graph.constant(tensor.detach().numpy(force=True), "float32")
 
 
 def _squashed(controls: Sequence[ControlDecl], raw: Sequence[Value]) -> dict[str, Value]:
@@ -331,8 +331,8 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
     """
     like = next(iter(start.values()))
     controls = inputs_of(plans, task)
-    states = rolled(task.system.exact_step, start, controls)
-    margins = written([rule.formula for rule in task.rules], states)
+    states = rollout(task.system.exact_step, start, controls)
+    margins = build_graph([rule.formula for rule in task.rules], states)
     margins = [margin.expand(1, BATCH, like=like) for margin in margins]
     broken = _broken(task, plans, states, margins)
     each = tuple(ONNX_OPS.where(broken, -math.inf, margin) for margin in margins)
@@ -349,7 +349,7 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
     the size of the batch.
     """
     if not rules:
-        return like.sheet.constant([[math.inf]]).expand(1, BATCH, like=like)
+        return like.graph.constant([[math.inf]]).expand(1, BATCH, like=like)
     factors = (rule.factor for rule in rules)
     least: Value = overall([each[rule.name] for rule in rules], factors, ONNX, Exact())
     return least
@@ -376,7 +376,7 @@ def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
     The reduced axes are retained with length 1.
     """
     shape = tuple(1 if place in axes else length for place, length in enumerate(x.shape))
-    (out,) = x.sheet.emit(op, (x, x.sheet.constant(axes, "int64")), [shape], x.kind, {"keepdims": 1})
+    (out,) = x.graph.emit(op, (x, x.graph.constant(axes, "int64")), [shape], x.kind, {"keepdims": 1})
     return out
 
 
@@ -388,18 +388,18 @@ def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
 
     Terms that depend on whether a plan satisfies the specification are computed as if it did.
     """
-    moments = rho.sheet.constant([[float(k)] for k in range(task.horizon + 1)])
+    moments = rho.graph.constant([[float(k)] for k in range(task.horizon + 1)])
     once = {"sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
     once |= {name + START: column[:1] for name, column in states.items()}
     timed = {"k": moments, "t": moments * task.system.dt} | dict(states)
-    parts = [rho.sheet.constant([[0.0]])]
+    parts = [rho.graph.constant([[0.0]])]
     for term in cost_terms(task):
         rows = term.samples
         env = once | {name: column[:rows] for name, column in timed.items()}
         if rows == task.horizon:
             env |= controls
         if term.goal is not None:
-            env[MARGIN.name] = written([term.goal], states, count=rows)[0]
+            env[MARGIN.name] = build_graph([term.goal], states, count=rows)[0]
         each = assigned({"each": term.number}, env)["each"]
         each = each.expand(rows, each.shape[1])
         reduced = ONNX_OPS.amax(each) if term.greatest else _reduced("ReduceMean", each, (0,))
@@ -418,7 +418,7 @@ def deepened(task: Task, states: States) -> Value:
     """
     soon = {name: column[:2] for name, column in states.items()}
     gamma, found = task.system.decl.objective.gamma, []
-    for margin in written([each.body for each in task.pending_goals.items], soon, count=2):
+    for margin in build_graph([each.body for each in task.pending_goals.items], soon, count=2):
         now, next_ = margin.expand(2, margin.shape[1])[:1], margin.expand(2, margin.shape[1])[1:]
         held = ONNX_OPS.both(ONNX_OPS.ge(now, 0.0), ONNX_OPS.gt(gamma, now))
         found.append(ONNX_OPS.both(held, ONNX_OPS.gt(next_, now)))
@@ -435,10 +435,10 @@ def falls(task: Task, start: States, plans: Value) -> Value:
     is a separate trajectory, so arrays are (T + 1, prefixes * batch).
     """
     rows = task.horizon + 1
-    states = rolled(task.system.exact_step, start, inputs_of(plans, task))
+    states = rollout(task.system.exact_step, start, inputs_of(plans, task))
     like = next(iter(start.values()))
     prefixes = [[[1.0 if k > end else -1.0] for end in range(rows)] for k in range(rows)]
-    beyond = like.sheet.constant(prefixes).expand(rows, rows, BATCH, like=like)
+    beyond = like.graph.constant(prefixes).expand(rows, rows, BATCH, like=like)
     columns = {
         name: column.expand(rows, BATCH, like=like)
         .reshaped(rows, 1, BATCH)
@@ -448,7 +448,7 @@ def falls(task: Task, start: States, plans: Value) -> Value:
     columns[BEYOND] = beyond
     flat = {name: column.reshaped(rows, BATCH) for name, column in columns.items()}
     formulas = [open_ended(anchored(rule.formula)) for rule in task.compiled.safety]
-    margins = written(formulas, flat)
+    margins = build_graph(formulas, flat)
     least = ONNX_OPS.join([margin.expand(1, BATCH, like=flat[BEYOND]) for margin in margins], "min")
     found: Value = least.reshaped(rows, BATCH)
     return found
@@ -488,12 +488,12 @@ def following(task: Task, network: PlanProposer) -> dict[str, Value]:
     Raises:
         Untranslatable: a part of the task has no ONNX form.
     """
-    sheet = OnnxGraph()
-    state = sheet.input("state", (BATCH, len(task.system.names)))
-    begun = sheet.input("begun", (BATCH, task.horizon, len(task.system.decl.controls)))
+    graph = OnnxGraph()
+    state = graph.input("state", (BATCH, len(task.system.names)))
+    previous = graph.input("begun", (BATCH, task.horizon, len(task.system.decl.controls)))
     fresh = proposed(task, network, columns_of(state, task.system.names))
     count = fresh.shape[1]
-    table = _table(task, state, joined([fresh, begun.reshaped(BATCH, 1, *begun.shape[1:])], axis=1))
+    table = _table(task, state, joined([fresh, previous.reshaped(BATCH, 1, *previous.shape[1:])], axis=1))
     policy = _varied(task, network, state, _picked(table, _best(table["rank"].T[:count].T)))
     rest = {name: _one(values, count) for name, values in table.items()}
     better = ONNX_OPS.ge(rest["rank"], policy["rank"])
@@ -522,13 +522,13 @@ def _varied(task: Task, network: PlanProposer, state: Value, policy: Mapping[str
         return {name: policy[name] for name in names}
     bounds = task.system.control_low, task.system.control_high
 
-    def changed(sheet: OnnxGraph) -> Sequence[Value]:
-        own = {name: policy[name].on(sheet) for name in names}
+    def changed(graph: OnnxGraph) -> Sequence[Value]:
+        own = {name: policy[name].on(graph) for name in names}
         plan = own["plan"].reshaped(BATCH, 1, *own["plan"].shape[1:])
         numbers = (network.changes[None], *bounds)
-        changes, low, high = (sheet.constant(each.double().numpy()) for each in numbers)
+        changes, low, high = (graph.constant(each.double().numpy()) for each in numbers)
         plans = joined([plan, (plan + changes).apply("Max", low).apply("Min", high)], axis=1)
-        table = _table(task, state.on(sheet), plans)
+        table = _table(task, state.on(graph), plans)
         better = _picked(table, _best(table["rank"]))
         good = satisfied(own["rho"])
         return [
@@ -536,12 +536,12 @@ def _varied(task: Task, network: PlanProposer, state: Value, policy: Mapping[str
             for name in names
         ]
 
-    def as_proposed(sheet: OnnxGraph) -> Sequence[Value]:
-        return [policy[name].on(sheet).apply("Identity") for name in names]
+    def as_proposed(graph: OnnxGraph) -> Sequence[Value]:
+        return [policy[name].on(graph).apply("Identity") for name in names]
 
     least = _reduced("ReduceMin", policy["rho"], (0,))
     fails = violated(least).reshaped()
-    found = state.sheet.branched(fails, changed, as_proposed)
+    found = state.graph.branched(fails, changed, as_proposed)
     return dict(zip(names, found, strict=True))
 
 
@@ -568,7 +568,7 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
 
 def _best(score: Value) -> Value:
     """Index of the plan with the highest rank for each agent, (batch, 1); `score` holds the ranks."""
-    (best,) = score.sheet.emit("ArgMax", (score,), [(BATCH, 1)], "int64", {"axis": 1, "keepdims": 1})
+    (best,) = score.graph.emit("ArgMax", (score,), [(BATCH, 1)], "int64", {"axis": 1, "keepdims": 1})
     return best
 
 
@@ -580,7 +580,7 @@ def _picked(table: Mapping[str, Value], index: Value) -> dict[str, Value]:
     outputs = {}
     for name, values in table.items():
         shape = (BATCH, *values.shape[2:])
-        (outputs[name],) = values.sheet.emit(
+        (outputs[name],) = values.graph.emit(
             "GatherND", (values, index), [shape], values.kind, {"batch_dims": 1}
         )
     return outputs
@@ -593,8 +593,8 @@ def _shown(picked: Mapping[str, Value]) -> dict[str, Value]:
 def _one(values: Value, place: int) -> Value:
     """Select plan number `place` of every agent: (batch, count, …) -> (batch, …)."""
     shape = (BATCH, *values.shape[2:])
-    index = values.sheet.constant(place, "int64")
-    (out,) = values.sheet.emit("Gather", (values, index), [shape], values.kind, {"axis": 1})
+    index = values.graph.constant(place, "int64")
+    (out,) = values.graph.emit("Gather", (values, index), [shape], values.kind, {"axis": 1})
     return out
 
 
@@ -646,7 +646,7 @@ def falling(task: Task) -> dict[str, Value]:
 
 
 def _asked(task: Task) -> tuple[Mapping[str, Value], Value]:
-    sheet = OnnxGraph()
-    state = sheet.input("state", (BATCH, len(task.system.names)))
-    plans = sheet.input("plan", (BATCH, task.horizon, len(task.system.decl.controls)))
+    graph = OnnxGraph()
+    state = graph.input("state", (BATCH, len(task.system.names)))
+    plans = graph.input("plan", (BATCH, task.horizon, len(task.system.decl.controls)))
     return columns_of(state, task.system.names), plans

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.backends.onnx.sheet import BATCH, KINDS, GraphBody, GraphNode, OnnxGraph, Value
+from stlc.compile.backends.onnx.graph import BATCH, KINDS, GraphBody, GraphNode, OnnxGraph, Value
 from stlc.controller.guard import candidates as backup
 from stlc.controller.run.run import Run, spec_hash, system_hash
 from stlc.diagnostics import usage
@@ -59,9 +59,9 @@ def model_of(
     """
     from onnx import checker, helper
 
-    sheet = next(iter(outputs.values())).sheet
+    graph = next(iter(outputs.values())).graph
     model = helper.make_model(
-        _graph(sheet, name, list(outputs.items()), real),
+        _graph(graph, name, list(outputs.items()), real),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="stlc",
@@ -73,25 +73,25 @@ def model_of(
     return data
 
 
-def _graph(sheet: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]], real: Precision) -> GraphProto:
-    """ONNX graph called `name`, with those nodes of `sheet` on which `outputs` depend.
+def _graph(graph: OnnxGraph, name: str, outputs: Iterable[tuple[str, Value]], real: Precision) -> GraphProto:
+    """ONNX graph called `name`, with those nodes of `graph` on which `outputs` depend.
 
     `outputs`: public name -> value, as pairs. `real` takes the place of float64.
     """
     from onnx import helper, numpy_helper
 
     shown = list(outputs)
-    nodes = sheet.needed([value for _, value in shown])
+    nodes = graph.needed([value for _, value in shown])
     read = {each for node in nodes for each in node.reads} | {value.name for _, value in shown}
     renamed = [helper.make_node("Identity", [value.name], [outside]) for outside, value in shown]
     return helper.make_graph(
         [*(_node(node, real) for node in nodes), *renamed],
         name,
-        [_declared(each, each.name, real) for each in sheet.inputs],
+        [_declared(each, each.name, real) for each in graph.inputs],
         [_declared(value, outside, real) for outside, value in shown],
         [
             numpy_helper.from_array(array.astype(real) if array.dtype == np.float64 else array, key)
-            for key, array in sheet.constants.items()
+            for key, array in graph.constants.items()
             if key in read
         ],
     )
@@ -103,9 +103,9 @@ def _node(node: GraphNode, real: Precision) -> NodeProto:
     made = helper.make_node(node.op, list(node.inputs), list(node.outputs))
     for key, value in node.attributes:
         if isinstance(value, GraphBody):
-            prefix = value.sheet.prefix
+            prefix = value.graph.prefix
             outputs = [(f"{prefix}o{i}", out) for i, out in enumerate(value.outputs)]
-            graph = _graph(value.sheet, key, outputs, real)
+            graph = _graph(value.graph, key, outputs, real)
             made.attribute.append(helper.make_attribute(key, graph))
         else:
             double = node.op == "Cast" and value == KINDS["float64"]

@@ -85,14 +85,14 @@ class Graphs:
         """
         return self._run(self._continue, state=x)["plan"]
 
-    def followed(self, x: Numbers, begun: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
-        """Choose, in each state of `x`, between the policy's plan and `begun`, the rest of the previous plan.
+    def followed(self, x: Numbers, previous: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:
+        """Choose, in each state of `x`, between the policy's plan and the rest of the `previous` plan.
 
         Returns:
             The chosen plans with their verdicts, and all outputs of the graph. The output `kept`, (rows,), is
                 true where the previous plan was chosen.
         """
-        found = self._run(self._follow, state=x, begun=begun)
+        found = self._run(self._follow, state=x, begun=previous)
         return _judged(found["plan"], found), found
 
     def judged(self, x: Numbers, plans: Numbers) -> tuple[JudgedPlans, Mapping[str, Numbers]]:

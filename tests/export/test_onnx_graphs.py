@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 from helpers.exported import CART, exported, mission, untrained
-from helpers.sheets import computed
+from helpers.onnx_graphs import computed
 
-from stlc.compile.backends.onnx import sheet as sheets
-from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph
+from stlc.compile.backends.onnx import graph as graphs
+from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import substitute
 from stlc.compile.semantics.switch import Hard
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
-from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rolled
+from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rollout
 from stlc.export.verify import previous_plan_agreement, same_verdicts
 from stlc.registry import INTEGRATORS
 from stlc.runtime.facts import read_facts
@@ -32,9 +32,9 @@ def test_promises_deepen_as_the_task_says() -> None:
     x[:, 1] = torch.linspace(0.6, -0.6, 80).roll(20)
     plans = torch.zeros(80, run.task.horizon, 1, dtype=torch.float64)
     wanted = run.task.pending_goals.deepened(run.task.judge(x, plans).columns)
-    sheet = OnnxGraph()
-    start = columns_of(sheet.input("state", (BATCH, len(run.task.system.names))), run.task.system.names)
-    given = sheet.input("plan", (BATCH, run.task.horizon, 1))
+    graph = OnnxGraph()
+    start = columns_of(graph.input("state", (BATCH, len(run.task.system.names))), run.task.system.names)
+    given = graph.input("plan", (BATCH, run.task.horizon, 1))
     found = deepened(run.task, judged(run.task, start, given).states)
     said = computed({"deepened": found}, {"state": x.numpy(), "plan": plans.numpy()})["deepened"]
     assert said[0].tolist() == wanted.tolist()
@@ -79,7 +79,7 @@ def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("written_out", [True, False])
 def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sheets, "UNROLLED_NODES", 10**9 if written_out else 0)
+    monkeypatch.setattr(graphs, "UNROLLED_NODES", 10**9 if written_out else 0)
     x, y, z, u = (ir.Signal(name) for name in ("x", "y", "z", "u"))
     feeds = ir.Op("add", (ir.Op("mul", (y, z)), u))
     step = ModelStep(
@@ -92,14 +92,14 @@ def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.
             "c": ir.Const(4.0),
         },
     )
-    sheet = OnnxGraph()
+    graph = OnnxGraph()
     names = ("x", "y", "z", "w", "c", "s")
-    start = {name: sheet.input(name, (1, BATCH)) for name in names}
-    controls = {"u": sheet.input("u", (5, BATCH))}
+    start = {name: graph.input(name, (1, BATCH)) for name in names}
+    controls = {"u": graph.input("u", (5, BATCH))}
     rng = np.random.default_rng(4)
     given = {name: rng.normal(size=(1, 9)) for name in names} | {"u": rng.normal(size=(5, 9))}
-    moved = rolled(step, start, controls)
-    assert ("Scan" in {node.op for node in sheet.nodes}) != written_out
+    moved = rollout(step, start, controls)
+    assert ("Scan" in {node.op for node in graph.nodes}) != written_out
     found = computed({f"{name}*": value for name, value in moved.items()}, given)
     now = {name: given[name][0] for name in names}
     for k in range(6):
@@ -125,7 +125,7 @@ def test_a_graph_takes_any_number_of_agents() -> None:
 def test_changed_copies_are_judged_where_the_plan_of_some_agent_fails() -> None:
     run, _ = exported("traffic", "car")
     outputs = deciding(run.task, run.network)
-    assert {node.op for node in outputs["plan"].sheet.nodes} >= {"If"}
+    assert {node.op for node in outputs["plan"].graph.nodes} >= {"If"}
     x = run.task.sample(60, seed=6, dtype=torch.float64)
     proposed = run.policy.continuation(x)
     good = satisfied(run.task.judge(x, proposed).rho)
@@ -153,10 +153,10 @@ def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
         lets += [(f"{name}#{part}", number) for name, number in moved.items()]
         state = {name: ir.Signal(f"{name}#{part}") for name in moved}
     step = ModelStep(tuple(lets), {name: state[name] for name in ("angle", "speed")})
-    sheet = OnnxGraph()
-    start = {name: sheet.input(name, (1, BATCH)) for name in ("angle", "speed")}
-    states = rolled(step, start, {"push": sheet.input("push", (40, BATCH))})
-    assert len(sheet.needed(list(states.values()))) < 30
+    graph = OnnxGraph()
+    start = {name: graph.input(name, (1, BATCH)) for name in ("angle", "speed")}
+    states = rollout(step, start, {"push": graph.input("push", (40, BATCH))})
+    assert len(graph.needed(list(states.values()))) < 30
     rng = np.random.default_rng(5)
     given = {
         "angle": rng.normal(size=(1, 4)),

@@ -7,12 +7,12 @@ import math
 import numpy as np
 from helpers.emitted import OPERATIONS
 from helpers.formula_strategies import NAMES
-from helpers.sheets import columns_on, computed
+from helpers.onnx_graphs import columns_on, computed
 
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.onnx.graph import OnnxGraph
 from stlc.compile.backends.onnx.ops import ONNX
-from stlc.compile.backends.onnx.sheet import OnnxGraph
 from stlc.compile.ir import nodes as ir
 
 ROWS = 7

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from helpers.emitted import STEPS, assert_every_kind, planned_formulas, traces_of
 from helpers.formula_strategies import NAMES
-from helpers.sheets import columns_on, computed
+from helpers.onnx_graphs import columns_on, computed
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.backends.onnx.ops import written
-from stlc.compile.backends.onnx.sheet import OnnxGraph
+from stlc.compile.backends.onnx.graph import OnnxGraph
+from stlc.compile.backends.onnx.ops import build_graph
 from stlc.compile.ir import nodes as ir
 
 X, Y, Z = (ir.Predicate(ir.Signal(name)) for name in NAMES)
@@ -20,7 +20,7 @@ X, Y, Z = (ir.Predicate(ir.Signal(name)) for name in NAMES)
 
 def _agree(rules: list[ir.Formula], trace: np.ndarray, count: int = 1) -> None:
     env = {name: trace[:, :, i].copy() for i, name in enumerate(NAMES)}
-    values = written(rules, columns_on(OnnxGraph(), NAMES, STEPS + 1), count=count)
+    values = build_graph(rules, columns_on(OnnxGraph(), NAMES, STEPS + 1), count=count)
     found = computed({f"r{i}": value for i, value in enumerate(values)}, env)
     expected = evaluate(rules, env, ops=NUMPY, count=count)
     for value, wanted in zip(found.values(), expected, strict=True):
@@ -59,4 +59,4 @@ def test_several_instants_and_the_mission_clock() -> None:
 )
 def test_what_has_no_form_is_said(rule: ir.Formula) -> None:
     with pytest.raises(Untranslatable):
-        written([rule], columns_on(OnnxGraph(), NAMES, STEPS + 1))
+        build_graph([rule], columns_on(OnnxGraph(), NAMES, STEPS + 1))

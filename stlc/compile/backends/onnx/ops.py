@@ -14,7 +14,7 @@ from typing import Self, TypeAlias, cast, final
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.backends.onnx.sheet import BATCH, Kind, Value, joined
+from stlc.compile.backends.onnx.graph import BATCH, Kind, Value, joined
 from stlc.compile.backends.schedule import spanning
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
@@ -85,7 +85,7 @@ class OnnxOps:
         divisor = like.beside(b)
         dividend = like.beside(a)
         shape = dividend.broadcast(divisor)
-        (rest,) = like.sheet.emit("Mod", (dividend, divisor), [shape], like.kind, {"fmod": 1})
+        (rest,) = like.graph.emit("Mod", (dividend, divisor), [shape], like.kind, {"fmod": 1})
         other = (rest * divisor).apply("Less", 0.0, kind="bool")
         return self.where(other, rest + divisor, rest)
 
@@ -146,7 +146,7 @@ class OnnxOps:
 
     def where(self, mask: Value, yes: Number, no: Number) -> Value:
         kind: Kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "float64")
-        parts = [each if isinstance(each, Value) else mask.sheet.constant(each, kind) for each in (yes, no)]
+        parts = [each if isinstance(each, Value) else mask.graph.constant(each, kind) for each in (yes, no)]
         return mask.apply("Where", *parts, kind=kind)
 
     def margin(self, x: Value) -> Value:
@@ -201,7 +201,7 @@ class OnnxOps:
 
     def full(self, shape: tuple[int, ...], value: float, like: Value) -> Value:
         """Array of a constant; an unknown batch size becomes 1, which broadcasts."""
-        known = like.sheet.constant(value, like.kind)
+        known = like.graph.constant(value, like.kind)
         return known.expand(*(1 if length == BATCH else length for length in shape))
 
     def counted(self, first: int, count: int, like: Value) -> Value:
@@ -209,7 +209,7 @@ class OnnxOps:
 
         The other dimensions are those of `like`. An unknown batch size becomes 1.
         """
-        numbers = like.sheet.constant([[float(k)] for k in range(first, first + count)], like.kind)
+        numbers = like.graph.constant([[float(k)] for k in range(first, first + count)], like.kind)
         return numbers.expand(count, *(1 if length == BATCH else length for length in like.shape[1:]))
 
     def cat(self, parts: Sequence[Value]) -> Value:
@@ -256,7 +256,9 @@ ONNX: Ops = cast("Ops", ONNX_OPS)
 Columns = dict[str, Value]
 
 
-def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, count: int = 1) -> list[Value]:
+def build_graph(
+    formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, count: int = 1
+) -> list[Value]:
     """Return the exact robustness of `formulas` at the first `count` samples.
 
     Args:
@@ -276,8 +278,8 @@ def written(formulas: Sequence[ir.Formula], columns: Mapping[str, Value], *, cou
         require_numbers(numbers(formula))
         if not defined(formula, samples)[:count].all():
             raise Untranslatable("a sample outside of the plan")
-    thawed = [_without_freeze(formula, env) for formula in formulas]
-    found: list[Value] = evaluate(thawed, env, ops=ONNX, count=count)
+    substituted = [_without_freeze(formula, env) for formula in formulas]
+    found: list[Value] = evaluate(substituted, env, ops=ONNX, count=count)
     return found
 
 

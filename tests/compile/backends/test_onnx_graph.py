@@ -1,13 +1,13 @@
-"""A sheet writes down what NumPy computes, once each."""
+"""A graph computes as NumPy does, equal operations once."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.sheets import computed
+from helpers.onnx_graphs import computed
 
-from stlc.compile.backends.onnx import sheet as sheets
-from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, joined
+from stlc.compile.backends.onnx import graph as graphs
+from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph, joined
 
 ARRAY = np.arange(15.0).reshape(5, 3) - 4.0
 
@@ -26,7 +26,7 @@ def test_cutting_and_shaping_is_that_of_numpy() -> None:
         "wide": wide * 2.0,
         "sums": 1.0 - x * 3.0 / 2.0 + (-x),
         "inverse": 2.0 / (x + 0.5),
-        "constant": x.sheet.constant([[7.0], [8.0]]).expand(2, BATCH, like=x),
+        "constant": x.graph.constant([[7.0], [8.0]]).expand(2, BATCH, like=x),
     }
     found = computed(outputs, {"x": ARRAY})
     expected = {
@@ -55,33 +55,33 @@ def test_equal_operations_are_one_node_and_unused_ones_none() -> None:
     first, second = x + 1.0, x + 1.0
     assert first is second
     unused = x * 2.0
-    assert [node.op for node in x.sheet.needed((first * first,))] == ["Add", "Mul"]
-    assert unused.sheet is x.sheet
+    assert [node.op for node in x.graph.needed((first * first,))] == ["Add", "Mul"]
+    assert unused.graph is x.graph
 
 
 def test_shapes_that_do_not_fit_are_not_written() -> None:
-    sheet = OnnxGraph()
+    graph = OnnxGraph()
     with pytest.raises(AssertionError, match="5"):
-        sheet.input("x", (5, BATCH)) + sheet.input("y", (4, BATCH))
+        graph.input("x", (5, BATCH)) + graph.input("y", (4, BATCH))
 
 
 @pytest.mark.parametrize("written_out", [True, False])
 def test_a_loop_is_the_same_written_out_and_as_a_node(
     written_out: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sheets, "UNROLLED_NODES", 10**9 if written_out else 0)
-    sheet = OnnxGraph()
-    x, first = sheet.input("x", (5, BATCH)), sheet.input("first", (1, BATCH))
+    monkeypatch.setattr(graphs, "UNROLLED_NODES", 10**9 if written_out else 0)
+    graph = OnnxGraph()
+    x, first = graph.input("x", (5, BATCH)), graph.input("first", (1, BATCH))
     factor, unread = first * 0.5, first + 9.0
 
     def turn(inner, now, rows):
         total = now[0] + rows[0] * factor.on(inner)
         return [total, now[0]], [total * 2.0, factor.on(inner), now[1]]
 
-    doubled, same, before = sheet.repeated([first, first], [x], turn)
-    scans = [node for node in sheet.needed([doubled]) if node.op == "Scan"]
+    doubled, same, before = graph.repeated([first, first], [x], turn)
+    scans = [node for node in graph.needed([doubled]) if node.op == "Scan"]
     assert bool(scans) != written_out
-    assert unread.name not in {name for node in sheet.needed([doubled]) for name in node.outputs}
+    assert unread.name not in {name for node in graph.needed([doubled]) for name in node.outputs}
     begin = np.array([[1.0, 2.0, -4.0]])
     found = computed({"doubled": doubled, "same": same, "before": before}, {"x": ARRAY, "first": begin})
     totals = begin + np.cumsum(ARRAY * begin * 0.5, 0)

@@ -51,17 +51,17 @@ class GraphBody:
     """Body of a loop, or branch of a condition: a graph inside a node.
 
     Attributes:
-        sheet: graph of one iteration or of the branch; `sheet.inputs` are its inputs.
+        graph: graph of one iteration or of the branch; `graph.inputs` are its inputs.
         outputs: values that each iteration, or the branch, returns.
     """
 
-    sheet: OnnxGraph
+    graph: OnnxGraph
     outputs: tuple[Value, ...]
 
     @property
     def nodes(self) -> list[GraphNode]:
         """Nodes that an iteration or the branch needs, in order."""
-        return self.sheet.needed(self.outputs)
+        return self.graph.needed(self.outputs)
 
     @property
     def around(self) -> frozenset[str]:
@@ -70,7 +70,7 @@ class GraphBody:
         read = {name for node in nodes for name in node.reads} | {value.name for value in self.outputs}
         made = {name for node in nodes for name in node.outputs}
         return frozenset(
-            read - made - self.sheet.constants.keys() - {value.name for value in self.sheet.inputs}
+            read - made - self.graph.constants.keys() - {value.name for value in self.graph.inputs}
         )
 
 
@@ -206,23 +206,23 @@ class Value:
     """Symbolic array.
 
     Attributes:
-        sheet: graph that the value belongs to.
+        graph: graph that the value belongs to.
         name: name of the value in the graph.
         shape: lengths of the axes; `BATCH` for an unknown length.
         kind: element type.
     """
 
-    sheet: OnnxGraph
+    graph: OnnxGraph
     name: str
     shape: tuple[int, ...]
     kind: Kind
 
-    def on(self, sheet: OnnxGraph) -> Value:
+    def on(self, graph: OnnxGraph) -> Value:
         """Return this value for use in a loop body or a branch.
 
-        The value belongs to the enclosing graph; `sheet` is the graph of the loop body or branch.
+        The value belongs to the enclosing graph; `graph` is the graph of the loop body or branch.
         """
-        return Value(sheet, self.name, self.shape, self.kind)
+        return Value(graph, self.name, self.shape, self.kind)
 
     # ----------------------------------------------------------------- arithmetic
 
@@ -264,7 +264,7 @@ class Value:
 
         A symbolic array is returned unchanged.
         """
-        return other if isinstance(other, Value) else self.sheet.constant(other, self.kind)
+        return other if isinstance(other, Value) else self.graph.constant(other, self.kind)
 
     def apply(self, op: str, *others: Value | float, kind: Kind | None = None) -> Value:
         """Apply the elementwise ONNX operation `op` to this value and `others`; shapes broadcast.
@@ -272,7 +272,7 @@ class Value:
         `kind` is the element type of the result; None means that of this value.
         """
         parts = [self.beside(other) for other in others]
-        (out,) = self.sheet.emit(op, (self, *parts), [self.broadcast(*parts)], kind or self.kind)
+        (out,) = self.graph.emit(op, (self, *parts), [self.broadcast(*parts)], kind or self.kind)
         return out
 
     def broadcast(self, *others: Value) -> tuple[int, ...]:
@@ -283,7 +283,7 @@ class Value:
         """Convert to another element type."""
         if kind == self.kind:
             return self
-        (out,) = self.sheet.emit("Cast", (self,), [self.shape], kind, {"to": KINDS[kind]})
+        (out,) = self.graph.emit("Cast", (self,), [self.shape], kind, {"to": KINDS[kind]})
         return out
 
     # --------------------------------------------------------------------- shapes
@@ -299,16 +299,16 @@ class Value:
     def __getitem__(self, rows: slice | int) -> Value:
         """Slice along axis 0; a single index removes the axis."""
         if isinstance(rows, int):
-            index = self.sheet.constant(rows % self.shape[0], "int64")
-            (out,) = self.sheet.emit("Gather", (self, index), [self.shape[1:]], self.kind, {"axis": 0})
+            index = self.graph.constant(rows % self.shape[0], "int64")
+            (out,) = self.graph.emit("Gather", (self, index), [self.shape[1:]], self.kind, {"axis": 0})
             return out
         first, stop, step = rows.indices(self.shape[0])
         count = len(range(first, stop, step))
         if count == self.shape[0] and step == 1:
             return self
         ends = stop if stop >= 0 else -self.shape[0] - 1
-        numbers = [self.sheet.constant([number], "int64") for number in (first, ends, 0, step)]
-        (out,) = self.sheet.emit("Slice", (self, *numbers), [(count, *self.shape[1:])], self.kind)
+        numbers = [self.graph.constant([number], "int64") for number in (first, ends, 0, step)]
+        (out,) = self.graph.emit("Slice", (self, *numbers), [(count, *self.shape[1:])], self.kind)
         return out
 
     def rows(self) -> tuple[Value, ...]:
@@ -316,20 +316,20 @@ class Value:
         count = self.shape[0]
         if count == 1:
             return (self,)
-        sizes = self.sheet.constant([1] * count, "int64")
+        sizes = self.graph.constant([1] * count, "int64")
         shapes = [(1, *self.shape[1:])] * count
-        return self.sheet.emit("Split", (self, sizes), shapes, self.kind, {"axis": 0})
+        return self.graph.emit("Split", (self, sizes), shapes, self.kind, {"axis": 0})
 
     def reshaped(self, *shape: int) -> Value:
         """Reshape; at most one length of the new shape may be `BATCH` (unknown)."""
-        wanted = self.sheet.constant([-1 if length == BATCH else length for length in shape], "int64")
-        (out,) = self.sheet.emit("Reshape", (self, wanted), [shape], self.kind)
+        wanted = self.graph.constant([-1 if length == BATCH else length for length in shape], "int64")
+        (out,) = self.graph.emit("Reshape", (self, wanted), [shape], self.kind)
         return out
 
     def transposed(self, *order: int) -> Value:
         """Permute the axes."""
         shape = tuple(self.shape[axis] for axis in order)
-        (out,) = self.sheet.emit("Transpose", (self,), [shape], self.kind, {"perm": order})
+        (out,) = self.graph.emit("Transpose", (self,), [shape], self.kind, {"perm": order})
         return out
 
     @property
@@ -344,16 +344,16 @@ class Value:
         """
         if self.shape == shape:
             return self
-        parts = [self.sheet.constant([1 if length == BATCH else length], "int64") for length in shape]
+        parts = [self.graph.constant([1 if length == BATCH else length], "int64") for length in shape]
         if like is not None and like.shape[-1] == BATCH and BATCH in shape:
             parts[shape.index(BATCH)] = like.count()
         wanted = joined(parts)
-        (out,) = self.sheet.emit("Expand", (self, wanted), [shape], self.kind)
+        (out,) = self.graph.emit("Expand", (self, wanted), [shape], self.kind)
         return out
 
     def count(self) -> Value:
         """Length of the last axis, as a symbolic array (1,) of the type int64."""
-        (out,) = self.sheet.emit("Shape", (self,), [(1,)], "int64", {"start": self.ndim - 1})
+        (out,) = self.graph.emit("Shape", (self,), [(1,)], "int64", {"start": self.ndim - 1})
         return out
 
 
@@ -370,7 +370,7 @@ def joined(parts: Sequence[Value], axis: int = 0) -> Value:
     first = parts[0]
     shape = list(first.shape)
     shape[axis] = sum(part.shape[axis] for part in parts)
-    (out,) = first.sheet.emit("Concat", parts, [tuple(shape)], first.kind, {"axis": axis})
+    (out,) = first.graph.emit("Concat", parts, [tuple(shape)], first.kind, {"axis": axis})
     return out
 
 

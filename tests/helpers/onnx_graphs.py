@@ -1,4 +1,4 @@
-"""Shared parts of the tests of graphs: a sheet is run by onnxruntime."""
+"""Shared parts of the tests of graphs: a graph is run by onnxruntime."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 import onnxruntime
 
-from stlc.compile.backends.onnx.sheet import BATCH, OnnxGraph, Value
+from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph, Value
 from stlc.export.onnx_write import model_of
 
 
-def columns_on(sheet: OnnxGraph, names: tuple[str, ...], rows: int) -> dict[str, Value]:
+def columns_on(graph: OnnxGraph, names: tuple[str, ...], rows: int) -> dict[str, Value]:
     """Columns (rows, batch) that are given."""
-    return {name: sheet.input(name, (rows, BATCH)) for name in names}
+    return {name: graph.input(name, (rows, BATCH)) for name in names}
 
 
 def computed(outputs: Mapping[str, Value], given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
