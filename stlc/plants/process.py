@@ -100,7 +100,7 @@ class PlantProcess:
         limit = max(float(decl.limits.time), OPENING)
         try:
             layout = {"layout": decl.layout(self._watchdog.folder).as_json()}
-            header = self._answer(layout, None, time.monotonic() + limit, limit).header
+            header = self.request(layout, None, time.monotonic() + limit, limit).header
         except FaultyError as error:
             raise _refused(
                 decl, f"the plant cannot be opened: {error.fault.message}", "", error.fault.stderr
@@ -114,23 +114,21 @@ class PlantProcess:
 
     # ------------------------------------------------------------------------------ requests
 
-    def request(self, header: Mapping[str, Any], array: Floats, deadline: float) -> Message:
+    def request(
+        self, header: Mapping[str, Any], array: Floats | None, deadline: float, limit: float | None = None
+    ) -> Message:
         """Send a request and return the reply.
 
         Args:
             header: the request.
-            array: its numbers, (rows, columns).
+            array: its numbers, (rows, columns); None for none.
             deadline: latest time of the reply, by `time.monotonic`.
+            limit: seconds that the request has, for messages; by default those of a simulation.
 
         Raises:
             FaultyError: the simulation failed. The process may have been ended; see `alive`.
         """
-        return self._answer(header, array, deadline, float(self._decl.limits.time))
-
-    def _answer(
-        self, header: Mapping[str, Any], array: Floats | None, deadline: float, limit: float
-    ) -> Message:
-        """Send a request and return the reply; `limit` is the time that it had. Raises FaultyError."""
+        limit = float(self._decl.limits.time) if limit is None else limit
         reply = self._exchanged(header, array, deadline, limit)
         reason = reply.header.get("fault")
         if reason is None:
