@@ -147,7 +147,7 @@ class ModelDraws:
         task = self.simulator.task
         rules = chosen(task.rules, self.require)
         states = [task.system.sample(1, seed=seed, dtype=torch.float64) for seed in seeds]
-        columns = self.simulator.columns_from(torch.cat(states))
+        columns = self.simulator.columns_of(task, torch.cat(states))
         scope = in_scope(task, columns)
         margins = np.stack([np.broadcast_to(each[0], len(seeds)) for each in self._evaluated(rules, columns)])
         finite = np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.assurance.drive_simulator import DriveSimulator
+from stlc.assurance.drive_simulator import DriveSimulator, JudgedDrives
 from stlc.assurance.portfolio import Portfolio, Proposal
 from stlc.assurance.search_space import Point, SearchSpace
 from stlc.compile.semantics.tolerance import satisfied, violated
@@ -34,8 +34,8 @@ EARLIER = 3
 """Decisions before the first wrong one whose states are kept too."""
 WRONG = 8
 """Wrong decisions of a failing drive whose states are kept, the earliest first; a quarter of other drives."""
-Seen = Callable[[DeploymentRecording, NDArray[np.float64]], None]
-"""Function that receives the recorded drives of a batch, and their margins, (count, agents, requirements)."""
+Seen = Callable[[DeploymentRecording, JudgedDrives], None]
+"""Function that receives the recorded drives of a batch, and the verdict on them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +110,9 @@ def search_drives(
                 asked.append(searches.ask())
         batch = [each.point for each in asked]
         recording = simulator.drive(np.stack(batch), watch)
-        found = simulator.margins_of_agents(recording)
-        seen(recording, found)
+        judged = simulator.judge(recording)
+        found = judged.margins
+        seen(recording, judged)
         points += batch
         margins += list(found)
         if searches is None:
@@ -210,9 +211,10 @@ def round_of(
     simulator = DriveSimulator(run, GUARDS.default, setting, batch=batch)
     kept, ended = list[NDArray[np.float64]](), list[int]()
 
-    def seen(recording: DeploymentRecording, margins: NDArray[np.float64]) -> None:
-        kept.append(wrong_states(recording, violated(margins).any(2).reshape(-1), test.replan))
-        ended.append(int(simulator.inconclusive(recording).sum()))
+    def seen(recording: DeploymentRecording, judged: JudgedDrives) -> None:
+        failing = violated(judged.margins).any(2).reshape(-1)
+        kept.append(wrong_states(recording, failing, test.replan))
+        ended.append(int(judged.inconclusive.sum()))
 
     def watch(_step: SimulationStep) -> None:
         if stop():

@@ -32,6 +32,42 @@ SEEDS = 2**31
 """Number of seeds from which the numbers without a coordinate may be drawn."""
 
 
+@dataclass(frozen=True, slots=True)
+class JudgedDrives:
+    """Drives of several simulations, with their verdict.
+
+    Attributes:
+        verdict: verdict on all drives, simulation by simulation.
+        agents: number of agents of a simulation.
+    """
+
+    verdict: Verdict
+    agents: int
+
+    @property
+    def in_scope(self) -> NDArray[np.bool_]:
+        """True for the drives that satisfy the assumptions of the specification, (count, agents)."""
+        scope = self.verdict.requirements[0].scope
+        inside = np.ones(1, dtype=np.bool_) if scope is None else np.asarray(scope)
+        return np.broadcast_to(inside, (self.verdict.traces,)).reshape(-1, self.agents)
+
+    @property
+    def margins(self) -> NDArray[np.float64]:
+        """Robustness of each drive, (count, agents, requirements).
+
+        It is +inf where the assumptions of the specification do not hold: nothing is violated there.
+        """
+        each = np.stack([judgement.high.min(0) for judgement in self.verdict], 1)
+        each = each.reshape(-1, self.agents, each.shape[1])
+        return np.where(self.in_scope[..., None], each, np.inf)
+
+    @property
+    def inconclusive(self) -> NDArray[np.bool_]:
+        """True for the drives that ended before their verdict, (count, agents)."""
+        found: NDArray[np.bool_] = np.array(self.verdict.statuses) == "inconclusive"
+        return found.reshape(-1, self.agents)
+
+
 @dataclass(frozen=True)
 class DriveSimulator(Simulator):
     """Simulator of drives: one world per point, whose random numbers are read from the point.
@@ -79,7 +115,7 @@ class DriveSimulator(Simulator):
     @cached_property
     def requirements(self) -> tuple[str, ...]:
         """Names of the requirements on drives."""
-        return tuple(each.name for each in self._verdict(self.drive(np.full((1, 1), 0.5))))
+        return tuple(each.name for each in self.judge(self.drive(np.full((1, 1), 0.5))).verdict)
 
     def simulate(self, points: NDArray[np.float64], requirement: int) -> Simulations:
         """Simulate `points`, (count, dim), and judge the drives by a requirement.
@@ -87,13 +123,11 @@ class DriveSimulator(Simulator):
         A point is admissible if the assumptions of the specification hold for one of its agents. It has a
         verdict if one of them violates the requirement, or all have a verdict.
         """
-        verdict = self._verdict(self.drive(points))
-        margins = self._margins(verdict).min(1)[:, requirement]
-        inside = np.broadcast_to(_inside(verdict), (len(points) * self.setting.agents,))
-        admissible: NDArray[np.bool_] = np.any(inside.reshape(len(points), -1), axis=1)
-        open_ = np.array(verdict.requirements[requirement].statuses) == "inconclusive"
+        drives = self.judge(self.drive(points))
+        margins = drives.margins.min(1)[:, requirement]
+        open_ = np.array(drives.verdict.requirements[requirement].statuses) == "inconclusive"
         judged = violated(margins) | ~open_.reshape(len(points), -1).any(1)
-        return Simulations(margins, admissible, judged)
+        return Simulations(margins, np.asarray(drives.in_scope.any(1)), judged)
 
     def drive(self, points: NDArray[np.float64], watch: Watch | None = None) -> DeploymentRecording:
         """Simulate `points`, (count, dim), side by side, and return the recorded drives.
@@ -107,38 +141,15 @@ class DriveSimulator(Simulator):
         assert recording is not None
         return recording
 
-    def margins_of_agents(self, recording: DeploymentRecording) -> NDArray[np.float64]:
-        """Robustness of each agent of each simulation, (count, agents, requirements).
-
-        It is +inf where the assumptions of the specification do not hold: nothing is violated there.
-        """
-        return self._margins(self._verdict(recording))
-
-    def inconclusive(self, recording: DeploymentRecording) -> NDArray[np.bool_]:
-        """True for the agents of each simulation whose drive ended before its verdict, (count, agents)."""
-        found = np.array(self._verdict(recording).statuses) == "inconclusive"
-        each: NDArray[np.bool_] = found.reshape(-1, self.setting.agents)
-        return each
-
-    def _margins(self, verdict: Verdict) -> NDArray[np.float64]:
-        inside = _inside(verdict)
-        each = np.stack([np.where(inside, judgement.high.min(0), np.inf) for judgement in verdict], 1)
-        return each.reshape(-1, self.setting.agents, each.shape[1])
+    def judge(self, recording: DeploymentRecording) -> JudgedDrives:
+        """Judge recorded drives by the specification of drives, or else by that of the plans."""
+        return JudgedDrives(verdict_on_runs(self._rules, self.run.task, recording), self.setting.agents)
 
     def trace(self, points: NDArray[np.float64]) -> Trace:
         """Drives at `points`, (count, dim), as a trace with one row per agent."""
         return trace_of(self.run, self.drive(points), self._at(points), self._rules)
 
-    def _verdict(self, recording: DeploymentRecording) -> Verdict:
-        return verdict_on_runs(self._rules, self.run.task, recording)
-
     def _at(self, points: NDArray[np.float64]) -> Setting:
         (first,) = self.setting.seeds
         seeds = (first + int(min(each, BELOW) * SEEDS) for each in points[:, -1])
         return replace(self.setting, seeds=tuple(seeds), draws=tuple(points[:, :-1]))
-
-
-def _inside(verdict: Verdict) -> NDArray[np.bool_]:
-    """True for the drives that satisfy the assumptions, (drives,), or (1,) if there are none."""
-    scope = verdict.requirements[0].scope
-    return np.ones(1, dtype=np.bool_) if scope is None else np.asarray(scope)

@@ -144,7 +144,7 @@ class ModelSimulator:
         """
         states = self.points.states(torch.from_numpy(np.concatenate(parts)))
         admissible = self.points.admissible(states).numpy()
-        columns, found, end = self._moved(self.task, states), [], 0
+        columns, found, end = self.columns_of(self.task, states), [], 0
         for part, requirement in zip(parts, requirements, strict=True):
             rows, end = slice(end, end + len(part)), end + len(part)
             own = {name: np.ascontiguousarray(column[:, rows]) for name, column in columns.items()}
@@ -169,7 +169,7 @@ class ModelSimulator:
         states = self.points.states(torch.tensor(points))
         admissible = self.points.admissible(states).numpy()
         task = self.finer(counts_samples(self.task.rules[requirement].typed.formula))
-        return self._judged(task, self._moved(task, states), requirement, admissible)
+        return self._judged(task, self.columns_of(task, states), requirement, admissible)
 
     def gradient(self, point: Point, requirement: int) -> Point | None:
         """Gradient of the exact robustness at a point, (dim,), by the native kernel.
@@ -200,24 +200,16 @@ class ModelSimulator:
     def trace(self, points: NDArray[np.float64], seed: int | None = None) -> Trace:
         """Simulated trajectories of `points`, (count, dim), as a trace."""
         states = self.points.states(torch.tensor(points))
-        return self.trace_from(states, seed)
-
-    def trace_from(self, states: Tensor, seed: int | None = None) -> Trace:
-        """Simulated trajectories from initial states (count, n), as a trace."""
-        rho = _margins(self.task, self._moved(self.task, states), range(len(self.task.rules)))
+        rho = _margins(self.task, self.columns_of(self.task, states), range(len(self.task.rules)))
         rho = rho.min(1, initial=np.inf)
         nothing = torch.zeros(len(states))
         plans = self._plans(self.task, len(states))
         result = PlanResult(states, plans, torch.from_numpy(rho), nothing.bool(), nothing, nothing.long())
         return trace_of(self.task, result, seed)
 
-    def columns_from(self, states: Tensor) -> Columns:
-        """Signals of simulations from initial states (count, n): name -> (time, count)."""
-        return self._moved(self.task, states)
-
     @staticmethod
-    def _moved(task: Task, states: Tensor) -> Columns:
-        """Simulate from initial states (count, n): signal -> (time, count), by the fastest kernel there is.
+    def columns_of(task: Task, states: Tensor) -> Columns:
+        """Signals of simulations from states (count, n), by the fastest kernel: name -> (time, count).
 
         Requirements are judged apart from that, in time that does not grow with their windows.
         """

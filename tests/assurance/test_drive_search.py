@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -66,9 +67,9 @@ class _Bowls:
     def drive(self, points: np.ndarray, _watch: object = None) -> np.ndarray:
         return points
 
-    def margins_of_agents(self, points: np.ndarray) -> np.ndarray:
+    def judge(self, points: np.ndarray) -> SimpleNamespace:
         low, high = points[:, 10:13], 100.0 * (1.0 - points[:, 20:23])
-        return np.stack([low.mean(1) - 0.02, high.mean(1) - 2.0], 1)[:, None]
+        return SimpleNamespace(margins=np.stack([low.mean(1) - 0.02, high.mean(1) - 2.0], 1)[:, None])
 
 
 @pytest.mark.parametrize("seed", [101, 102, 103])

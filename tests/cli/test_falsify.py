@@ -128,13 +128,13 @@ def test_points_decide_the_drives():
 def test_a_drive_that_violates_an_assumption_violates_no_requirement():
     simulator = DriveSimulator(Run.open("latest"), "none", Setting((0,), 2, 20, 1))
     points = np.random.default_rng(0).random((8, simulator.space.dim))
-    every = simulator.margins_of_agents(simulator.drive(points))
+    every = simulator.judge(simulator.drive(points)).margins
     assumed = DriveSimulator(simulator.run, simulator.guard, simulator.setting)
     spec = parse(Source("cart.stl", SPEC + "assume left: x <= 0 m\n"))
     assumed.__dict__["_rules"] = Rules(spec, "cart.stl")
     recording = assumed.drive(points)
     left = (recording.states[:, 0, 0] <= 0.0).reshape(8, 2)
-    margins = assumed.margins_of_agents(recording)
+    margins = assumed.judge(recording).margins
     assert 0 < left.sum() < left.size
     assert np.isposinf(margins[~left]).all()
     assert np.allclose(margins[left], every[left], atol=1e-6)
