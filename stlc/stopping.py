@@ -100,15 +100,18 @@ def _wait(read: int) -> None:
         numbers = os.read(read, 64)
     number = signal.SIGTERM if signal.SIGTERM in numbers else signal.SIGINT
     _asked.append(number)
-    patience = PATIENCE
-    with suppress(ValueError):
-        patience = min(max(float(os.environ.get(CHILD, PATIENCE)), 0.0), PATIENCE)
-    time.sleep(patience)
+    time.sleep(_patience())
     code = 128 + number
     last = threading.Thread(target=_undo, args=(code,), daemon=True)
     last.start()
     last.join(LAST)
     os._exit(code)
+
+
+def _patience() -> float:
+    with suppress(ValueError):
+        return min(max(float(os.environ.get(CHILD, PATIENCE)), 0.0), PATIENCE)
+    return PATIENCE
 
 
 def _undo(code: int) -> None:
