@@ -19,6 +19,8 @@ from stlc.controller.world import world_type
 from stlc.dynamics.system import System
 from stlc.monitor.verdict import Monitor
 
+pytestmark = pytest.mark.apart  # worlds of the examples: their own programs
+
 ROOT = Path(__file__).parents[2]
 DT = 0.1
 AREA, HALF = 1.0, 0.5  # m: the stop area before a line, and how close to it who is told to yield may come

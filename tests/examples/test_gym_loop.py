@@ -12,6 +12,8 @@ from helpers.exported import ROOT, exported
 from stlc.gym import make
 from stlc.runtime import Controller
 
+pytestmark = pytest.mark.apart  # worlds of the examples: their own programs
+
 PATH = ROOT / "examples" / "gym_loop.py"
 SPEC = str(ROOT / "specs" / "traffic.stl")
 

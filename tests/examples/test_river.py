@@ -13,6 +13,8 @@ import torch
 from stlc.controller.world import world_type
 from stlc.dynamics.system import System
 
+pytestmark = pytest.mark.apart  # worlds of the examples: their own programs
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 

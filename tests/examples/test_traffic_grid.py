@@ -15,6 +15,8 @@ from helpers.traffic_drivers import Driver, careful, reckless
 from stlc.controller.world import world_type
 from stlc.dynamics.system import System
 
+pytestmark = pytest.mark.apart  # worlds of the examples: their own programs
+
 CAR = Path(__file__).parents[2] / "examples" / "car.yaml"
 STEPS = 150
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,12 @@ WORLDS = {
     "manipulation": "panda",
 }
 FREE = [name for name in WORLDS if name != "traffic"]  # agents that do not meet each other
+FIRST = "traffic", "reach_n_avoid"
+
+
+def tried(names: Iterable[str]) -> list[Any]:
+    """Names of worlds as parameters; all but the first ones are tried apart."""
+    return [pytest.param(name, marks=() if name in FIRST else pytest.mark.apart) for name in names]
 
 
 class Wild(Policy):
@@ -48,7 +55,7 @@ class Wild(Policy):
         return (low + share * (high - low)).to(x0.dtype)[:, None]
 
 
-@pytest.fixture(scope="module", params=WORLDS)
+@pytest.fixture(scope="module", params=tried(WORLDS))
 def task(request: pytest.FixtureRequest) -> Task:
     return task_of(request.param)
 
@@ -82,7 +89,7 @@ def test_a_world_is_its_seed(task: Task) -> None:
     assert np.isfinite(first).all()
 
 
-@pytest.mark.parametrize("name", FREE)
+@pytest.mark.parametrize("name", tried(FREE))
 def test_an_agent_in_a_batch_does_as_it_does_alone(name: str) -> None:
     task = task_of(name)
     (many, _), (few, _) = film(task, 4, 1), film(task, 1, 1)
