@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.deployments import sampled_states
 from benchmarks.timing import Times, after_warm_up
 from stlc.compile.semantics.tolerance import satisfied, violated
-from stlc.controller.guard.candidates import TO_SPARE, Limits
+from stlc.controller.guard.candidates import TARGET_SHARE, Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.full import GUARD as FULL
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
@@ -91,7 +91,7 @@ def methods_of(task: Task, backup: StagedSearch) -> dict[str, Method]:
 
     `backup` is the search of the full guard, which is one of the methods.
     """
-    target = TO_SPARE * task.system.decl.objective.gamma
+    target = TARGET_SHARE * task.system.decl.objective.gamma
     ascent = GradientAscent(task, torch.Generator().manual_seed(SEED), target=target)
     searcher = Searcher(task, torch.Generator().manual_seed(SEED), target=target)
 

@@ -25,7 +25,7 @@ RobustnessMargins: TypeAlias = Mapping[str, float]
 """Safety requirement -> required robustness margin, in its unit; 0 for requirements left out."""
 
 SOURCES = ("policy", "backup", "safest", "polished")
-TO_SPARE = 0.05
+TARGET_SHARE = 0.05
 """Target robustness of plan repair, as a share of gamma (the robustness at which training aims)."""
 POLICY, BACKUP, SAFEST, REPAIRED = range(len(SOURCES))
 """Sources of a plan: the policy; a prefix continued by the policy; the longest safe prefix; plan repair."""

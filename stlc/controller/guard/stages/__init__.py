@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from stlc.controller.guard.candidates import TO_SPARE, Candidates, Deadline, Limits
+from stlc.controller.guard.candidates import TARGET_SHARE, Candidates, Deadline, Limits
 from stlc.registry import PackageRegistry
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Setup:
 
         It is a small share of gamma, the robustness at which training aims.
         """
-        return TO_SPARE * self.task.system.decl.objective.gamma
+        return TARGET_SHARE * self.task.system.decl.objective.gamma
 
 
 @dataclass(slots=True)

@@ -1,9 +1,9 @@
 """Landmarks: conditions that hold on every safe way to a target (Hoffmann, Porteous & Sebastia 2004).
 
 A safety requirement such as `door open -> at rest at a floor` is a choice: door closed, or at rest at a
-floor. A target with an open door leaves the second alternative only. Whoever opens the door must have taken
-it before, while the first one still held. So there are two landmarks on the way to the target: the first
-alternative, door closed, and what the target asks together with the second one, at rest at the floor.
+floor. A target with an open door leaves the second alternative only. Before the door opens, the second must
+already hold together with the first. So there are two landmarks on the way to the target: the first
+alternative, door closed, and the target together with the second one, at rest at the floor.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Landmarks:
     _apart: dict[tuple[ir.Formula, ir.Formula], bool] = field(default_factory=dict)
 
     def of(self, target: ir.Formula) -> tuple[ir.Formula, ...]:
-        """Return the landmarks on the way to a target, the first to reach first; none where none is known."""
+        """Return the landmarks on the way to a target, in the order in which they are reached."""
         asked = tuple(_literals(target))
         left, rest, before = list(asked), list[ir.Formula](), list[ir.Formula]()
         for clause in self.clauses:

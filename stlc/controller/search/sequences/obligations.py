@@ -1,4 +1,4 @@
-"""Obligations of a plan: what the requirements ask of the samples from a given state of the mission on.
+"""Obligations of a plan: the requirements as seen from a given state of the mission.
 
 For plans, the compiler rewrites an absolute formula such as `p until@[0 s, 25 s] q` with states that it
 adds: a mission clock, a status, and timers for the formulas within. That form is exact from every state, but
@@ -79,8 +79,8 @@ class Obligations:
     ) -> ir.Formula | None:
         """Return the answer that is due for what happened up to the state `env`; None if there is none.
 
-        The latest sample at which it may come is looked up: the requirement is judged on plans on which
-        nothing is asked for any more, and which answer at one sample after another, or never.
+        To find the latest sample for it, the requirement is judged on plans without further triggers that
+        answer at one sample after another, or never.
         """
         samples = np.arange(self._horizon + 1.0)[:, None]
 
@@ -99,7 +99,7 @@ class Obligations:
         if good(np.array([np.inf]))[0]:
             return None
         last = good(np.arange(1.0, response.latest + 1.0)).nonzero()[0]
-        if not len(last) or last[-1] + 1 == response.latest:  # asked for at this sample
+        if not len(last) or last[-1] + 1 == response.latest:  # triggered at this sample
             return None
         return ir.Temporal("eventually", ir.Window(0, int(last[-1]) + 1), response.answer)
 
@@ -151,7 +151,7 @@ class Obligations:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """A number of a requirement that a signal stands for.
+    """A number of a requirement that a signal replaces.
 
     Attributes:
         num: the number.
@@ -169,7 +169,7 @@ class _Response:
     """A requirement such as `always@[a, b] (p -> eventually[c, d] q)`.
 
     Attributes:
-        answer: what is due, q.
+        answer: the formula that becomes due, q.
         latest: number of samples after which it is due, d.
         form: the requirement on plans, with a signal for the number in each predicate.
         parts: the numbers, by the names of these signals.
@@ -182,7 +182,7 @@ class _Response:
 
 
 def _responses(written: ir.Formula, form: ir.Formula, own: frozenset[str]) -> Iterator[_Response]:
-    """Yield the responses that an absolute formula asks for; `form`: its form for plans."""
+    """Yield the responses that an absolute formula requires; `form`: its form for plans."""
     formula = written.body if isinstance(written, ir.AtStart) else written
     if not (isinstance(formula, ir.Temporal) and formula.op == "always"):
         return

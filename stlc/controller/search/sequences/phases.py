@@ -2,9 +2,9 @@
 
 A phase is found by its switches: plans that keep one level of the controls after another. From the best of
 them, Gauss-Newton steps meet the target at each of several samples, and safety where it is missed most up to
-there; the earliest that does is kept. Where they fail, the local search of the native kernel goes on. The
+there; the earliest that succeeds is taken. If all fail, the local search of the native kernel follows. The
 kernel computes the robustness of `safe until[0, L] (target and safe for a while)`. It serves all targets of a
-task. Further states, constant along a phase, say which target is asked for and at which samples it counts.
+task. Further states, constant along a phase, select the target and the samples at which it counts.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ TAIL = 6
 """The part of a phase's length for which it stays safe after the target: one of so many."""
 SPREAD = 1.5
 """Standard deviation of the logarithm of the weights of shortfalls."""
-SPARE = 1e-6
-"""Margin that a strict predicate shall have."""
+LEAST_MARGIN = 1e-6
+"""Robustness margin that a strict predicate must have."""
 UNSURE = 1e-3
 """Shortfall of a target that is reached in a state in which safety is not known to last."""
 TINY = 1e-9
@@ -91,7 +91,7 @@ SHORTER = 0.7, 0.85
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
+class PhaseRequest:
     """A request for a phase.
 
     Attributes:
@@ -181,7 +181,7 @@ class Phases:
         Args:
             system: system of the task.
             safe: formula that holds at every sample of a phase.
-            targets: formulas, one of which a request asks for; they look less than `steps` samples ahead.
+            targets: formulas, of which a request selects one; their lookahead is less than `steps` samples.
             untils: formulas that hold at every sample of a phase while they are open.
             steps: number of steps of a phase.
             scale: function that returns the typical size of the margin of a predicate.
@@ -223,16 +223,16 @@ class Phases:
         sizes = Sizes(len(motion.states), len(motion.controls), steps, 1)
         return cls(Kernel(library, sizes), system, steps, len(untils), targets, clauses)
 
-    def reach(self, state: Numbers, ask: Ask, random: Generator, effort: int = 1) -> Phase:
+    def reach(self, state: Numbers, request: PhaseRequest, random: Generator, effort: int = 1) -> Phase:
         """Search for a phase from `state`, (n,), and make it shorter if it is found.
 
         `effort` is a factor of the generations of local searches.
         """
-        row, middle = self._row(state, ask), np.broadcast_to(self._middle, self._constant[0].shape)
-        plans, rho = self._remembered(row, ask, middle)
+        row, middle = self._row(state, request), np.broadcast_to(self._middle, self._constant[0].shape)
+        plans, rho = self._remembered(row, request, middle)
         for _ in range(min(ROUNDS[0] + effort - 1, ROUNDS[1])):
             if rho.max() < 0.0:
-                plans, rho = self._improved(row, ask, plans, random, effort)
+                plans, rho = self._improved(row, request, plans, random, effort)
             found = (
                 max((self._phase(row, plan) for plan in plans), key=lambda phase: phase.margin)
                 if rho.max() < 0
@@ -242,11 +242,11 @@ class Phases:
                 break
             plans = plans[(-rho).argsort(kind="stable")[:KEPT]]
         if found.margin < -UNSURE:
-            plans, rho = self._steered(row, ask, middle[None], NEWTON)
+            plans, rho = self._steered(row, request, middle[None], NEWTON)
             found = max(found, self._phase(row, plans[0]), key=lambda phase: phase.margin)
         shares = deque(SHORTER)
-        while shares and found.margin >= 0.0 and found.sample > ask.first + SHORT:
-            shorter = replace(ask, last=max(ask.first, int(shares[0] * found.sample)))
+        while shares and found.margin >= 0.0 and found.sample > request.first + SHORT:
+            shorter = replace(request, last=max(request.first, int(shares[0] * found.sample)))
             row = self._row(state, shorter)
             plans, rho = self._twice(row, shorter, np.stack((found.plan, middle)), random)
             if rho.max() < 0.0:
@@ -256,26 +256,26 @@ class Phases:
             else:
                 found = self._phase(row, plans[int(rho.argmax())])
         if found.margin >= -UNSURE:
-            found = self._calm(state, ask, found)
-            self._known[ask.target].append(found.plan)
+            found = self._calm(state, request, found)
+            self._known[request.target].append(found.plan)
         return found
 
-    def _remembered(self, row: Numbers, ask: Ask, middle: Numbers) -> tuple[Numbers, Numbers]:
+    def _remembered(self, row: Numbers, request: PhaseRequest, middle: Numbers) -> tuple[Numbers, Numbers]:
         """Return initial plans, (k, L, m), with their robustness.
 
         They are the middle of the ranges of the controls, what reached the target before, and the best of
         what reached other targets.
         """
-        own, others = self._known[ask.target], [*chain(*self._known)]
+        own, others = self._known[request.target], [*chain(*self._known)]
         plans = np.stack((middle, *own, *others))
         rho = self._judged(np.repeat(row, len(plans), 0), plans)
         first = 1 + len(own)
         kept = [*range(first), *(first + (-rho[first:]).argsort(kind="stable")[:KEPT])]
         return plans[kept], rho[kept]
 
-    def _calm(self, state: Numbers, ask: Ask, found: Phase) -> Phase:
-        """Return a phase without the controls that it does not need: they keep the middle of their ranges."""
-        row, plan = self._row(state, replace(ask, last=found.sample)), found.plan
+    def _calm(self, state: Numbers, request: PhaseRequest, found: Phase) -> Phase:
+        """Return the phase with unneeded controls held at the middle of their ranges."""
+        row, plan = self._row(state, replace(request, last=found.sample)), found.plan
         for control, middle in enumerate(self._middle):
             calmer = np.where(np.arange(len(self._middle)) == control, middle, plan)
             if self._judged(row, calmer[None])[0] >= found.margin:
@@ -283,14 +283,14 @@ class Phases:
         return found if plan is found.plan else self._phase(row, plan)
 
     def _improved(
-        self, row: Numbers, ask: Ask, plans: Numbers, random: Generator, effort: int
+        self, row: Numbers, request: PhaseRequest, plans: Numbers, random: Generator, effort: int
     ) -> tuple[Numbers, Numbers]:
         """Improve plans, (k, L, m), and return those that result, with their robustness."""
-        best, rho = self._twice(row, ask, plans, random)
+        best, rho = self._twice(row, request, plans, random)
         if rho.max() >= 0.0:
             return best, rho
         kept = (-rho).argsort(kind="stable")[:IMPROVED]
-        steered, found = self._steered(row, ask, best[kept[:STEERED]], NEWTON)
+        steered, found = self._steered(row, request, best[kept[:STEERED]], NEWTON)
         if found.max() >= 0.0:
             return steered, found
         best[kept[:STEERED]] = steered
@@ -304,17 +304,21 @@ class Phases:
         best, rho = self._kernel.local_search(rows, best[kept], options)
         return best, np.nan_to_num(rho, nan=-np.inf)
 
-    def _twice(self, row: Numbers, ask: Ask, plans: Numbers, random: Generator) -> tuple[Numbers, Numbers]:
+    def _twice(
+        self, row: Numbers, request: PhaseRequest, plans: Numbers, random: Generator
+    ) -> tuple[Numbers, Numbers]:
         """Return plans with one or two more switches than `plans`, (k, L, m), or the first on target."""
-        best, rho = self._switched(row, ask, plans, random)
+        best, rho = self._switched(row, request, plans, random)
         if rho.max() >= 0.0:
             return best, rho
-        again, found = self._switched(row, ask, best[(-rho).argsort(kind="stable")[:KEPT]], random)
+        again, found = self._switched(row, request, best[(-rho).argsort(kind="stable")[:KEPT]], random)
         if found.max() >= 0.0:
             return again, found
         return np.concatenate((best, again)), np.concatenate((rho, found))
 
-    def _switched(self, row: Numbers, ask: Ask, plans: Numbers, random: Generator) -> tuple[Numbers, Numbers]:
+    def _switched(
+        self, row: Numbers, request: PhaseRequest, plans: Numbers, random: Generator
+    ) -> tuple[Numbers, Numbers]:
         """Return plans that follow one of `plans`, (k, L, m), up to some sample and keep a level from there.
 
         Those are the best for each level or, if some reach the target, one of those that do so first.
@@ -327,16 +331,18 @@ class Phases:
         rows[1:, own : own + WEIGHTS] = np.exp(SPREAD * random.standard_normal((levels - 1, WEIGHTS)))
         rho = self._judged(np.repeat(rows, whole.shape[1], 0), whole.reshape(-1, *plans.shape[1:]))
         if rho.max() >= 0.0:
-            return self._first(row, ask, whole.reshape(-1, *plans.shape[1:])[rho >= 0.0]), np.zeros(1)
+            return self._first(row, request, whole.reshape(-1, *plans.shape[1:])[rho >= 0.0]), np.zeros(1)
         rho = rho.reshape(levels, -1)
         return whole[np.arange(levels), rho.argmax(1)], rho.max(1)
 
-    def _first(self, row: Numbers, ask: Ask, plans: Numbers) -> Numbers:
+    def _first(self, row: Numbers, request: PhaseRequest, plans: Numbers) -> Numbers:
         """Return one of `plans`, (k, L, m), that reaches the target first, (1, L, m); all reach it."""
-        low, high = ask.first - 1, ask.last
+        low, high = request.first - 1, request.last
         while high - low > 1 and len(plans) > 1:
             last = (low + high) // 2
-            shorter = np.repeat(self._row(row[0, : len(self._names)], replace(ask, last=last)), len(plans), 0)
+            shorter = np.repeat(
+                self._row(row[0, : len(self._names)], replace(request, last=last)), len(plans), 0
+            )
             if (good := self._judged(shorter, plans) >= 0.0).any():
                 plans, high = plans[good], last
             else:
@@ -348,21 +354,25 @@ class Phases:
         rho, _ = self._kernel.judge(rows, plans)
         return np.nan_to_num(rho[:, 0], nan=-np.inf)
 
-    def _steered(self, row: Numbers, ask: Ask, plans: Numbers, most: int) -> tuple[Numbers, Numbers]:
+    def _steered(
+        self, row: Numbers, request: PhaseRequest, plans: Numbers, most: int
+    ) -> tuple[Numbers, Numbers]:
         """Change plans, (k, L, m), by Gauss-Newton steps that meet the target at one of several samples.
 
         Derivatives are differences. Of each plan and those that result from it, the best is kept.
         """
         rho = self._judged(np.repeat(row, len(plans), 0), plans)
         for _ in range(most):
-            tried = self._steps(row, ask, plans)
+            tried = self._steps(row, request, plans)
             if not tried.shape[1]:
                 break
             found = self._judged(
                 np.repeat(row, tried.shape[0] * tried.shape[1], 0), tried.reshape(-1, *plans.shape[1:])
             )
             if found.max() >= 0.0:
-                return self._first(row, ask, tried.reshape(-1, *plans.shape[1:])[found >= 0.0]), np.zeros(1)
+                return self._first(row, request, tried.reshape(-1, *plans.shape[1:])[found >= 0.0]), np.zeros(
+                    1
+                )
             found = found.reshape(tried.shape[:2])
             best = found.argmax(1)
             value = found[np.arange(len(plans)), best]
@@ -373,7 +383,7 @@ class Phases:
                 break
         return plans, rho
 
-    def _steps(self, row: Numbers, ask: Ask, plans: Numbers) -> Numbers:
+    def _steps(self, row: Numbers, request: PhaseRequest, plans: Numbers) -> Numbers:
         """Return changed copies of plans, (k, L, m), as (k, tries, L, m); none without demands."""
         count, moves = len(plans), len(self._moves)
         span = self._bounds[1] - self._bounds[0]
@@ -389,7 +399,7 @@ class Phases:
         env = dict(zip(self._names, columns, strict=False)) | {
             ir.ELAPSED: np.broadcast_to(np.arange(self.steps + 1.0)[:, None], columns.shape[1:])
         }
-        options = self._demands[ask.target]
+        options = self._demands[request.target]
         literals = tuple(
             dict.fromkeys((*(each.literal for option in options for each in option), *chain(*self._clauses)))
         )
@@ -404,7 +414,7 @@ class Phases:
         )
         values = values.reshape(len(literals), self.steps + 1, count, moves + 1)
         index = {literal: i for i, literal in enumerate(literals)}
-        whens = np.unique(np.linspace(ask.first, ask.last, SAMPLES).round().astype(np.int64))
+        whens = np.unique(np.linspace(request.first, request.last, SAMPLES).round().astype(np.int64))
         now = values[..., 0]
         with np.errstate(invalid="ignore"):  # of infinities; not a number is no slope
             slopes = (values[..., 1:] - now[..., None]) / PROBE  # per share of the range, inward
@@ -413,8 +423,8 @@ class Phases:
         for option in options:
             numbers = [index[each.literal] for each in option]
             at = np.minimum(whens[:, None] + [each.later for each in option], self.steps)
-            spare = np.array([each.spare for each in option])
-            missing = np.concatenate((spare[:, None] - now[numbers, at], lacks), 1)
+            margins = np.array([each.margin for each in option])
+            missing = np.concatenate((margins[:, None] - now[numbers, at], lacks), 1)
             grow = np.concatenate((slopes[numbers, at], falls), 1)
             tried.append(self._solved(plans, inward, missing.transpose(2, 0, 1), grow.transpose(2, 0, 1, 3)))
         return np.concatenate(tried, 1)
@@ -422,9 +432,9 @@ class Phases:
     def _unsafe(
         self, now: Numbers, slopes: Numbers, index: dict[ir.Predicate, int], whens: NDArray[np.int64]
     ) -> tuple[Numbers, Numbers]:
-        """Return what safety lacks where it lacks most, (whens, clauses, k), and its derivatives.
+        """Return the largest shortfalls of the safety clauses, (whens, clauses, k), and their derivatives.
 
-        Of each clause, that is its greatest literal at the sample up to each of `whens` where this is least.
+        Each is that of the greatest literal of a clause, at the sample up to each `when` of its minimum.
 
         Args:
             now: values of the literals, (literals, L + 1, k).
@@ -440,15 +450,15 @@ class Phases:
             margins = now[numbers].max(0)
             worst = np.stack([margins[: when + 1].argmin(0) for when in whens])
             samples[:, i], literals[:, i] = worst, numbers[now[numbers].argmax(0)[worst, each]]
-        return SPARE - now[literals, samples, each], slopes[literals, samples, each]
+        return LEAST_MARGIN - now[literals, samples, each], slopes[literals, samples, each]
 
     def _solved(self, plans: Numbers, inward: Numbers, missing: Numbers, slopes: Numbers) -> Numbers:
-        """Return plans after the least changes by which linearised values grow by what is missing.
+        """Return plans after the smallest changes that increase the linearised values by `missing`.
 
         Args:
             plans: plans, (k, L, m).
             inward: signs of the changes of the controls, (k, L, m).
-            missing: what the values lack, (k, samples, demands).
+            missing: shortfalls of the values, (k, samples, demands).
             slopes: derivatives by the changes, (k, samples, demands, moves).
         """
         slopes = np.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
@@ -482,15 +492,15 @@ class Phases:
         bounded: Numbers = np.clip(tried, low, high)
         return bounded
 
-    def margin(self, state: Numbers, ask: Ask) -> float:
+    def margin(self, state: Numbers, request: PhaseRequest) -> float:
         """Robustness of the target of a request in `state`, (n,), itself."""
         middle = np.broadcast_to(self._middle, (1, self.steps, len(self._middle)))
-        rho, _ = self._kernel.judge(self._row(state, replace(ask, first=0, last=0)), middle)
+        rho, _ = self._kernel.judge(self._row(state, replace(request, first=0, last=0)), middle)
         return float(rho[0, 0])
 
-    def _row(self, state: Numbers, ask: Ask) -> Numbers:
-        opened = [float(i in ask.open) for i in range(self._untils)]
-        return np.array([[*state, ask.target, ask.first, ask.last, *[1.0] * WEIGHTS, *opened]])
+    def _row(self, state: Numbers, request: PhaseRequest) -> Numbers:
+        opened = [float(i in request.open) for i in range(self._untils)]
+        return np.array([[*state, request.target, request.first, request.last, *[1.0] * WEIGHTS, *opened]])
 
     def _phase(self, row: Numbers, plan: Numbers) -> Phase:
         """Return the phase of a plan, up to the first sample at which it reaches the target."""
@@ -512,22 +522,22 @@ class Demand:
     Attributes:
         literal: the predicate.
         later: number of samples.
-        spare: margin to aim at.
+        margin: robustness margin to aim at.
     """
 
     literal: ir.Predicate
     later: int
-    spare: float
+    margin: float
 
 
 def _demands(formula: ir.Formula, known: frozenset[str], later: int = 0) -> list[tuple[Demand, ...]]:
-    """Return alternatives of what a target demands, conjunctions; what cannot be said is left out.
+    """Return the alternatives of a target, each a conjunction of demands; other parts are left out.
 
     Of an `always`, the first, the middle and the last sample count.
     """
     match formula:
         case ir.Predicate() if columns_in(formula) <= known:
-            return [(Demand(formula, later, SPARE),)]
+            return [(Demand(formula, later, LEAST_MARGIN),)]
         case ir.BoolOp("or", items):
             return [each for item in items for each in _demands(item, known, later)][:OPTIONS]
         case ir.BoolOp("and", items):
@@ -568,11 +578,11 @@ def levels(*ends: Numbers, most: int) -> Numbers:
 
 
 class _Shortfall:
-    """Lack of a state for a formula, as a formula whose robustness is 0 where nothing is missing.
+    """Shortfall of a formula in a state, as a formula whose robustness is 0 where the state satisfies it.
 
-    What a conjunction lacks is the sum over its items, each in units of its typical size: unlike a minimum,
-    it becomes less with every item that comes nearer. Predicates that read the same states form a group;
-    each group has a weight, which is a state of the kernel.
+    The shortfall of a conjunction is the sum over its items, each in units of its typical size: unlike a
+    minimum, it decreases with every item that comes nearer. Predicates that read the same states form a
+    group; each group has a weight, which is a state of the kernel.
 
     Args:
         scale: function that returns the typical size of the margin of a predicate.
@@ -583,25 +593,25 @@ class _Shortfall:
         self._groups: dict[frozenset[str], int] = {}
 
     def of(self, formula: ir.Formula) -> ir.Formula:
-        """Return a formula whose robustness is the negative of what `formula` lacks."""
+        """Return a formula whose robustness is the negative shortfall of `formula`."""
         if isinstance(formula, ir.Truth):
             return formula
         if not all(isinstance(node, (ir.Truth, ir.Predicate, ir.BoolOp)) for node in nodes(formula)):
             return map_children(formula, formulas=self.of)
-        return ir.Predicate(ir.Op("neg", (self._lack(formula),)))
+        return ir.Predicate(ir.Op("neg", (self._shortfall(formula),)))
 
-    def _lack(self, formula: ir.Formula) -> ir.Num:
+    def _shortfall(self, formula: ir.Formula) -> ir.Num:
         match formula:
             case ir.Predicate(num, sign, strict):
                 margin = num if sign > 0 else ir.Op("neg", (num,))
-                spare = ir.Op("sub", (margin, ir.Const(SPARE))) if strict else margin
+                tightened = ir.Op("sub", (margin, ir.Const(LEAST_MARGIN))) if strict else margin
                 share = ir.Const(1.0 / self._scale(formula))
                 group = self._groups.setdefault(columns_in(formula), len(self._groups)) % WEIGHTS
                 weight = ir.Op("mul", (ir.Signal(WEIGHT.format(group)), share))
-                return ir.Op("mul", (ir.Op("relu", (ir.Op("neg", (spare,)),)), weight))
+                return ir.Op("mul", (ir.Op("relu", (ir.Op("neg", (tightened,)),)), weight))
             case ir.BoolOp(op, items):
                 name = "add" if op == "and" else "min"
-                return reduce(lambda a, b: ir.Op(name, (a, b)), map(self._lack, items))
+                return reduce(lambda a, b: ir.Op(name, (a, b)), map(self._shortfall, items))
             case ir.Truth(value):
                 return ir.Const(0.0 if value else 1.0)
             case _:
@@ -609,7 +619,7 @@ class _Shortfall:
 
 
 def _decisive(formula: ir.Formula) -> ir.Formula:
-    """Return a formula whose robustness is +inf or -inf: whether it holds counts, not by how much."""
+    """Return the formula with robustness +inf where it holds, and -inf elsewhere."""
     if isinstance(formula, ir.Predicate):
         return replace(formula, guard=True)
     return map_children(formula, formulas=_decisive)

@@ -1,4 +1,4 @@
-"""Relaxed plans: the jumps and waits that pending conditions still need, as if nothing were ever undone.
+"""Relaxed plans: the jumps and waits that pending conditions still need, ignoring what steps undo.
 
 The state of a hybrid system has parts that only jumps change (modes, counters), parts that flow by themselves
 depending on the modes (timers), and parts that the controls drive. A condition on the first needs jumps that
@@ -205,7 +205,7 @@ class Relaxation:
         return RelaxedState(self, values[:, 0], met[:, 0], better)
 
     def tree(self, formula: ir.Formula) -> Tree:
-        """Return what a formula needs, by identity where the same object was asked for before."""
+        """Return the tree of a formula; results are cached by object identity."""
         found = self._trees.get(id(formula))
         if found is None:
             found = self._trees[id(formula)] = formula, self._as_tree(formula)
@@ -226,14 +226,14 @@ class Relaxation:
                 return 0.0
 
     def number(self, literal: ir.Formula) -> int | None:
-        """Index of a literal, by identity where the same object was asked for before."""
+        """Index of a literal; results are cached by object identity."""
         found = self._known.get(id(literal))
         if found is None:
             found = self._known[id(literal)] = literal, self._number.get(literal)
         return found[1]
 
     def runs_by_itself(self, step: int) -> bool:
-        """True if nothing but modes decides whether the timer runs for which a step waits."""
+        """True if the timer of a waiting step depends on modes alone."""
         return all(
             self._sort(part) == "mode" for part in self._literals_of(self._ways[self.steps[step].condition])
         )
@@ -247,7 +247,7 @@ class Relaxation:
         return max(lack, 0.0) / max(self._rates.get(literal, 0.0), PROBE)
 
     def _group(self, formula: ir.Formula, samples: float) -> Iterator[RelaxedStep]:
-        """Yield the motion that makes a conjunction true on which a timer runs; none if only modes do.
+        """Yield the motion that satisfies the conjunction under which a timer runs; none if modes suffice.
 
         It stays true for the number of samples that the timer needs, unless these are many.
         """
@@ -261,7 +261,7 @@ class Relaxation:
     def _step(
         self, jump: JumpDecl, clauses: Sequence[Sequence[ir.Formula]], orders: Sequence[ir.Until]
     ) -> RelaxedStep:
-        """Return a jump as a step, with what safety requirements and orders ask when it happens."""
+        """Return a jump as a step, with the conditions that safety and orders add to its guard."""
         fixed = {each.name: each.value for each in jump.resets if isinstance(each.value, ir.Const)}
         extra = [self._left(clause, fixed) for clause in clauses]
         for order in orders:
@@ -276,7 +276,7 @@ class Relaxation:
         return RelaxedStep(joined("and", (free, *extra)), joined("and", effects), 0, jump)
 
     def _left(self, clause: Sequence[ir.Formula], fixed: Mapping[str, ir.Num]) -> ir.Formula:
-        """Return what a clause, a disjunction, asks before a jump that sets the states `fixed`."""
+        """Return the condition of a clause, a disjunction, before a jump that sets the states `fixed`."""
         if not any(columns_in(item) & fixed.keys() for item in clause):
             return YES
         if any(isinstance(node, (ir.PastTemporal, ir.Since)) for item in clause for node in nodes(item)):

@@ -65,7 +65,7 @@ class Progression:
         return ir.Predicate(ir.Signal(self._names.get(formula, "?")))
 
     def after(self, env: Mapping[str, NDArray[np.float64]]) -> tuple[ir.Formula, ...]:
-        """Return what is left of each formula after a prefix, or false for a formula that is lost.
+        """Return the residual of each formula after a prefix; false for a formula that the prefix violates.
 
         Args:
             env: states along the prefix, name -> (k + 1, 1).
@@ -77,7 +77,7 @@ class Progression:
             *evaluate(self._back, env, ops=NUMPY, count=count),
         )
         shape = self._steps + 1, 2
-        unknown = np.broadcast_to([-1.0, 1.0], shape)  # what follows is the worst, or the best
+        unknown = np.broadcast_to([-1.0, 1.0], shape)  # the worst or best continuation
         signals = {"?": unknown}
         for name, value in zip(self._names.values(), values, strict=True):
             signals[name] = unknown.copy()
@@ -96,7 +96,7 @@ class _Residual:
     """Remainder of formulas after the sample `now`.
 
     Attributes:
-        known: whether each formula, by identity, is met if the worst follows, or the best, (T + 1, 2).
+        known: whether each formula, by identity, is met by the worst and best continuation, (T + 1, 2).
         now: last sample of the prefix.
         steps: number of steps of a whole trajectory.
     """
@@ -106,7 +106,7 @@ class _Residual:
     steps: int
 
     def at(self, formula: ir.Formula, sample: int) -> ir.Formula:
-        """Return what is left of `formula`, asked at `sample`, after sample `now`."""
+        """Return the residual after sample `now` of `formula` at `sample`."""
         worst, best = self.known[id(formula)][sample]
         if worst or not best:
             return ir.Truth(bool(worst))

@@ -1,6 +1,6 @@
 """Search for whole plans as sequences of phases, for missions whose goals need many steps in order.
 
-A node is a prefix of a plan. What is left of the requirements after it gives the pending goals. A relaxed
+A node is a prefix of a plan. The residual of the requirements gives its pending goals. A relaxed
 plan for them (`relaxation`) gives the jumps, waits and goals to try next, and the time that they take. Each
 is tried by a short search for a phase that reaches it and stays safe until then (`phases`). A phase that is
 found, appended to the prefix, is a further node. The node of least estimated total time is extended first.
@@ -28,7 +28,7 @@ from stlc.compile.ir.traverse import nodes
 from stlc.controller.search.newton import values_of
 from stlc.controller.search.sequences.landmarks import Landmarks
 from stlc.controller.search.sequences.obligations import Obligations
-from stlc.controller.search.sequences.phases import TAIL, UNSURE, Ask, Phase, Phases
+from stlc.controller.search.sequences.phases import TAIL, UNSURE, Phase, PhaseRequest, Phases
 from stlc.controller.search.sequences.relaxation import Relaxation, RelaxedState, clauses_of, present
 from stlc.controller.search.sequences.residuals import NO, YES, Progression, looks_ahead
 from stlc.controller.search.starts import extremes
@@ -100,16 +100,16 @@ class Node:
     Attributes:
         states: states along the prefix, (k + 1, n).
         plan: controls, (k, m).
-        left: what is left of the obligations.
+        left: residual of the obligations.
         goals: goals that are pending.
-        steps: jumps and waits of a relaxed plan for what is left.
-        missing: number of these steps, and of the goals that are left.
+        steps: jumps and waits of a relaxed plan for the residual.
+        missing: number of these steps, and of the remaining goals.
         time: time that these steps take, in steps of the plan.
         relaxed: relaxed plans from the last state.
         tries: targets of the last phases, if these came nearer to them without reaching one.
         since: number of steps since the last goal or step was reached, which have led to landmarks.
         tail: controls after the prefix, (j, m), with which the last phase goes on.
-        asks: requests for phases from here that are left; none before the first of them.
+        requests: remaining requests for phases from here; empty before the first of them.
     """
 
     states: Numbers
@@ -123,7 +123,7 @@ class Node:
     tries: tuple[int, ...] = ()
     since: int = 0
     tail: Numbers | None = None
-    asks: tuple[Ask, ...] = ()
+    requests: tuple[PhaseRequest, ...] = ()
 
 
 class Sequences:
@@ -279,8 +279,8 @@ class Sequences:
     def plans(self, state: Tensor, random: Generator, effort: int = 1) -> Iterator[Tensor | None]:
         """Search for plans from `state`, (n,): yield each that is complete, (T, m), and None after each try.
 
-        The plans keep the safety requirements and meet the goals as far as phases see them; whether they
-        satisfy the specification is to be judged. `effort` is a factor of the tries for each phase.
+        The plans satisfy the safety requirements and goals in the form that phases use; whether they satisfy
+        the specification has to be judged. `effort` is a factor of the tries for each phase.
         """
         if self._phases is None:
             return
@@ -309,8 +309,8 @@ class Sequences:
             return self._ended(node)
 
         add(self._node(progression, state.numpy()[None], self._nothing))
-        for begun in self._begun(state):
-            yield add(begun)
+        for earlier in self._reopened(state):
+            yield add(earlier)
         tries = TRIES * effort * (FEWEST + heap[0][2].missing) if heap else 0.0
         node: Node | None = None
         try:
@@ -318,19 +318,19 @@ class Sequences:
                 node = heapq.heappop(heap)[2]
                 if not node.missing:
                     yield self._ended(node)
-                asks = deque(node.asks or self._asks(node))
-                while asks:
+                requests = deque(node.requests or self._requests(node))
+                while requests:
                     tries -= 1
-                    grown = self._try(progression, node, asks, random, effort)
-                    node = replace(node, asks=tuple(asks))
+                    grown = self._try(progression, node, requests, random, effort)
+                    node = replace(node, requests=tuple(requests))
                     yield None if grown is None else add(grown)
                 node = None
         finally:
-            left = [] if node is None or not node.asks else [node]
+            left = [] if node is None or not node.requests else [node]
             self._open = [*self._open, *(each for _, _, each in sorted(heap)[:OPEN]), *left][-OPEN:]
 
-    def _begun(self, state: Tensor) -> list[Node]:
-        """Return what is left, from `state`, (n,), of nodes that earlier searches have not extended."""
+    def _reopened(self, state: Tensor) -> list[Node]:
+        """Return the nodes that earlier searches have not extended, continued from `state`, (n,)."""
         found, others = list[Node](), list[Node]()
         for node in self._open:
             same = np.isclose(node.states[1:SOON], state.numpy()).all(1).nonzero()[0]
@@ -343,32 +343,39 @@ class Sequences:
         return found
 
     def _try(
-        self, progression: Progression, node: Node, asks: deque[Ask], random: Generator, effort: int
+        self,
+        progression: Progression,
+        node: Node,
+        requests: deque[PhaseRequest],
+        random: Generator,
+        effort: int,
     ) -> Node | None:
-        """Search for the phase that is asked for first, and return the node that it leads to, if any.
+        """Search for the first requested phase, and return the node that it leads to, if any.
 
-        Where requests for a target have failed that has landmarks, the next landmark is asked for.
+        If requests for a target with landmarks have failed, the next landmark is requested instead.
         """
         assert self._phases is not None
-        ask, state = asks.popleft(), node.states[-1]
-        marks = self._marks[ask.target] if ask.target < len(self._marks) else ()
-        missing = [mark for mark in marks if self._phases.margin(state, replace(ask, target=mark)) < -UNSURE]
+        request, state = requests.popleft(), node.states[-1]
+        marks = self._marks[request.target] if request.target < len(self._marks) else ()
+        missing = [
+            mark for mark in marks if self._phases.margin(state, replace(request, target=mark)) < -UNSURE
+        ]
         mark = None
         if missing and missing[-1] == marks[-1]:
             last = min(self.steps, self.task.horizon - len(node.plan))
-            mark = replace(ask, target=missing[0], first=0, last=last, after=0)
-        if mark is None or self._merit[ask.target] >= 0:
-            phase = self._phases.reach(state, ask, random, effort)
-            found = self._grown(progression, node, ask, phase)
-            if found is None and ask.target == self._idle:
-                asks.append(replace(ask, target=self._idle - 1, first=0))
+            mark = replace(request, target=missing[0], first=0, last=last, after=0)
+        if mark is None or self._merit[request.target] >= 0:
+            phase = self._phases.reach(state, request, random, effort)
+            found = self._grown(progression, node, request, phase)
+            if found is None and request.target == self._idle:
+                requests.append(replace(request, target=self._idle - 1, first=0))
             if mark is None:
                 return found
-            self._merit[ask.target] += 1 if found else -1
+            self._merit[request.target] += 1 if found else -1
             if found is not None:
                 return found
-        asks.appendleft(mark)
-        return self._try(progression, node, asks, random, effort)
+        requests.appendleft(mark)
+        return self._try(progression, node, requests, random, effort)
 
     def _node(
         self,
@@ -417,8 +424,8 @@ class Sequences:
                 if (target := self._target.get(body)) is not None:
                     yield Goal(target, body, window.lo, window.lo)
 
-    def _asks(self, node: Node) -> list[Ask]:
-        """Return what to try from a node."""
+    def _requests(self, node: Node) -> list[PhaseRequest]:
+        """Return the requests to try from a node."""
         rest = self.task.horizon - len(node.plan)
         if not rest:
             return []
@@ -428,17 +435,17 @@ class Sequences:
             for i, until in enumerate(self._untils)
             if any(isinstance(part, ir.Until) and part.left is until.left for part in node.left)
         )
-        idle = Ask(self._idle, most, most, opened)
+        idle = PhaseRequest(self._idle, most, most, opened)
         if not node.missing:
             return [idle]
-        found: list[Ask] = []
+        found: list[PhaseRequest] = []
         due = min((goal.last for goal in node.goals if node.relaxed.cost(goal.condition)), default=rest)
         for goal in sorted(node.goals, key=lambda goal: goal.last):
             if goal.first <= due and node.relaxed.ready(goal.condition):
                 after = reach(goal.condition).future
                 last = min(goal.last, most - after)
                 first = goal.first if goal.first <= last else 0
-                found.append(Ask(goal.target, first, last, opened, after))
+                found.append(PhaseRequest(goal.target, first, last, opened, after))
                 if goal.first > 1 and not node.relaxed.cost(goal.condition):
                     pause = min(most, goal.first - 1)
                     found.append(replace(idle, first=pause, last=pause))
@@ -451,24 +458,26 @@ class Sequences:
                 found.append(idle)
             else:
                 first = first if first <= most - delay else 0
-                found.append(Ask(self._first_step + step, first, most - delay, opened, delay))
+                found.append(PhaseRequest(self._first_step + step, first, most - delay, opened, delay))
         return [each for each in dict.fromkeys(found) if each.last >= each.first]
 
-    def _grown(self, progression: Progression, node: Node, ask: Ask, phase: Phase) -> Node | None:
+    def _grown(
+        self, progression: Progression, node: Node, request: PhaseRequest, phase: Phase
+    ) -> Node | None:
         """Return the node of a phase; None if it comes no nearer to its target."""
         assert self._phases is not None
-        wanted = ask.target < len(self._marks)
-        length, tries, since = phase.sample + ask.after, (*node.tries, ask.target), 0
+        wanted = request.target < len(self._marks)
+        length, tries, since = phase.sample + request.after, (*node.tries, request.target), 0
         if phase.margin < -UNSURE:
-            now = self._phases.margin(node.states[-1], ask)
-            if (wanted and self._marks[ask.target]) or phase.margin < (1.0 - NEARER) * now:
+            now = self._phases.margin(node.states[-1], request)
+            if (wanted and self._marks[request.target]) or phase.margin < (1.0 - NEARER) * now:
                 return None
             length = phase.sample
         elif wanted:
-            if not ask.first:
+            if not request.first:
                 self._spent, self._made = self._spent + node.since + length, self._made + 1
             tries = ()
-        elif ask.target == self._idle:
+        elif request.target == self._idle:
             tries = ()
         else:
             since = node.since + length
@@ -515,7 +524,7 @@ def _needed(formulas: Sequence[ir.Formula]) -> tuple[ir.Formula, ...]:
 
 
 def _moves(formula: ir.Formula, relaxed: RelaxedState) -> float:
-    """Number of goals in what is left of a formula; inf if one of them is out of reach."""
+    """Number of goals in the residual of a formula; inf if one of them is out of reach."""
     match formula:
         case ir.BoolOp("and", items):
             return sum(_moves(item, relaxed) for item in items)

@@ -13,7 +13,7 @@ from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan, planner_named
 from stlc.controller.search.planner_policy import PlannerPolicy
-from stlc.controller.search.sequences.phases import Ask
+from stlc.controller.search.sequences.phases import PhaseRequest
 from stlc.controller.search.sequences.sequences import Sequences
 from stlc.controller.world import world_type
 
@@ -49,8 +49,8 @@ def test_a_phase_reaches_its_target_and_stays_safe(handover: Task) -> None:
     if sequences._phases is None:
         pytest.skip("no C compiler")
     step = next(filter(root.relaxed.possible, root.steps))
-    ask = Ask(sequences._first_step + step, 0, sequences.steps - 1)
-    phase = sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0))
+    request = PhaseRequest(sequences._first_step + step, 0, sequences.steps - 1)
+    phase = sequences._phases.reach(x0.numpy(), request, np.random.default_rng(0))
     assert phase.margin >= 0.0
     names = handover.system.names
     p, q = (phase.states[: phase.sample + 2, names.index(name)] for name in "pq")
@@ -59,7 +59,7 @@ def test_a_phase_reaches_its_target_and_stays_safe(handover: Task) -> None:
     part = phase.states[:, names.index("part")]
     assert part[phase.sample] == 0.0
     assert part[phase.sample + 1] == 1.0  # the jump happens in the next step
-    again = sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0))
+    again = sequences._phases.reach(x0.numpy(), request, np.random.default_rng(0))
     assert np.array_equal(phase.plan, again.plan)
 
 
@@ -84,8 +84,8 @@ def test_a_phase_is_short_where_safety_binds_the_way_to_its_target(tmp_path: Pat
     sequences = Sequences(task, x0)
     if sequences._phases is None:
         pytest.skip("no C compiler")
-    ask = Ask(sequences._first_step, 0, sequences.steps - 1)
-    found = [sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(seed)) for seed in range(6)]
+    request = PhaseRequest(sequences._first_step, 0, sequences.steps - 1)
+    found = [sequences._phases.reach(x0.numpy(), request, np.random.default_rng(seed)) for seed in range(6)]
     assert min(phase.margin for phase in found) >= 0.0
     assert max(phase.sample for phase in found) <= 18
 
@@ -115,8 +115,8 @@ def test_a_phase_begins_with_what_reached_another_target(tmp_path: Path) -> None
     tried = []
     for target in (0, 1):
         before = sequences._phases.tried
-        ask = Ask(sequences._first_step + target, 0, sequences.steps - 1)
-        assert sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0)).margin >= 0.0
+        request = PhaseRequest(sequences._first_step + target, 0, sequences.steps - 1)
+        assert sequences._phases.reach(x0.numpy(), request, np.random.default_rng(0)).margin >= 0.0
         tried.append(sequences._phases.tried - before)
     assert tried[1] < 0.5 * tried[0], tried
 
@@ -129,9 +129,9 @@ def test_a_target_out_of_reach_is_approached(handover: Task) -> None:
     root = sequences.root(x0)
     assert root is not None
     step = next(filter(root.relaxed.possible, root.steps))
-    ask = Ask(sequences._first_step + step, 0, 1)
-    phase = sequences._phases.reach(x0.numpy(), ask, np.random.default_rng(0))
-    assert sequences._phases.margin(x0.numpy(), ask) <= phase.margin < 0.0
+    request = PhaseRequest(sequences._first_step + step, 0, 1)
+    phase = sequences._phases.reach(x0.numpy(), request, np.random.default_rng(0))
+    assert sequences._phases.margin(x0.numpy(), request) <= phase.margin < 0.0
 
 
 @pytest.mark.parametrize(
@@ -179,10 +179,10 @@ def test_a_search_goes_on_where_the_last_one_ended(handover: Task) -> None:
     search.close()
     later = handover.rollout(x0[None], best[None])[0, 1]
     longest = max(len(node.plan) for node in sequences._open)
-    begun = sequences._begun(later)
-    assert max(len(node.plan) for node in begun) == longest - 1
-    assert np.allclose(begun[-1].states[0], later.numpy())
-    assert sequences._begun(x0) == []
+    earlier = sequences._reopened(later)
+    assert max(len(node.plan) for node in earlier) == longest - 1
+    assert np.allclose(earlier[-1].states[0], later.numpy())
+    assert sequences._reopened(x0) == []
 
 
 @pytest.mark.slow
