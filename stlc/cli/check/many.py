@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from stlc.compile.semantics.tolerance import Status
     from stlc.controller.parallel.workers import LostCall
     from stlc.monitor.check import Question
-    from stlc.monitor.facts.fact import Fact
     from stlc.monitor.judgement import RequirementVerdict, Verdict
 
 SATISFIED, VIOLATED, INVALID, INCONCLUSIVE = 0, 1, 3, 4
@@ -194,7 +193,11 @@ def _judged(works: Sequence[Work], jobs: int, cluster: str | None) -> Iterator[t
     texts: Sequence[Path] = ()
     if cluster is not None:
         sent = [replace(work, name=_seen(work)) for work in works]
-        texts = _texts(works[0].question)
+        from stlc.controller.parallel.inputs import input_files
+
+        question = works[0].question
+        if question.spec is not None:
+            texts = input_files(question.spec, question.system, question.overrides)
 
     def read(work: Work) -> CallFiles:
         return CallFiles((*texts, Path(work.name)), () if work.out is None else (work.out,))
@@ -221,14 +224,6 @@ def _seen(work: Work) -> str:
     with suppress(StlcError):
         return str(seen_at(work.name, work.runs))
     return work.name
-
-
-def _texts(question: Question) -> Sequence[Path]:
-    """Files of the specification and of what it names."""
-    from stlc.controller.parallel.inputs import input_files
-
-    spec = question.spec
-    return () if spec is None else input_files(spec, question.system, question.overrides)
 
 
 def safe_outcomes(work: Work) -> list[Outcome]:
@@ -341,7 +336,8 @@ def _per_requirement(names: Sequence[str], outcomes: Sequence[Outcome]) -> str:
 
 def _about_recordings(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Yield a paragraph with the number of files in which each fact about a recording is true, if any is."""
-    counts = Counter((fact.code, fact.signal) for outcome in outcomes for fact in _remarks(outcome))
+    verdicts = (outcome.verdict for outcome in outcomes if outcome.verdict is not None)
+    counts = Counter((fact.code, fact.signal) for verdict in verdicts for fact in verdict.remarks)
     total = f"of {len(outcomes):,} files"
     lines = [
         f"  {f'`{visible(signal)}`: ' if signal else ''}{CODES[code]}, in {count:,} {total}"
@@ -349,10 +345,6 @@ def _about_recordings(outcomes: Sequence[Outcome]) -> Iterator[str]:
     ]
     if lines:
         yield "\n".join(lines)
-
-
-def _remarks(outcome: Outcome) -> tuple[Fact, ...]:
-    return () if outcome.verdict is None else outcome.verdict.remarks
 
 
 def out_paths(out: Path | None, names: Sequence[str]) -> list[Path | None]:

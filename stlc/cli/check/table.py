@@ -52,7 +52,11 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
     Raises:
         MissingError: R201, the disk is full, or the user may not write there.
     """
-    rows = [tuple(map(_encodable, row)) for outcome in outcomes for row in _rows(outcome)]
+    rows = [
+        tuple(encodable(value) if isinstance(value, str) else value for value in row)
+        for outcome in outcomes
+        for row in _rows(outcome)
+    ]
     if path.suffix.lower() == ".parquet":
         from stlc.trace.formats.parquet import write_columns
 
@@ -65,10 +69,6 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
     writer.writerow(COLUMNS)
     writer.writerows(map(_cell, row) for row in rows)
     write_atomic(path, text.getvalue())
-
-
-def _encodable(value: Any) -> Any:
-    return encodable(value) if isinstance(value, str) else value
 
 
 def _cell(value: Any) -> Any:

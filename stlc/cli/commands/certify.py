@@ -105,16 +105,13 @@ def _finding_lines(result: Mapping[str, Any]) -> Iterator[str]:
     if not shown:
         return
     yield f"  {findings['count']:,} simulation{'s' * (findings['count'] > 1)} failed:"
-    yield from (f"    - {_finding_text(each)}" for each in shown)
+    for each in shown:
+        at = "" if each["time"] is None else f" at t = {each['time']:.10g} s"
+        yield f"    - seed {each['seed']}: {each['reason']}{at}: {visible(each['message'])}"
     if findings["count"] > len(shown):
         yield f"    - and {findings['count'] - len(shown):,} more"
     where = ("--plant", operand(result["system_file"]), "--seeds", str(shown[0]["seed"]))
     yield f"  again        {shell(('stlc', 'simulate', operand(result['spec_file']), *where))}"
-
-
-def _finding_text(each: Mapping[str, Any]) -> str:
-    at = "" if each["time"] is None else f" at t = {each['time']:.10g} s"
-    return f"seed {each['seed']}: {each['reason']}{at}: {visible(each['message'])}"
 
 
 def _compared_lines(result: CertificateCheck) -> Iterator[str]:

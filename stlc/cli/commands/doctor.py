@@ -34,7 +34,16 @@ def doctor(
 
     Exit code: 0, or 5 if a required package is missing.
     """
-    findings = [*_python(), *_packages(), *_devices(quick=quick), *_tools(), *_plugins(quick=quick)]
+    from stlc.version import __version__
+
+    completion = _completion()
+    findings = [
+        _finding("stlc", "ok", f"{__version__} in {Path(__file__).parents[2]}"),
+        _finding("python", "ok", ".".join(map(str, sys.version_info[:3]))),
+        *(*_packages(), *_devices(quick=quick), _cache(), _compiler()),
+        _finding("completion", "ok" if completion else "off", completion or "stlc --install-completion"),
+        *_plugins(quick=quick),
+    ]
     missing = [finding["name"] for finding in findings if finding["state"] == "missing"]
 
     def show() -> None:
@@ -50,13 +59,6 @@ def _finding(name: str, state: Literal["ok", "missing", "off"], detail: str) -> 
     The state "off" means that the item is missing, but only some commands need it.
     """
     return {"name": name, "state": state, "detail": detail}
-
-
-def _python() -> Iterator[InstallationFinding]:
-    from stlc.version import __version__
-
-    yield _finding("stlc", "ok", f"{__version__} in {Path(__file__).parents[2]}")
-    yield _finding("python", "ok", ".".join(map(str, sys.version_info[:3])))
 
 
 def _packages() -> Iterator[InstallationFinding]:
@@ -93,13 +95,6 @@ def _devices(*, quick: bool) -> Iterator[InstallationFinding]:
         yield _finding("cuda", "ok", names)
     else:
         yield _finding("cuda", "off", "no device; everything runs on the processor")
-
-
-def _tools() -> Iterator[InstallationFinding]:
-    yield _cache()
-    yield _compiler()
-    installed = _completion()
-    yield _finding("completion", "ok" if installed else "off", installed or "stlc --install-completion")
 
 
 def _plugins(*, quick: bool) -> Iterator[InstallationFinding]:

@@ -72,7 +72,9 @@ def falsify(
 
     def show() -> None:
         show_diagnostics(lost)
-        emit("\n".join(_lines(found)))
+        failed = bool(found.failures)
+        lines = (line for each in found.requirements for line in _of_requirement(each, failed=failed))
+        emit("\n".join((*lines, *_finding_lines(found.findings))))
 
     return Answer(found, show, code, lost)
 
@@ -98,13 +100,6 @@ def _again(found: ReplayedFinding) -> Iterator[str]:
     before = "as before" if found.identical else f"before: {visible(found.stored_reason)}"
     yield f"the simulation fails, {before}; {_told(found.reason, found.time, found.message or '')}"
     yield from (f"  | {visible(line)}" for line in found.stderr.splitlines()[-MOST_LINES:])
-
-
-def _lines(document: FalsifiedSystem) -> list[str]:
-    lines = []
-    for each in document.requirements:
-        lines.extend(_of_requirement(each, failed=bool(document.failures)))
-    return [*lines, *_finding_lines(document.findings)]
 
 
 def _of_requirement(each: FalsifiedRequirement, *, failed: bool) -> list[str]:

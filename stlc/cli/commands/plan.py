@@ -135,7 +135,12 @@ def plan(
         document = _record(task, result, choice, output, bounds, stopped=bool(signals))
     good = document.satisfied if bounds is None else bounds.guaranteed
     short = good / document.starts < (1.0 if fail_under is None else fail_under)
-    return Answer(document, lambda: emit("\n".join(_lines(document))), signals[0] if signals else int(short))
+
+    def show() -> None:
+        lines = (*_found_lines(document), *_missed_lines(document), *_tube_lines(document))
+        emit("\n".join((*lines, f"trace {document.trace}")))
+
+    return Answer(document, show, signals[0] if signals else int(short))
 
 
 def _target(text: str) -> float:
@@ -176,11 +181,6 @@ def _record(
         str(output),
         tube,
     )
-
-
-def _lines(plans: Plans) -> list[str]:
-    """Lines of text that show the result of `stlc plan`."""
-    return [*_found_lines(plans), *_missed_lines(plans), *_tube_lines(plans), f"trace {plans.trace}"]
 
 
 def _bound(value: float) -> str:

@@ -63,7 +63,12 @@ def check(
 
     decl = _load(system, parse_overrides(set_))
     warnings = _roll_out(decl, steps, seed) if steps else decl.warnings
-    compared = _kinematics(decl) if steps else []
+    compared: list[Comparison] = []
+    robots = [function for function in decl.functions if function.body is not None]
+    if steps and robots:
+        from stlc.dynamics import crosscheck
+
+        compared = [crosscheck.compared(function) for function in robots]
 
     def tell() -> None:
         show_diagnostics(warnings)
@@ -132,20 +137,6 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
     with torch.no_grad():
         system.require_finite(system.rollout(system.sample(_DRAWN, seed=seed), low + share * (high - low)))
     return warnings
-
-
-def _kinematics(decl: SystemDecl) -> list[Comparison]:
-    """Compare the kinematics of robots from URDF files with the package pytorch-kinematics.
-
-    Return one comparison for each kinematic function. Raises SystemFileError (S208) if stlc and the package
-    give different results.
-    """
-    robots = [function for function in decl.functions if function.body is not None]
-    if not robots:
-        return []
-    from stlc.dynamics.crosscheck import compared
-
-    return [compared(function) for function in robots]
 
 
 def _all_systems() -> Iterator[ListedSystem]:

@@ -137,7 +137,7 @@ def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: Paint, sev
         if previous is not None and number > previous + 1:
             yield f"{' ' * width} {paint('frame', '...')}"
         previous = number
-        row = _Row(source, number, [mark for mark in marks if mark.span.line == number])
+        row = _SourceLine(source, number, [mark for mark in marks if mark.span.line == number])
         yield f"{paint('frame', f'{number:>{width}} |')} {row.text}".rstrip()
         for mark in row.marks:
             style = severity if mark.primary else "secondary"
@@ -146,7 +146,7 @@ def _lines(source: Source, marks: Sequence[_Mark], width: int, paint: Paint, sev
             yield f"{' ' * width} {paint('frame', '|')} {under}{label}"
 
 
-class _Row:
+class _SourceLine:
     """One source line as displayed: tabs expanded, control characters visible, truncated if very long."""
 
     def __init__(self, source: Source, number: int, marks: Sequence[_Mark]) -> None:

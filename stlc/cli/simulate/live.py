@@ -6,7 +6,7 @@ Without a terminal, the view is ten lines of text.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,9 +103,10 @@ class LiveView:
         worst = min(self.monitor.margins.items(), key=lambda each: float(each[1].high.min()))
         name, agent = worst[0], int(worst[1].high.argmin())
         violated = np.any([margin.violated > 0 for margin in self.monitor.margins.values()], axis=0)
+        counts = self.monitor.counts
         parts = (
             self._counter(),
-            f"guard acted in {self._acted()}",
+            f"guard acted in {int(counts[1:].sum()):,} of {int(counts.sum()):,}",
             f"least margin {name} {_signed(float(worst[1].high[agent]))} ({self._agent(agent)})",
             f"violated by {int(violated.sum())} of {len(violated)}",
         )
@@ -132,10 +133,6 @@ class LiveView:
         total = max(int(self.monitor.counts.sum()), 1)
         shares = zip(SOURCES, self.monitor.counts.tolist(), strict=True)
         return "   ".join(f"{name} {percent(count / total)}" for name, count in shares if count)
-
-    def _acted(self) -> str:
-        acted, total = int(self.monitor.counts[1:].sum()), int(self.monitor.counts.sum())
-        return f"{acted:,} of {total:,}"
 
     def _agent(self, row: int) -> str:
         seed, agent = divmod(row, self.monitor.setting.agents)
@@ -201,7 +198,7 @@ class LiveView:
         monitor, moment = self.monitor, self.monitor.moment
         assert moment is not None
         agents = range(monitor.setting.agents)
-        least = _least(monitor.margins)
+        least: NDArray[np.float64] = np.min([each.high for each in monitor.margins.values()], axis=0)
         rows = sorted(sorted(agents, key=lambda row: float(least[row]))[:most])
         states = moment.x[: len(agents)].tolist()
         names = monitor.task.system.signature.columns
@@ -209,8 +206,9 @@ class LiveView:
         cells = []
         for row in rows:
             rho = "" if decision is None else _signed(float(decision.rho[row]))
-            name, margin = _worst(monitor.margins, row)
-            first = (str(row), monitor.decided(row) or "", rho, f"{name} {_signed(margin)}")
+            name, margin = min(monitor.margins.items(), key=lambda each: float(each[1].high[row]))
+            worst = f"{name} {_signed(float(margin.high[row]))}"
+            first = (str(row), monitor.decided(row) or "", rho, worst)
             cells.append([*first, *map(_shown, names, states[row])])
         units = (f"{column.name} {column.unit.text}".strip() for column in names)
         lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]
@@ -245,14 +243,3 @@ def _shown(column: Column, value: float) -> str:
 def _signed(value: float) -> str:
     """Text of a robustness value with its sign; a value within rounding errors of zero is "0"."""
     return "0" if abs(value) <= TOLERANCE else signed(value)
-
-
-def _least(margins: Mapping[str, Margin]) -> NDArray[np.float64]:
-    """Upper bounds on the least robustness over all requirements, (agents of all seeds,)."""
-    least: NDArray[np.float64] = np.min([margin.high for margin in margins.values()], axis=0)
-    return least
-
-
-def _worst(margins: Mapping[str, Margin], row: int) -> tuple[str, float]:
-    name = min(margins, key=lambda each: float(margins[each].high[row]))
-    return name, float(margins[name].high[row])

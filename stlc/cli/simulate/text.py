@@ -43,8 +43,8 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     yield from _starts(document)
     yield from _wrong(document.get("errors", {}))
     if document.get("margin"):
-        spared = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
-        yield f"  the guard asks for a margin: {spared}"
+        margins = ", ".join(f"{name} {margin:.3g}" for name, margin in document["margin"].items())
+        yield f"  robustness margins of the guard: {margins}"
     yield ""
     yield from _drives(document)
     planners = document.get("planners", {})
@@ -60,7 +60,7 @@ def screen(document: Record, *, windows: bool = False) -> Iterator[str]:
     if windows and document.get("safety", True):
         yield f"  {_unsafe(last['unsafe'], seeds * agents)}"
     if windows:
-        yield from _foreseen(last["metrics"].get("foreseen"))
+        yield from _model_consistent(last["metrics"].get("foreseen"))
     if document.get("scenarios"):
         yield from compared(document, windows=windows)
 
@@ -124,11 +124,11 @@ def _broken(guard: str, drives: Record, judged: str) -> Iterator[str]:
         yield f"{violated}: {more} more, see eval/simulate.json"
 
 
-def _foreseen(foreseen: Record | None) -> Iterator[str]:
-    if foreseen and foreseen["mean"] > 0:
-        share = _part(foreseen["mean"])
-        beyond = "; others hold what no plan could know" if foreseen["mean"] < 1 else ""
-        yield f"  model-consistent: the {share} of starts from which the world did as the model says{beyond}"
+def _model_consistent(share: Record | None) -> Iterator[str]:
+    if share and share["mean"] > 0:
+        part = _part(share["mean"])
+        beyond = "; the others contain exogenous events" if share["mean"] < 1 else ""
+        yield f"  model-consistent: the {part} of starts from which the world did as the model says{beyond}"
 
 
 def _wrong(errors: Mapping[str, Any]) -> Iterator[str]:
