@@ -1,11 +1,9 @@
-"""Text and options of statistical bounds."""
+"""Statistical bounds as text."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from stlc.diagnostics import usage
 from stlc.escape import visible
@@ -15,16 +13,6 @@ from stlc.units import floored, raised
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment
-
-CertifyOption = Annotated[
-    float | None,
-    typer.Option(
-        "--certify",
-        metavar="SHARE",
-        help="Bound the share that satisfies everything, with 95 % confidence; the exit code says whether it "
-        "is at least SHARE.",
-    ),
-]
 
 
 def require_claim(share: float | None, fail_under: float | None) -> None:

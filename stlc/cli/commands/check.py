@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from stlc.activity import PULSE
-from stlc.cli.certify.text import CertifyOption, bounds_lines, require_claim
 from stlc.cli.check import options as given
 from stlc.cli.framework.options import FailUnderOption, JsonOption, require_separate
 from stlc.cli.framework.output import QUIET, Answer, emit, say, show_diagnostics, wants_color
@@ -37,6 +36,15 @@ if TYPE_CHECKING:
 NAME = "standard input"
 MOST_SAMPLES = 2**31 - 1
 """Samples of a chunk at most, as readers count them."""
+CertifyOption = Annotated[
+    float | None,
+    typer.Option(
+        "--certify",
+        metavar="SHARE",
+        help="Bound the share that satisfies everything, with 95 % confidence; the exit code says whether it "
+        "is at least SHARE.",
+    ),
+]
 
 
 @command(
@@ -104,6 +112,7 @@ def check(
     each time; with --certify 0 certified, 1 refuted, 4 undecided; with --again 0 the same result, 1 another;
     with -q nothing is printed.
     """
+    from stlc.cli.certify.text import require_claim
     from stlc.cli.check.junit import junit as junit_xml
     from stlc.cli.check.many import Work, all_outcomes, exit_code, out_paths
     from stlc.cli.check.table import require_table, write_table
@@ -295,6 +304,8 @@ def _print(
         if line:
             emit(line)
     if assurance is not None:
+        from stlc.cli.certify.text import bounds_lines
+
         emit("\n".join(["", *bounds_lines(assurance)]))
     for line in compared:
         emit(line)

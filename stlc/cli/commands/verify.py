@@ -15,7 +15,6 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic
 from stlc.escape import visible
 from stlc.options import given
-from stlc.units import floored
 
 if TYPE_CHECKING:
     from stlc.assurance.verification.verified import Verified
@@ -85,6 +84,8 @@ def _exit_code(found: Verification, fail_under: float | None) -> int:
 
 def _lines(told: Verified) -> Iterator[str]:
     """Lines of text that show the result of `stlc verify`."""
+    from stlc.units import floored
+
     found, modes = told.found, told.modes
     rows = [
         (

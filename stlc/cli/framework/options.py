@@ -53,6 +53,8 @@ def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> Plann
 
     `pairs` are the values `NAME=VALUE` of `--option`. Raises UsageError (U101).
     """
+    from stlc.controller.search.planner_policy import PlannerChoice
+
     options = parse_pairs(pairs, "--option", "NAME=VALUE", "tries=500")
     return PlannerChoice(PLANNERS.chosen(name), options, parse_seconds(budget))
 

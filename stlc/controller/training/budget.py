@@ -18,8 +18,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from stlc.native import cores
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -49,6 +47,8 @@ def processor() -> float:
     It is the larger of two times: the time of this thread, and the time of all threads divided by the number
     of cores. The time of child processes that have ended, such as compilers, is added to it.
     """
+    from stlc.native import cores
+
     ended = os.times()
     mine = max(time.thread_time(), time.process_time() / cores())
     return mine + ended.children_user + ended.children_system
