@@ -95,17 +95,17 @@ def methods_of(task: Task, backup: StagedSearch) -> dict[str, Method]:
     ascent = GradientAscent(task, torch.Generator().manual_seed(SEED), target=target)
     searcher = Searcher(task, torch.Generator().manual_seed(SEED), target=target)
 
-    def local_search(x: Tensor, places: Tensor, tries: int) -> Tensor:
-        return searcher.repair(x.expand(len(places), -1), places, tries=tries, threads=1).plans
+    def local_search(x: Tensor, guesses: Tensor, tries: int) -> Tensor:
+        return searcher.repair(x.expand(len(guesses), -1), guesses, tries=tries, threads=1).plans
 
     def steps_and_search(x: Tensor, plan: Tensor, rest: Tensor) -> Tensor:
-        raised = ascent.rise(x, torch.stack((plan, rest), 1))[0]
-        if float(task.judge(x, raised[:1], states=False).rho) >= target:
-            return raised
-        return torch.cat((raised, local_search(x, raised, SHORT)))
+        refined = ascent.refine(x, torch.stack((plan, rest), 1))[0]
+        if float(task.judge(x, refined[:1], states=False).rho) >= target:
+            return refined
+        return torch.cat((refined, local_search(x, refined, SHORT)))
 
     return {
-        "gradient steps": lambda x, plan, rest: ascent.rise(x, torch.stack((plan, rest), 1))[0],
+        "gradient steps": lambda x, plan, rest: ascent.refine(x, torch.stack((plan, rest), 1))[0],
         "local search": lambda x, plan, rest: local_search(x, torch.cat((plan, rest)), SHORT),
         "long local search": lambda x, plan, rest: local_search(x, torch.cat((plan, rest)), LONG),
         "steps, then search": steps_and_search,

@@ -72,7 +72,7 @@ from stlc.controller.problem.native import motion_of
 
 NO_LIMIT = Limits(seconds=None, paper=None)
 """Limits of a guard's decision without time limits, for reproducible results."""
-SMALL = Limits(seconds=None, tries=200, prefixes=50, drawn=16, places=2, again=200)
+SMALL = Limits(seconds=None, tries=200, prefixes=50, drawn=16, guesses=2, again=200)
 """The same for a cheap decision."""
 
 

@@ -194,7 +194,7 @@ class Limits:
             run before it; lengths with more prefixes are skipped.
         drawn: maximum number of prefixes of one length in the stage "sampled shooting"; if there are more, a
             random sample is used.
-        places: number of plans of the stage "sampled shooting", the best ones, from which local searches
+        guesses: number of plans of the stage "sampled shooting", the best ones, from which local searches
             start.
         again: number of plans that each of these local searches judges.
         rescue: whether the stage "restarts" also searches for a safe plan without the policy. It does so only
@@ -209,7 +209,7 @@ class Limits:
     tries: int = 2000
     prefixes: int = 1000
     drawn: int = 256
-    places: int = 8
+    guesses: int = 8
     again: int = 2000
     rescue: bool = True
     margin: RobustnessMargins = field(default_factory=dict)

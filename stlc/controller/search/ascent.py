@@ -82,34 +82,34 @@ class GradientAscent:
         ]
 
     @torch.no_grad()
-    def rise(self, x: Tensor, places: Tensor, until: float = math.inf) -> Tensor:
+    def refine(self, x: Tensor, guesses: Tensor, until: float = math.inf) -> Tensor:
         """Refine plans and return the two best of each agent, the best first, (agents, 2, T, m) float64.
 
         Args:
             x: states, (agents, n) float64.
-            places: starting plans, (agents, places, T, m); finite. The first is the policy's.
+            guesses: starting plans, (agents, guesses, T, m); finite. The first is the policy's.
             until: deadline, as a reading of `perf_counter()`.
         """
         if len(x) == 0:
-            return places.new_zeros(0, KEPT, *places.shape[2:], dtype=torch.float64)
-        states, plans = x.double().numpy(force=True), places.double().numpy(force=True)
+            return guesses.new_zeros(0, KEPT, *guesses.shape[2:], dtype=torch.float64)
+        states, plans = x.double().numpy(force=True), guesses.double().numpy(force=True)
         parts = [
-            self._risen(states[at : at + AGENTS], plans[at : at + AGENTS], until)
+            self._refined(states[at : at + AGENTS], plans[at : at + AGENTS], until)
             for at in range(0, len(states), AGENTS)
         ]
-        return torch.from_numpy(np.concatenate(parts)).to(places.device)
+        return torch.from_numpy(np.concatenate(parts)).to(guesses.device)
 
-    def _risen(self, x: Numbers, places: Numbers, until: float) -> Numbers:
-        best, value = self._raised(x, self._changed(places), RATES[0], until)
+    def _refined(self, x: Numbers, guesses: Numbers, until: float) -> Numbers:
+        best, value = self._ascended(x, self._changed(guesses), RATES[0], until)
         for at, rate in enumerate(RATES[1:]):
             left = np.flatnonzero(value[:, 0] < APART + self.target)
             if not len(left) or perf_counter() >= until:
                 break
             far = np.broadcast_to(self._far[at], (len(left), *self._far[at].shape))
             starts = np.concatenate((self._changed(best[left]), far), 1)
-            best[left], value[left] = self._raised(x[left], starts, rate, until)
+            best[left], value[left] = self._ascended(x[left], starts, rate, until)
         done = np.flatnonzero(value[:, 0] >= APART + self.target)
-        best[done, 0] = self._eased(x[done], places[done, 0], best[done, 0])
+        best[done, 0] = self._eased(x[done], guesses[done, 0], best[done, 0])
         return best
 
     def _eased(self, x: Numbers, own: Numbers, found: Numbers) -> Numbers:
@@ -126,7 +126,7 @@ class GradientAscent:
         eased: Numbers = tried[np.arange(len(x)), reached.argmax(1)]
         return eased
 
-    def _raised(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
+    def _ascended(self, x: Numbers, plans: Numbers, rate: float, until: float) -> tuple[Numbers, Numbers]:
         """Run one round of gradient ascent from the plans `plans`, (agents, k, T, m).
 
         `x`: states, (agents, n). `rate`: initial step size. `until`: deadline.
@@ -224,8 +224,8 @@ class GradientAscent:
 
     def _changed(self, plans: Numbers) -> Numbers:
         """Return `plans`, (agents, k, T, m), and random perturbations of them: (agents, NEAR, T, m)."""
-        agents, places, *shape = plans.shape
-        changed = plans[:, :, None] + self._changes[: NEAR // places]
+        agents, guesses, *shape = plans.shape
+        changed = plans[:, :, None] + self._changes[: NEAR // guesses]
         changed[:, :, 1:] = self._bounded(changed[:, :, 1:])
         return changed.reshape(agents, -1, *shape)
 

@@ -18,7 +18,7 @@ from stlc.controller.search.ascent import GradientAscent
 from stlc.controller.search.feasibility import safety_task, viable
 from tests.controller.guard.test_prefix_shooting import F64, Constant, failing, grid
 
-QUICK = Limits(seconds=None, tries=256, drawn=30, places=2)
+QUICK = Limits(seconds=None, tries=256, drawn=30, guesses=2)
 
 
 @pytest.mark.parametrize("action", [10.0, -10.0])
@@ -69,24 +69,24 @@ def test_gradient_steps_mend_what_a_short_search_does_not(
     car_task: Task, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     x, plan = failing(car_task, 10.0, 100)
-    limits = Limits(seconds=None, tries=16, drawn=1, places=1, again=16)
+    limits = Limits(seconds=None, tries=16, drawn=1, guesses=1, again=16)
     policy, few = Constant(car_task, 10.0), grid(lengths=(1,))
     found = StagedSearch(car_task, policy, FULL, grid=few, limits=limits).search(x, plan)
-    monkeypatch.setattr(GradientAscent, "rise", _as_they_are)
+    monkeypatch.setattr(GradientAscent, "refine", _as_they_are)
     improved = StagedSearch(car_task, policy, FULL, grid=few, limits=limits).search(x, plan)
     assert (found.rho >= -1e-6).sum() > (improved.rho >= -1e-6).sum() + 5
     assert (found.source[found.rho >= -1e-6] == REPAIRED).all()
 
 
-def _as_they_are(_ascent: GradientAscent, _x: Tensor, places: Tensor, _until: float) -> Tensor:
-    return places
+def _as_they_are(_ascent: GradientAscent, _x: Tensor, guesses: Tensor, _until: float) -> Tensor:
+    return guesses
 
 
 @pytest.mark.apart
 def test_without_a_kernel_it_finds_as_much(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     x, plan = failing(car_task, 10.0, 40)
     x, plan = x[:12], plan[:12]
-    policy, limits = Constant(car_task, 10.0), Limits(seconds=None, tries=64, drawn=5, places=1, again=64)
+    policy, limits = Constant(car_task, 10.0), Limits(seconds=None, tries=64, drawn=5, guesses=1, again=64)
     found = StagedSearch(car_task, policy, FULL, grid=grid(), limits=limits).search(x, plan)
     bare = Task(car_task.compiled, car_task.plain)
     monkeypatch.setitem(bare.__dict__, "native", None)
@@ -97,10 +97,10 @@ def test_without_a_kernel_it_finds_as_much(car_task: Task, monkeypatch: pytest.M
 
 
 def test_whoever_can_be_saved_is_saved(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(GradientAscent, "rise", _as_they_are)
+    monkeypatch.setattr(GradientAscent, "refine", _as_they_are)
     x, plan = failing(car_task, 10.0, 300)
     can = viable(car_task, x)
-    poor = {"seconds": None, "tries": 16, "drawn": 1, "places": 1, "again": 16}
+    poor = {"seconds": None, "tries": 16, "drawn": 1, "guesses": 1, "again": 16}
     policy, few = Constant(car_task, 10.0), grid(lengths=(1,))
     alone = StagedSearch(car_task, policy, FULL, grid=few, limits=Limits(**poor, rescue=False)).search(
         x, plan

@@ -48,23 +48,23 @@ def test_plans_are_mended(car_task: Task, by_torch: bool, monkeypatch: pytest.Mo
     monkeypatch.setattr(ascent, "STEPS", 10)
     x, plan = failing(car_task, 10.0, 120)
     x, plan = x[:16], plan[:16]
-    raised = made(car_task, by_torch=by_torch).rise(x, plan[:, None])
-    assert raised.shape == (len(x), KEPT, car_task.horizon, 1)
-    assert raised.dtype == F64
-    assert (car_task.judge(x, raised[:, 0]).rho >= -1e-6).double().mean() >= 0.5
+    refined = made(car_task, by_torch=by_torch).refine(x, plan[:, None])
+    assert refined.shape == (len(x), KEPT, car_task.horizon, 1)
+    assert refined.dtype == F64
+    assert (car_task.judge(x, refined[:, 0]).rho >= -1e-6).double().mean() >= 0.5
 
 
 def test_it_is_never_worse_than_what_it_begins_with(car_task: Task, rover_task: Task) -> None:
     for task in (car_task, rover_task):
         x = task.sample(60, seed=4, dtype=F64)
         low, high = task.system.control_low.double(), task.system.control_high.double()
-        places = low + (high - low) * torch.rand(
+        guesses = low + (high - low) * torch.rand(
             60, 2, task.horizon, len(low), generator=torch.Generator().manual_seed(1), dtype=F64
         )
-        raised = made(task).rise(x, places)
-        assert (raised >= low).all()
-        assert (raised <= high).all()
-        value, before = worth(task, x, raised), worth(task, x, places)
+        refined = made(task).refine(x, guesses)
+        assert (refined >= low).all()
+        assert (refined <= high).all()
+        value, before = worth(task, x, refined), worth(task, x, guesses)
         assert (value[:, 0] >= torch.minimum(value[:, 1], before.new_tensor(APART + TARGET))).all()
         assert (value[:, 0] >= before.amax(1).clamp(max=APART + TARGET)).all()
         assert (value[:, 0] > before.amax(1) + 0.01).any()
@@ -72,19 +72,19 @@ def test_it_is_never_worse_than_what_it_begins_with(car_task: Task, rover_task: 
 
 def test_no_more_is_changed_than_is_enough(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0, 120)
-    rise = made(car_task)
-    found = rise.rise(x, plan[:, None])[:, 0]
+    refinement = made(car_task)
+    found = refinement.refine(x, plan[:, None])[:, 0]
     good = car_task.judge(x, found).rho >= TARGET
     assert good.double().mean() > 0.6
     less = found + (plan - found) / ascent.SHARES
     changed = (found - plan).abs().amax((1, 2)) > 0.1
     worse = car_task.judge(x, less).rho < TARGET
-    whole = torch.from_numpy(rise._eased(*(part.numpy() for part in (x, plan, found))))
+    whole = torch.from_numpy(refinement._eased(*(part.numpy() for part in (x, plan, found))))
     assert torch.equal(whole[good & worse], found[good & worse])
     assert (good & worse & changed).sum() > 10
     far = torch.full_like(plan, -10.0)
     brake = car_task.judge(x, far).rho >= TARGET
-    eased = torch.from_numpy(rise._eased(*(part[brake].numpy() for part in (x, plan, far))))
+    eased = torch.from_numpy(refinement._eased(*(part[brake].numpy() for part in (x, plan, far))))
     assert (car_task.judge(x[brake], eased).rho >= TARGET).all()
     assert (eased > far[brake]).any()
 
@@ -92,11 +92,11 @@ def test_no_more_is_changed_than_is_enough(car_task: Task) -> None:
 def test_a_direction_turns_round(rover_task: Task) -> None:
     turns = [control.squash == "angle" for control in rover_task.system.decl.controls]
     assert any(turns)
-    rise = made(rover_task)
-    beyond = (rise._high + 0.1 * rise._span) * np.ones((1, 1, rover_task.horizon, 1))
-    bounded = rise._bounded(beyond)
+    refinement = made(rover_task)
+    beyond = (refinement._high + 0.1 * refinement._span) * np.ones((1, 1, rover_task.horizon, 1))
+    bounded = refinement._bounded(beyond)
     for i, turn in enumerate(turns):
-        expected = rise._low[i] + 0.1 * rise._span[i] if turn else rise._high[i]
+        expected = refinement._low[i] + 0.1 * refinement._span[i] if turn else refinement._high[i]
         assert bounded[..., i] == pytest.approx(expected)
 
 
@@ -117,32 +117,32 @@ def test_torch_and_the_kernel_say_the_same(name: str, request: pytest.FixtureReq
 
 def test_who_is_alone_gets_the_same(car_task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     x, plan = failing(car_task, 10.0, 60)
-    rise = made(car_task)
-    together = rise.rise(x, plan[:, None])
+    refinement = made(car_task)
+    together = refinement.refine(x, plan[:, None])
     monkeypatch.setattr(ascent, "AGENTS", 7)
-    assert torch.equal(together, rise.rise(x, plan[:, None]))
-    assert torch.equal(together[3:4], made(car_task).rise(x[3:4], plan[3:4, None]))
+    assert torch.equal(together, refinement.refine(x, plan[:, None]))
+    assert torch.equal(together[3:4], made(car_task).refine(x[3:4], plan[3:4, None]))
 
 
 def test_without_time_the_best_of_the_beginnings_is_handed_on(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0, 60)
     none = torch.zeros_like(plan)
-    raised = made(car_task).rise(x, torch.stack((plan, none), 1), until=0.0)
-    value = worth(car_task, x, raised)[:, 0]
+    refined = made(car_task).refine(x, torch.stack((plan, none), 1), until=0.0)
+    value = worth(car_task, x, refined)[:, 0]
     before = worth(car_task, x, torch.stack((plan, none), 1)).amax(1)
     assert (value >= before.clamp(max=APART + TARGET)).all()
-    full = worth(car_task, x, made(car_task).rise(x, plan[:, None]))[:, 0]
+    full = worth(car_task, x, made(car_task).refine(x, plan[:, None]))[:, 0]
     assert (full > value).any()
 
 
 def test_states_that_are_no_numbers_leave_plans_that_are(car_task: Task) -> None:
     x, plan = failing(car_task, 10.0, 20)
     x[:3] = math.nan
-    raised = made(car_task).rise(x, plan[:, None])
-    assert torch.isfinite(raised).all()
-    assert torch.equal(raised[3:], made(car_task).rise(x[3:], plan[3:, None]))
+    refined = made(car_task).refine(x, plan[:, None])
+    assert torch.isfinite(refined).all()
+    assert torch.equal(refined[3:], made(car_task).refine(x[3:], plan[3:, None]))
 
 
 def test_nobody_gets_no_plans(car_task: Task) -> None:
-    x, places = torch.zeros(0, len(car_task.system.names)), torch.zeros(0, 2, car_task.horizon, 1)
-    assert made(car_task).rise(x, places).shape == (0, KEPT, car_task.horizon, 1)
+    x, guesses = torch.zeros(0, len(car_task.system.names)), torch.zeros(0, 2, car_task.horizon, 1)
+    assert made(car_task).refine(x, guesses).shape == (0, KEPT, car_task.horizon, 1)

@@ -27,8 +27,8 @@ class GradientRefine(GuardStage):
         """Return the best refined plan of each agent; store the two best ones for the next stage."""
         plans = [rejected.plan] if rejected.previous is None else [rejected.plan, rejected.previous]
         x, starts = rejected.x[rows], torch.stack(plans, 1)[rows]
-        raised = self.ascent.rise(x, starts, 0.5 * (perf_counter() + deadline.until))
-        found = Candidates.judged(self.task, x, raised, REPAIRED)
+        refined = self.ascent.refine(x, starts, 0.5 * (perf_counter() + deadline.until))
+        found = Candidates.judged(self.task, x, refined, REPAIRED)
         rejected.tried.append(Tried(rows, found))
         return found.pick(torch.zeros_like(rows))
 

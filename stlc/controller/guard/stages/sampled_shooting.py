@@ -102,7 +102,7 @@ class SampledShooting(GuardStage):
             return found
         x = rejected.x[rows]
         tried = self.prefixes.finished(x)
-        picked = tried.standing.topk(min(self.limits.places, tried.rho.shape[1]), 1).indices
+        picked = tried.standing.topk(min(self.limits.guesses, tried.rho.shape[1]), 1).indices
         agents = torch.arange(len(rows), device=rows.device)
         best = tried.pick(picked[:, 0])
         improved = improved_from(self._searcher, x, tried.plans[agents[:, None], picked], self.limits.again)
