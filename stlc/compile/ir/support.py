@@ -28,12 +28,12 @@ class Analysis(ABC, Generic[V]):
     operands. `fold` applies the methods from the leaves upwards.
     """
 
-    @abstractmethod
-    def predicate(self, num: ir.Num) -> V:
-        """Return the value of a predicate on the number `num`.
+    def predicate(self, num: ir.Num) -> V:  # noqa: ARG002
+        """Return the value of a predicate on the number `num`; unless overridden, that of a constant.
 
         The method is also called for a number that a `freeze` binds to a name.
         """
+        return self.constant()
 
     @abstractmethod
     def constant(self) -> V:
@@ -206,9 +206,6 @@ def earliest(formula: ir.Formula) -> tuple[int, int]:
 
 @final
 class _Earliest(Analysis[tuple[int, int]]):
-    def predicate(self, num: ir.Num) -> tuple[int, int]:  # noqa: ARG002
-        return 0, 0
-
     def constant(self) -> tuple[int, int]:
         return 0, 0
 

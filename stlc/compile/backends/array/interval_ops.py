@@ -87,11 +87,9 @@ class IntervalOps(FloatConstants):
     # ---------------------------------------------------------------------------- arithmetic
 
     def sub(self, a: Operand, b: Operand) -> Intervals:
-        """`a - b`."""
         return add(a, -b)
 
     def square(self, x: Operand) -> Intervals:
-        """`x * x`."""
         size = magnitudes(x)
         found = widened(*_mapped(np.square, size), PRODUCT)
         return Intervals(np.maximum(found.low, 0.0), found.high)
@@ -167,7 +165,6 @@ class IntervalOps(FloatConstants):
     # ----------------------------------------------------------------------------- functions
 
     def exp(self, x: Operand) -> Intervals:
-        """`e ^ x`."""
         found = _monotone(np.exp, x)
         return Intervals(np.maximum(found.low, 0.0), found.high)
 
@@ -176,7 +173,6 @@ class IntervalOps(FloatConstants):
         return _wave(np.sin, x, 0.5)
 
     def cos(self, x: Operand) -> Intervals:
-        """Cosine."""
         return _wave(np.cos, x, 0.0)
 
     def tan(self, x: Operand) -> Intervals:
@@ -191,31 +187,24 @@ class IntervalOps(FloatConstants):
         return _widened(low, high)
 
     def sigmoid(self, x: Operand) -> Intervals:
-        """`1 / (1 + exp(-x))`."""
         return within(widened(*_mapped(NUMPY.sigmoid, x), RoundingError(_RELATIVE, _RELATIVE)), 0.0, 1.0)
 
     def sign(self, x: Intervals) -> Intervals:
-        """-1, 0 or 1."""
         return x.each(np.sign)
 
     def floor(self, x: Intervals) -> Intervals:
-        """Next whole number below."""
         return x.each(np.floor)
 
     def ceil(self, x: Intervals) -> Intervals:
-        """Next whole number above."""
         return x.each(np.ceil)
 
     def round(self, x: Intervals) -> Intervals:
-        """Nearest whole number."""
         return x.each(np.rint)
 
     def minimum(self, a: Operand, b: Operand) -> Intervals:
-        """Elementwise minimum."""
         return _smaller_or_greater(np.minimum, a, b)
 
     def maximum(self, a: Operand, b: Operand) -> Intervals:
-        """Elementwise maximum."""
         return _smaller_or_greater(np.maximum, a, b)
 
     # --------------------------------------------------------------------------------- truth
@@ -229,11 +218,9 @@ class IntervalOps(FloatConstants):
         return Belief(np.greater_equal(a_low, b_high), ~np.less(a_high, b_low))
 
     def both(self, a: Belief, b: Belief) -> Belief:
-        """Conjunction."""
         return Belief(a.sure & b.sure, a.possible & b.possible)
 
     def either(self, a: Belief, b: Belief) -> Belief:
-        """Disjunction."""
         return Belief(a.sure | b.sure, a.possible | b.possible)
 
     def settled(self, weight: Intervals, mask: Belief) -> Intervals:

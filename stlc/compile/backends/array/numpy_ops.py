@@ -141,7 +141,6 @@ class NumpyOps(FloatConstants):
             return top + np.log1p(np.exp(-abs(k) * gap)) / k
 
     def sigmoid(self, x: Array) -> Array:
-        """`1 / (1 + exp(-x))`."""
         return 0.5 + 0.5 * np.tanh(0.5 * x)
 
     def full(self, shape: tuple[int, ...], value: float, like: Array) -> Array:

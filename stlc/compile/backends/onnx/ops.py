@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Self, TypeAlias, cast, final
+from typing import TypeAlias, cast, final
 
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
@@ -19,7 +19,7 @@ from stlc.compile.backends.schedule import spanning
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
-from stlc.compile.namespace import Ops, Pick, Sliding
+from stlc.compile.namespace import FloatConstants, Ops, Pick, Sliding
 
 Number: TypeAlias = Value | float
 
@@ -46,18 +46,13 @@ def _comparison(op: str) -> Callable[[OnnxOps, Number, Number], Value]:
 
 
 @final
-class OnnxOps:
+class OnnxOps(FloatConstants):
     """Implementation of `stlc.compile.namespace.Ops` for symbolic arrays.
 
     If an operand of min or max is NaN, so is the result.
     """
 
     name = "onnx"
-
-    @property
-    def guarded(self) -> Self:
-        """Return the library itself, since it has no gradients."""
-        return self
 
     # operators of ONNX, elementwise
     add, sub, mul, div, pow = map(_binary, ("Add", "Sub", "Mul", "Div", "Pow"))
@@ -77,7 +72,6 @@ class OnnxOps:
         return _two("Add", a, product if factor == 1.0 else product * factor)
 
     def square(self, x: Value) -> Value:
-        """`x * x`."""
         return x * x
 
     def mod(self, a: Number, b: Number) -> Value:
@@ -98,7 +92,6 @@ class OnnxOps:
         return total.apply("Sqrt")
 
     def log10(self, x: Value) -> Value:
-        """Logarithm to the base 10."""
         return x.apply("Log") / math.log(10.0)
 
     def sinh(self, x: Value) -> Value:
@@ -106,17 +99,14 @@ class OnnxOps:
         return x.apply("Tanh") * self.cosh(x)
 
     def cosh(self, x: Value) -> Value:
-        """Hyperbolic cosine."""
         return (x.apply("Exp") + (-x).apply("Exp")) / 2.0
 
     # ------------------------------------------------------------------ angles
 
     def tan(self, x: Value) -> Value:
-        """Tangent."""
         return x.apply("Sin") / x.apply("Cos")
 
     def atan(self, x: Value) -> Value:
-        """Arc tangent."""
         return self.atan2(x, 1.0)
 
     def asin(self, x: Value) -> Value:
@@ -148,10 +138,6 @@ class OnnxOps:
         kind: Kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "float64")
         parts = [each if isinstance(each, Value) else mask.graph.constant(each, kind) for each in (yes, no)]
         return mask.apply("Where", *parts, kind=kind)
-
-    def margin(self, x: Value) -> Value:
-        """Return `x` itself."""
-        return x
 
     def infinite(self, mask: Value, like: Value) -> Value:  # noqa: ARG002
         return self.where(mask, math.inf, -math.inf)
@@ -194,10 +180,6 @@ class OnnxOps:
         Arrays with equal element types can share converted constants.
         """
         return like.kind
-
-    def constant(self, value: float, like: Value) -> float:  # noqa: ARG002
-        """Return the float itself."""
-        return value
 
     def full(self, shape: tuple[int, ...], value: float, like: Value) -> Value:
         """Array of a constant; an unknown batch size becomes 1, which broadcasts."""

@@ -188,7 +188,6 @@ class TorchOps:
         return torch.lerp(*_pair(no, yes), weight)
 
     def margin(self, x: Tensor) -> Tensor:
-        """Return `x` itself."""
         return x
 
     def infinite(self, mask: Mask, like: Tensor) -> Tensor:
