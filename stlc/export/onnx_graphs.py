@@ -495,7 +495,10 @@ def following(task: Task, network: PlanProposer) -> dict[str, Value]:
     count = fresh.shape[1]
     table = _table(task, state, joined([fresh, previous.reshaped(BATCH, 1, *previous.shape[1:])], axis=1))
     policy = _varied(task, network, state, _picked(table, _best(table["rank"].T[:count].T)))
-    rest = {name: _one(values, count) for name, values in table.items()}
+    index, rest = graph.constant(count, "int64"), {}
+    for name, values in table.items():
+        shape = (BATCH, *values.shape[2:])
+        (rest[name],) = graph.emit("Gather", (values, index), [shape], values.kind, {"axis": 1})
     better = ONNX_OPS.ge(rest["rank"], policy["rank"])
     if task.pending_goals.items:
         better = ONNX_OPS.either(better, rest["deepened"])
@@ -588,14 +591,6 @@ def _picked(table: Mapping[str, Value], index: Value) -> dict[str, Value]:
 
 def _shown(picked: Mapping[str, Value]) -> dict[str, Value]:
     return {name: picked[name] for name in ("plan", "rho", "safe", "cost", "requirements")}
-
-
-def _one(values: Value, place: int) -> Value:
-    """Select plan number `place` of every agent: (batch, count, …) -> (batch, …)."""
-    shape = (BATCH, *values.shape[2:])
-    index = values.graph.constant(place, "int64")
-    (out,) = values.graph.emit("Gather", (values, index), [shape], values.kind, {"axis": 1})
-    return out
 
 
 def _added(task: Task, state: Value) -> dict[str, Value]:

@@ -183,8 +183,12 @@ class Guarding(nn.Module):
                 pick = torch.where(done, pick, first(longest(tried.falls.permute(2, 1, 0), rho, cost, TORCH)))
             rows = (tried.plans, tried.rho, tried.safe, tried.each)
             here = (*_picked(rows, pick), torch.where(done, 1, 2), torch.full_like(pick, length))
-            found = here if not found else _earlier(decided, found, here)
-            decided = decided | done
+            if found:  # decided by a shorter prefix
+                here = tuple(
+                    torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
+                    for old, new in zip(found, here, strict=True)
+                )
+            found, decided = here, decided | done
         return found
 
     def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
@@ -229,14 +233,6 @@ def _picked(values: Sequence[Tensor], pick: Tensor) -> list[Tensor]:
     """Select entry `pick` (rows,) of every row: (rows, choices, …) -> (rows, …)."""
     rows = torch.arange(pick.shape[0])  # `len` would fix the size of the batch
     return [value[rows, pick] for value in values]
-
-
-def _earlier(decided: Tensor, before: Sequence[Tensor], here: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Results for shorter prefixes (`before`) for the states in `decided`, else the present ones (`here`)."""
-    return tuple(
-        torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
-        for old, new in zip(before, here, strict=True)
-    )
 
 
 def recorded_guard(task: Task, network: PlanProposer) -> ExportedProgram:

@@ -74,7 +74,9 @@ def augment(
     if not absolute(formula):
         return Augmented(past.rewrite(normal(formula)), always, None)
     if grid.steps is None:
-        tell(sink, _without_horizon(formula.span))
+        reason = "an absolute interval is planned for window by window, and no planning horizon is known here"
+        help_ = 'name the system (`system "…"` in the file, or --system), or give dt and the horizon'
+        tell(sink, Diagnostic("E311", reason, formula.span, help=(help_,)))
         return Augmented(always, always, None)
     try:
         flat = in_past_form(hoist_absolute(normal(formula), sink), grid, table, sink)
@@ -195,13 +197,4 @@ def _without_deadline(span: Span) -> Diagnostic:
         span,
         "no finite mission can break it",
         help=("give its interval an end, such as `eventually@[0 s, 60 s]`",),
-    )
-
-
-def _without_horizon(span: Span) -> Diagnostic:
-    return Diagnostic(
-        "E311",
-        "an absolute interval is planned for window by window, and no planning horizon is known here",
-        span,
-        help=('name the system (`system "…"` in the file, or --system), or give dt and the horizon',),
     )

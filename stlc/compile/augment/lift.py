@@ -27,22 +27,15 @@ def hoist_absolute(formula: typed.Formula, sink: list[Diagnostic]) -> typed.Form
         case typed.Logic(_, "and" | "or"):
             return map_children(formula, formulas=lambda item: hoist_absolute(item, sink))
         case typed.Temporal(_, _, interval, body) if absolute(body):
-            if not _reaches_now(interval, formula):
+            # a past window without the present sample may be empty; the body then makes no difference
+            has_now = interval.lo == typed.Time() and not interval.lo_open
+            if formula.op not in ("always", "eventually") and not has_now:
                 return _stuck(formula, sink)
             return _out_of(formula, hoist_absolute(body, sink), sink)
         case typed.Temporal() | typed.Until() if not any(map(absolute, operands(formula))):
             return formula
         case _:
             return _stuck(formula, sink)
-
-
-def _reaches_now(interval: typed.Interval, node: typed.Temporal) -> bool:
-    """True if the window of `node` contains the present sample; `interval` is the interval of `node`.
-
-    A past window without the present sample may be empty; the truth of `node` then does not depend on its
-    body.
-    """
-    return node.op in ("always", "eventually") or (interval.lo == typed.Time() and not interval.lo_open)
 
 
 def _out_of(node: typed.Temporal, body: typed.Formula, sink: list[Diagnostic]) -> typed.Formula:

@@ -56,7 +56,11 @@ def apply(name: str, args: Sequence[Number], span: Span, scope: Scope) -> Number
     """
     function = FUNCTIONS[name]
     for arg in args:
-        _refuse_enum(function, arg, span, scope)
+        if arg.kind == "enum" and name != "choice":
+            members = ", ".join(f"`{label}`" for label, _ in arg.labels)
+            help_ = f"compare it with one of its members: {members}"
+            message = f"`{function.symbol or name}` does not apply to an enum"
+            scope.fail(Diagnostic("E205", message, arg.span or span, help=(help_,)))
     typed_args, template = _units(function, args, span, scope)
     if name in ("div", "mod"):
         _check_divisor(function, typed_args[1], span, scope)
@@ -196,14 +200,6 @@ def in_unit(number: Number, unit: Unit, scope: Scope) -> Number:
             scope.fail(too_large(number.span))
         num = ir.Const(stored)
     return replace(number, num=num, unit=unit, exact=exact, kind="real", bare=False, flexible=False)
-
-
-def _refuse_enum(function: Function, arg: Number, span: Span, scope: Scope) -> None:
-    if arg.kind != "enum" or function.name == "choice":
-        return
-    name = function.symbol or function.name
-    help_ = "compare it with one of its members: " + ", ".join(f"`{label}`" for label, _ in arg.labels)
-    scope.fail(Diagnostic("E205", f"`{name}` does not apply to an enum", arg.span or span, help=(help_,)))
 
 
 def _units(

@@ -52,7 +52,7 @@ def as_number(value: Value, expr: ast.Expr, need: Expectation, scope: Scope) -> 
         case typed.Node():
             return scope.fail(_formula_for_number(value, expr, need))
         case TimeExpr():
-            return scope.fail(_moment_for_number(value, expr))
+            return scope.fail(_time_for_number(value, expr))
         case _:
             message = f"{need.who}; {need.which} is {noun(value)}"
             return scope.fail(Diagnostic("E205", message, expr.span, describe(value)))
@@ -178,7 +178,7 @@ def _formula_for_number(value: typed.Formula, expr: ast.Expr, need: Expectation)
     return Diagnostic("E202", message, expr.span, "formula", help=help_)
 
 
-def _moment_for_number(value: TimeExpr, expr: ast.Expr) -> Diagnostic:
+def _time_for_number(value: TimeExpr, expr: ast.Expr) -> Diagnostic:
     text = expr.span.text
     if value.end:
         return Diagnostic("E205", f"`{text}` is only known as the end of an interval", expr.span)
