@@ -75,6 +75,10 @@ def test_all_findings_of_a_stage_at_once() -> None:
     ]
 
 
+def test_absolute_intervals_need_a_planning_horizon() -> None:
+    assert errors("require a: eventually@[0, 1 s] x > 1 m", Grid(GRID.dt)) == ["E311"]
+
+
 def test_windows_must_fit_a_plan() -> None:
     late = "require a: always[0, 2.6 s] x > 1 m"
     assert errors(late) == ["E306"]
