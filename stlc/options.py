@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, Concatenate, Literal, ParamSpec, TypeVar, get_type_hints
+from typing import Annotated, Any, Concatenate, Literal, ParamSpec, TypeVar, get_args, get_type_hints
 
 from stlc.diagnostics import usage
 from stlc.registry import GUARDS
@@ -65,14 +65,22 @@ def described(options: type) -> dict[str, tuple[str | None, str]]:
 def taking(
     options: Callable[P, Options],
 ) -> Callable[[Callable[[Subject, Options], Result]], Callable[Concatenate[Subject, P], Result]]:
-    """Return a decorator: a function of a subject and `options` takes their fields as keyword arguments."""
+    """Return a decorator: a function of a subject and `options` takes their fields as keyword arguments.
+
+    A path may be given as text.
+    """
 
     def decorate(function: Callable[[Subject, Options], Result]) -> Callable[Concatenate[Subject, P], Result]:
+        own, hints = inspect.signature(function), get_type_hints(options)
+        paths = {name for name, hint in hints.items() if Path in (hint, *get_args(hint))}
+
         @wraps(function)
         def called(subject: Subject, *given: P.args, **named: P.kwargs) -> Result:
+            for name in paths & named.keys():
+                if isinstance(text := named[name], str):
+                    named[name] = Path(text)
             return function(subject, options(*given, **named))
 
-        own, hints = inspect.signature(function), get_type_hints(options)
         first, *_ = own.parameters.values()
         taken = inspect.signature(options).parameters
         rest = (each.replace(annotation=hints[name]) for name, each in taken.items())
