@@ -232,7 +232,8 @@ def _refuse_on_resume(own: Mapping[str, object], changed: Mapping[str, object]) 
     Only the length of the training and `--device` can be changed. `changed` are options of the training.
     """
     named = [option for option, value in own.items() if value is not None]
-    named += [f"--{name.replace('_', '-').replace('options', 'option')}" for name in changed]
+    flags = {"options": "--option", "clock": "--budget-clock"}
+    named += [flags.get(name, f"--{name.replace('_', '-')}") for name in changed]
     named = [option for option in named if option not in ("--budget", "--steps", "--device")]
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"
