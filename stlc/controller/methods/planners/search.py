@@ -19,7 +19,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
 from stlc.controller.options import bounded
 from stlc.controller.search.attempts import Attempts
 from stlc.controller.search.local_search import Searcher
-from stlc.controller.search.sequences.sequences import Sequences
+from stlc.controller.search.sequences.sequences import LENGTHS, Sequences
 from stlc.controller.search.starts import extremes
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ SHARE, EQUAL = 2.0, 0.05
 """Greatest cost of the searches that look at the requirements, in that of the local search, and the cost of
 the local search at which both are equal; see `PlanSearch.spent`."""
 ORDERS = 4.0
-"""This cost where the order of jumps matters."""
+"""This cost where the order of jumps matters: in plans longer than a phase."""
 LEAD, LONG = 0.02, 0.1
 """Cost of the search for phases before schedules are searched for as well; and before local search, where the
 order of jumps matters."""
@@ -102,7 +102,8 @@ class _Orders:
 
     def __init__(self, task: Task, rounds: int) -> None:
         self._task, self._jumps = task, bool(task.system.decl.jumps)
-        self._rounds = min(rounds, 1) if self._jumps else rounds
+        self._ordered = self._jumps and task.horizon > LENGTHS[1]
+        self._rounds = min(rounds, 1) if self._ordered else rounds
 
     @cached_property
     def _sequences(self) -> Sequences:
@@ -130,8 +131,8 @@ class _Orders:
             if search.allowed(torch.tensor([row]), COSTLY) < COSTLY:
                 continue
             local = float(search.spent[row] - self._own[row])
-            share = ORDERS if self._jumps else min(SHARE, local / EQUAL)
-            lead = LONG if self._jumps else LEAD if self._first == 0 else 0.0
+            share = ORDERS if self._ordered else min(SHARE, local / EQUAL)
+            lead = LONG if self._ordered else LEAD if self._first == 0 else 0.0
             allowed = local + max(lead, share * local)
             going, before = self._running.get(row), search.spent.clone()
             if going is None:
