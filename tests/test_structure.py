@@ -10,8 +10,8 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 464700
-CROSSINGS = 6.5
+NODES = 463386
+CROSSINGS = 6.48
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {
     "numbers of one step": 5,
