@@ -114,7 +114,7 @@ class Draw:
         goal = kinds[kind]()
         goals = len(self._objects)
         for _ in range(int(self._random.choice(len(OBSTACLES), p=OBSTACLES))):
-            if self._circle(MIDDLE, LARGE) is None:
+            if self._obstacle() is None:
                 break
         x0 = self._start()
         avoid = {
@@ -197,6 +197,10 @@ class Draw:
         number = self._circle(SMALL, MIDDLE)
         assert number is not None
         return number
+
+    def _obstacle(self) -> int | None:
+        """Add a random obstacle and return its index; None if no free place was found."""
+        return self._circle(MIDDLE, LARGE)
 
     def _circle(self, least: float, most: float) -> int | None:
         """Add a random circle away from the other circles, and return its index.

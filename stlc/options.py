@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any, Concatenate, Literal, ParamSpec, TypeVar, get_args, get_type_hints
 
 from stlc.diagnostics import usage
-from stlc.registry import GUARDS
 
 P = ParamSpec("P")
 Subject = TypeVar("Subject")
@@ -222,7 +221,6 @@ Natural = Annotated[int, Option(metavar="N", least=0)]
 Positive = Annotated[int, Option(metavar="N", least=1)]
 Seed = Annotated[int, Option("Seed of everything random.", least=0, most=MOST_SEED)]
 Jobs = Annotated[int, Option("Number of processes side by side.", flags=("--jobs", "-j"), least=1)]
-GuardName = Annotated[str, Option(metavar="|".join(GUARDS.installed))]
 Cluster = Annotated[
     str | None,
     Option("Work on a Ray cluster, with as many processes as it has cores.", "auto|local|HOST:PORT"),

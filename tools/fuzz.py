@@ -188,7 +188,7 @@ def _unfinished(given):
             data = path.read_bytes()
             try:
                 json.loads(data)
-            except ValueError:
+            except (ValueError, RecursionError):
                 if data != given.files.get(path.as_posix()):
                     return f"half-written: {path}"
     return ""

@@ -14,7 +14,6 @@ from stlc.options import (
     RUNS,
     ClockOption,
     Cluster,
-    GuardName,
     Jobs,
     MethodOptions,
     Natural,
@@ -32,6 +31,7 @@ from stlc.options import (
 from stlc.registry import GUARDS, PLANNERS
 
 Plant = Annotated[Path | None, Option("A black box instead of a system (docs/plants.md).", "FILE")]
+GuardName = Annotated[str, Option(metavar="|".join(GUARDS.installed))]
 Requirements = Annotated[Sequence[str], REQUIRE, tuple]
 Agents = Annotated[int | None, Option("Agents in each world; by default the system's.", least=1)]
 DriveSteps = Annotated[int | None, Option("Steps of each drive; by default the system's.", least=1)]

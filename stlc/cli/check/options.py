@@ -186,6 +186,8 @@ def betweens(pairs: Mapping[str, str]) -> dict[str, Between]:
     Raises:
         UsageError: U101, a text is none of these.
     """
+    if not pairs:
+        return {}
     from stlc.trace.resample import Between
 
     found = {}
