@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463386
+NODES = 463393
 CROSSINGS = 6.48
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {

@@ -206,13 +206,15 @@ def clock_setting(text: str | None, fps: float | None) -> ClockSetting | None:
     Raises:
         UsageError: U101, a value is malformed.
     """
+    if text is None and fps is None:
+        return None
     from stlc.trace.clocks import ClockSetting
 
     if fps is not None and not 0.0 < fps < math.inf:
         raise usage(f"`--fps {fps}` is not a number above 0")
     step = None if fps is None else 1.0 / fps
     if text is None:
-        return None if step is None else ClockSetting(step=step)
+        return ClockSetting(step=step)
     try:
         return ClockSetting.parse(text.strip(), step)
     except ValueError as error:
