@@ -47,7 +47,7 @@ SCENARIOS = "eval/scenarios.json"
 PLANNING = 0.02
 """Processor time of a planner for each plan, in seconds, unless it is given."""
 Watching: TypeAlias = Callable[[Task, Setting, str, bool], AbstractContextManager[Watch | None]]
-"""What is shown of a deployment: from task, setting, title, and whether it is the one that was asked for."""
+"""View of a deployment while it runs, from task, setting, title, and whether it was asked for."""
 
 
 # ---------------------------------------------------------------------- records

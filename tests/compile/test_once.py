@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 from collections import Counter
 from collections.abc import Callable
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,7 +19,6 @@ from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source
 
-ROOT = Path(__file__).resolve().parents[2]
 TEXT = """
 spec twice
 time s
@@ -89,18 +86,3 @@ def test_lint_resolves_once_and_tells_once(counted: Counted, within: Surrounding
     assert stage(counted, "resolve_formula") == [1] * 5
     assert len(set(found)) == len(found)
     assert Counter(finding.code for finding in found)["W505"] == 1
-
-
-STAGES = ("ir", "analysis", "frontend", "augment", "lowering", "schedule", "backends")
-
-
-def test_no_stage_imports_a_later_one() -> None:
-    room = ROOT / "stlc" / "compile"
-    for place, name in enumerate(STAGES[:5]):
-        for path in sorted((room / name).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text())):
-                module = getattr(node, "module", None) or ""
-                if isinstance(node, ast.ImportFrom) and module.startswith("stlc.compile."):
-                    other = module.split(".")[2]
-                    later = STAGES[place + 1 :]
-                    assert other not in later, f"{path.relative_to(ROOT)} imports {module}"

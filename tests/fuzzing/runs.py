@@ -84,7 +84,7 @@ def a_run(rng: random.Random) -> tuple[list[str], dict[str, bytes], dict[str, st
 
 
 def _instead(name: str, files: dict[str, bytes], rng: random.Random) -> str:
-    """What lies in place of a file; see `fuzzing.hostile.lay_odd`."""
+    """Kind of thing that stands in place of a file; see `fuzzing.hostile.lay_odd`."""
     other = rng.choice(sorted({*files} - {name}))
     links = (os.path.relpath(other, Path(name).parent), "nowhere", ".", Path(name).name, "/dev/zero")
     others = (f"hard {other}", "fifo", "folder", "sparse 0", "sparse 60000000")
