@@ -18,13 +18,17 @@ LARGEST = 150
 TOOLS = ("pytest", "pytest-xdist", "hypothesis", "jsonschema")
 WITHOUT_TORCH = (
     *("tests/test_facade.py", "tests/test_extras.py", "tests/cli/commands", "tests/cli/framework"),
-    *("tests/cli/test_compile.py", "tests/cli/test_bad_input.py", "tests/monitor/facts", "tests/runtime"),
+    *("tests/cli/test_bad_input.py", "tests/monitor/facts", "tests/runtime"),
 )
 PORTABLE = (
-    *("tests/test_light.py", "tests/cli/check/test_check.py", "tests/cli/check/test_recordings.py"),
-    *("tests/cli/check/test_uncertain.py", "tests/cli/test_commands.py", "tests/lint/test_lint.py"),
-    *("tests/plants/test_plant.py", "tests/cli/simulate/test_plant.py", "tests/grammar/test_format.py"),
-    *("tests/assurance/test_plant_simulator.py", "tests/monitor/online/test_online.py"),
+    *("tests/test_light.py", "tests/cli/test_commands.py", "tests/lint/test_lint.py"),
+    *(f"tests/cli/commands/check/test_{name}.py" for name in ("check", "recordings", "uncertain")),
+    *("tests/cli/commands/simulate/test_plant.py", "tests/plants/test_plant.py"),
+    *(
+        "tests/assurance/test_plant_simulator.py",
+        "tests/grammar/test_format.py",
+        "tests/monitor/online/test_online.py",
+    ),
 )
 
 

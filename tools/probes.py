@@ -192,7 +192,7 @@ PROBES = (
     ),
     Probe(
         "word of a status",
-        "cli/check/text.py",
+        "cli/commands/check/text.py",
         '"satisfied": "satisfied",',
         '"satisfied": "OBEYED",',
         ("check as text",),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stlc.cli.check import options as given
+from stlc.cli.commands.check import options as given
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table, wants_color
 from stlc.cli.framework.program import command
@@ -70,7 +70,7 @@ def explain(
             return Answer(found, lambda: emit(text or f"{found.spec} requires nothing"))
     if guarantee:
         return Answer(found, lambda: emit("\n".join(_guarantee_lines(found))))
-    from stlc.cli.check.many import EXIT_CODES, SATISFIED
+    from stlc.cli.commands.check.many import EXIT_CODES, SATISFIED
 
     verdict: Verdict = found.verdict
     if not json:
@@ -97,7 +97,7 @@ def _violation_lines(found: ExplainedViolation, verdict: Verdict) -> Iterator[st
 
     The tree leads from the requirement to the sub-formulas, instants and signal values that decide its value.
     """
-    from stlc.cli.check.text import in_unit
+    from stlc.cli.commands.check.text import in_unit
 
     cause = found.cause
     of = f" in trace {cause.trace}" if verdict.traces > 1 else ""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stlc.assurance.options import FalsifyOptions
-from stlc.cli.check.many import INCONCLUSIVE
+from stlc.cli.commands.check.many import INCONCLUSIVE
 from stlc.cli.framework.output import Answer, emit, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, MissingError

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.check import options as given
+from stlc.cli.commands.check import options as given
 from stlc.cli.framework.options import require_separate
 from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command

@@ -1,8 +1,8 @@
 """Command-line programs: a program is a package with one module per command, each imported only when needed.
 
-`stlc` and `python -m benchmarks` are programs. To add a command, add a module to the package. The module has
-one function marked with `command`, or a variable `GROUP` with a group of subcommands. Modules import little
-at the top, so that `--help` stays fast.
+`stlc` and `python -m benchmarks` are programs. To add a command, add a module to the package, or a package
+with the command in its `__init__.py`. The module has one function marked with `command`, or a variable
+`GROUP` with a group of subcommands. Modules import little at the top, so that `--help` stays fast.
 """
 
 from __future__ import annotations

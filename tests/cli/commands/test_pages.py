@@ -231,7 +231,7 @@ def machine(monkeypatch, tmp_path):
         elif code == "R109":
             others.enter_context(RunDir.open("first").claimed())
         elif code == "R406":
-            monkeypatch.setattr("stlc.cli.check.many.outcomes_of", ends_its_process)
+            monkeypatch.setattr("stlc.cli.commands.check.many.outcomes_of", ends_its_process)
         elif code == "W702":
             (tmp_path / "cc").write_text("#!/bin/sh\necho error: no licence\nexit 1\n")
             (tmp_path / "cc").chmod(0o755)

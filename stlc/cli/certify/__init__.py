@@ -1,1 +1,0 @@
-"""Statistical bounds in `stlc certify`, `simulate --certify` and `check --certify`."""

@@ -1,0 +1,245 @@
+"""Live view of a deployment (closed-loop simulation): robustness margins as bars, agents, and decisions.
+
+Without a terminal, the view is ten lines of text.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from stlc.cli.commands.check.text import percent, signed
+from stlc.cli.framework.output import table
+from stlc.compile.ir.traverse import margin_unit
+from stlc.compile.semantics.tolerance import TOLERANCE, violated
+from stlc.controller.guard.candidates import SOURCES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stlc.controller.deployment.live import LiveMonitor
+    from stlc.monitor.online.margins import Margin
+    from stlc.signature import Column
+
+REDRAWN = 0.5
+"""Seconds between redraws on a terminal."""
+LINES = 10
+"""Number of lines without a terminal."""
+HALF = 10
+"""Half the width of a bar in characters; the right half shows positive margins."""
+NARROW = 4
+"""Half the width of a bar in characters in a narrow terminal."""
+FIRST = ("agent", "decided by", "plan", "least margin")
+"""Headers of the columns before the states of an agent."""
+
+
+class LiveView:
+    """Display of a running deployment: redrawn in place on a terminal, else ten lines of text in total.
+
+    Args:
+        monitor: computes the robustness margins of all agents and counts the decisions of the guard.
+        title: name of the deployment.
+        console: console to which the view is written.
+        clock: function that returns the time in seconds, to limit the rate of redrawing.
+    """
+
+    def __init__(
+        self,
+        monitor: LiveMonitor,
+        title: str,
+        console: Console,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.monitor, self.title, self.console = monitor, title, console
+        self._clock = clock
+        self._drawn_at = -1e9
+        self._scales: dict[str, float] = {}
+        self._seconds = 0.0
+        terminal = console.is_terminal and not console.is_dumb_terminal
+        self._live = Live(console=console, auto_refresh=False) if terminal else None
+        self._unicode = "utf" in (console.encoding or "").lower()
+
+    def start(self) -> None:
+        """Open the view."""
+        if self._live is not None:
+            self._live.start()
+        else:
+            self.console.print(Text(self.title))
+
+    def stop(self) -> None:
+        """Close the view; its last state stays on the screen."""
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self) -> None:
+        """Update the view after a step of the deployment."""
+        moment = self.monitor.moment
+        assert moment is not None
+        if moment.planned:
+            self._seconds = moment.seconds
+        over = moment.decision is None
+        if self._live is None:
+            if over or moment.step * LINES // moment.steps > (moment.step - 1) * LINES // moment.steps:
+                self.console.print(Text(self.line()), soft_wrap=True)
+        elif over or self._clock() - self._drawn_at >= REDRAWN:
+            self._live.update(self.panel(), refresh=True)
+            self._drawn_at = self._clock()
+
+    # ------------------------------------------------------------------------- text
+
+    def line(self) -> str:
+        """Present state of the deployment on one line.
+
+        It shows the step, how often the guard intervened, the least robustness, and the number of agents that
+        violate a requirement.
+        """
+        worst = min(self.monitor.margins.items(), key=lambda each: float(each[1].high.min()))
+        name, agent = worst[0], int(worst[1].high.argmin())
+        violated = np.any([margin.violated > 0 for margin in self.monitor.margins.values()], axis=0)
+        counts = self.monitor.counts
+        parts = (
+            self._counter(),
+            f"guard acted in {int(counts[1:].sum()):,} of {int(counts.sum()):,}",
+            f"least margin {name} {_signed(float(worst[1].high[agent]))} ({self._agent(agent)})",
+            f"violated by {int(violated.sum())} of {len(violated)}",
+        )
+        return "  " + "   ".join(parts)
+
+    def panel(self) -> Group:
+        """The present state of the deployment as drawn on the terminal."""
+        width, height = self.console.size
+        lines = [Text(self.title, style="bold"), Text(f"{self._counter()}   {self._decisions()}"), Text()]
+        lines += self._bars(width)
+        lines.append(Text())
+        lines += self._agents(width, max(height - len(lines) - 2, 3))
+        for line in lines:
+            line.no_wrap, line.overflow = True, "ellipsis"
+        return Group(*lines)
+
+    def _counter(self) -> str:
+        moment = self.monitor.moment
+        assert moment is not None
+        step = f"step {moment.step:,} / {moment.steps:,}   t = {self.monitor.time:.6g} s"
+        return f"{step}   all decided in {1e3 * self._seconds:.1f} ms"
+
+    def _decisions(self) -> str:
+        total = max(int(self.monitor.counts.sum()), 1)
+        shares = zip(SOURCES, self.monitor.counts.tolist(), strict=True)
+        return "   ".join(f"{name} {percent(count / total)}" for name, count in shares if count)
+
+    def _agent(self, row: int) -> str:
+        seed, agent = divmod(row, self.monitor.setting.agents)
+        several = len(self.monitor.setting.seeds) > 1
+        return f"agent {agent}" + (f", seed {self.monitor.setting.seeds[seed]}" if several else "")
+
+    def _bars(self, width: int) -> list[Text]:
+        """Return one line for each requirement: a bar and the least robustness over all agents.
+
+        In a narrow terminal, the bars are shortened first; names are cut only after that.
+        """
+        margins = self.monitor.margins
+        units = {rule.name: margin_unit(rule.typed.formula) for rule in self.monitor.task.rules}
+        texts = {name: self._texts(margin, units.get(name, "")) for name, margin in margins.items()}
+        wide = [max(len(parts[k]) for parts in texts.values()) for k in range(3)]
+        label = max(map(len, margins))
+        room = width - label - sum(wide) - len("      │      ")
+        half = min(max(room // 2, NARROW), HALF)
+        found = []
+        for name, (value, agent, count) in texts.items():
+            high = float(margins[name].high.min())
+            text = Text(f"  {name:<{label}}  ")
+            text.append(self._bar(name, high, half), style="red" if violated(high) else "green")
+            text.append(f"  {value:<{wide[0]}}  {agent:<{wide[1]}}")
+            text.append(f"  {count}", style="red")
+            text.rstrip()
+            found.append(text)
+        return found
+
+    def _texts(self, margin: Margin, unit: str) -> tuple[str, str, str]:
+        """Return three texts about a requirement; `margin` is its robustness for each agent.
+
+        The texts are the least robustness with its unit, the agent that has it, and the number of agents that
+        violate the requirement.
+        """
+        row = int(margin.high.argmin())
+        open_ = margin.low[row] < margin.high[row]
+        count = int((margin.violated > 0).sum())
+        value = f"{'at most ' if open_ else ''}{_signed(float(margin.high[row]))} {unit}".rstrip()
+        return value, self._agent(row), f"violated by {count} of {len(margin.high)}" if count else ""
+
+    def _bar(self, name: str, value: float, half: int = HALF) -> str:
+        """Bar for a robustness value: to the left of the middle if negative, else to the right.
+
+        A full bar has `half` characters. It stands for the largest absolute value shown until now for the
+        requirement `name`.
+        """
+        full, empty, middle = ("█", "·", "│") if self._unicode else ("#", ".", "|")
+        finite = abs(value) if np.isfinite(value) else 0.0
+        scale = self._scales[name] = max(self._scales.get(name, 1e-9), finite)
+        length = half if not np.isfinite(value) else round(half * abs(value) / scale)
+        length = max(length, 1) if value else 0
+        filled = full * length, empty * (half - length)
+        if value < 0:
+            return filled[1] + filled[0] + middle + empty * half
+        return empty * half + middle + filled[0] + filled[1]
+
+    def _agents(self, width: int, most: int) -> list[Text]:
+        """Lines with the state of each agent of the first seed, one line per agent.
+
+        If there are more than `most` agents, those with the least robustness are shown.
+        """
+        monitor, moment = self.monitor, self.monitor.moment
+        assert moment is not None
+        agents = range(monitor.setting.agents)
+        least: NDArray[np.float64] = np.min([each.high for each in monitor.margins.values()], axis=0)
+        rows = sorted(sorted(agents, key=lambda row: float(least[row]))[:most])
+        states = moment.x[: len(agents)].tolist()
+        names = monitor.task.system.signature.columns
+        decision = moment.decision
+        cells = []
+        for row in rows:
+            rho = "" if decision is None else _signed(float(decision.rho[row]))
+            name, margin = min(monitor.margins.items(), key=lambda each: float(each[1].high[row]))
+            worst = f"{name} {_signed(float(margin.high[row]))}"
+            first = (str(row), monitor.decided(row) or "", rho, worst)
+            cells.append([*first, *map(_shown, names, states[row])])
+        units = (f"{column.name} {column.unit.text}".strip() for column in names)
+        lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]
+        for line, row in zip(lines[1:], rows, strict=True):
+            line.stylize("red" if violated(least[row]) else "")
+        return lines
+
+
+def _fitting(cells: list[list[str]], header: list[str], width: int) -> str:
+    """Text table of `cells` and `header` with as many columns as fit into `width` characters.
+
+    If columns are left out, `…` stands for them.
+    """
+    for count in range(len(header), len(FIRST), -1):
+        more = ["…"] if count < len(header) else []
+        text = table([[*row[:count], *more] for row in cells], header=[*header[:count], *more])
+        if max(map(len, text.splitlines())) <= width:
+            return text
+    return table([row[: len(FIRST)] for row in cells], header=header[: len(FIRST)])
+
+
+def _shown(column: Column, value: float) -> str:
+    """Value of a state as text: the label of an enum, "yes" or "no", or a number."""
+    for label, number in column.labels:
+        if number == value:
+            return label
+    if column.kind == "bool":
+        return "yes" if value > 0.5 else "no"
+    return f"{value:.2f}"
+
+
+def _signed(value: float) -> str:
+    """Text of a robustness value with its sign; a value within rounding errors of zero is "0"."""
+    return "0" if abs(value) <= TOLERANCE else signed(value)

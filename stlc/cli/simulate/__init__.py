@@ -1,1 +1,0 @@
-"""Output of `stlc simulate`: its text, its progress and its live view."""
