@@ -121,7 +121,8 @@ def row(param: Any) -> str:
         shown = ", ".join(f"`{option}`" for option in (*param.opts, *param.secondary_opts))
         kind = param.metavar or choices(param)
         shown += f" `{escaped(kind)}`" if kind else ""
-    default = param.default if isinstance(param.default, str | int | float) else ""
+    given = param.show_default if isinstance(getattr(param, "show_default", None), str) else param.default
+    default = given if isinstance(given, str | int | float) else ""
     default = "" if isinstance(default, bool) else default
     return f"| {shown} | {default} | {escaped(param.help or '')} |"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -48,7 +49,8 @@ class CommandHelp(TyperCommand):
         for param in self.get_params(ctx):
             record = param.get_help_record(ctx)
             if record is not None:
-                rows[title_of(param, str(self.name))].append(record)
+                about = re.sub(r"(?<=\[default: )\((.*)\)", r"\1", record[1])  # as that of a number
+                rows[title_of(param, str(self.name))].append((record[0], about))
         _write_sections(formatter, rows)
 
 
