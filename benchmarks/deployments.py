@@ -14,11 +14,10 @@ import torch
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.options import Output, ResultsOption, TrainedOption
+from benchmarks.options import Output, ResultsOption, SeedsOption, TrainedOption
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore
 from benchmarks.table import Table, listed, publish
 from benchmarks.training import Place, benchmark_order
-from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.output import say
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
 from stlc.controller.evaluation.deployment import decided, feasible_states

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SeedsOption
+from stlc.cli.framework.options import JsonOption
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.options import parse_clock, parse_seconds, parse_seeds
 from stlc.registry import closest
@@ -24,6 +24,7 @@ OnlyOption = Annotated[
 RunsArgument = Annotated[
     list[str] | None, typer.Argument(metavar="RUN…", help="Runs; the newest one if none.")
 ]
+SeedsOption = Annotated[str, typer.Option("--seeds", metavar="SEEDS", help="Such as 0..9 or 0,3.")]
 ResultsOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the results.")]
 TrainedOption = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Folder of the runs behind them.")]
 PageOption = Annotated[

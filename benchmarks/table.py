@@ -15,7 +15,7 @@ import typer
 
 from benchmarks.options import Output
 from benchmarks.store import Result, made_here
-from stlc.cli.framework.output import emit, emit_json, say
+from stlc.cli.framework.output import Document, emit, say
 from stlc.cli.framework.output import table as columns_of_text
 from stlc.files import write_atomic
 
@@ -163,7 +163,7 @@ def show(
         table.rows  # noqa: B018 - what is measured is measured before anything is printed
     if as_json:
         result = {"what": what, **facts, **{key: table.json() for key, table in tables.items()}}
-        emit_json("benchmarks/1", ok=code == 0, exit_code=code, result=result)
+        Document("benchmarks/1", code, result=result).print()
         return
     emit("\n\n".join(table.terminal() for table in tables.values()))
     if "page" in facts:

@@ -8,12 +8,11 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from fractions import Fraction
 from functools import cache
-from operator import attrgetter
 from pathlib import PurePath
 from typing import Annotated, Any, TypeAlias
 
@@ -28,29 +27,32 @@ Count: TypeAlias = Annotated[int, 0]
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """Key of a record in JSON: its name, its (dotted) attribute, and whether empty values are left out."""
+    """Key of a record in JSON: its name, its (dotted) attribute, and its mark.
+
+    A key with the mark `?` is left out where its value is None or empty, one with `??` where it is None.
+    """
 
     name: str
     attribute: str
-    optional: bool
+    mark: str = ""
 
 
 @cache
 def keys_of(kind: type) -> tuple[Key, ...]:
     """Keys of a dataclass: its fields, or the words of its attribute `JSON`: `key`, `key=attribute`, `key?`.
 
-    A key with `?` is left out where its value is None or empty.
+    An attribute of a record that may be None is left out where that is None.
     """
     words = getattr(kind, "JSON", None) or " ".join(field.name for field in fields(kind))
     parts = [word.partition("=") for word in words.split()]
-    names = [(name.removesuffix("?"), attribute, name.endswith("?")) for name, _, attribute in parts]
-    return tuple(Key(name, attribute or name, optional) for name, attribute, optional in names)
+    names = [(name.rstrip("?"), name, attribute) for name, _, attribute in parts]
+    return tuple(Key(name, attribute or name, word[len(name) :]) for name, word, attribute in names)
 
 
 def keys_below(field: str, kind: type) -> str:
     """Words of `JSON` for the keys of a record among those of another, which has it as a field."""
     keys = keys_of(kind)
-    return " ".join(f"{key.name}{'?' * key.optional}={field}.{key.attribute}" for key in keys)
+    return " ".join(f"{key.name}{key.mark}={field}.{key.attribute}" for key in keys)
 
 
 def plain(value: object) -> Json:
@@ -78,16 +80,26 @@ def plain(value: object) -> Json:
         case PurePath():
             return value.as_posix()
     if is_dataclass(value) and not isinstance(value, type):
-        held = ((key, attrgetter(key.attribute)(value)) for key in keys_of(type(value)))
-        return {key.name: plain(each) for key, each in held if not (key.optional and _is_empty(each))}
+        return {name: plain(each) for name, each in _entries(value, keys_of(type(value)))}
     to_list = getattr(value, "tolist", None)
     if to_list is None:
         raise TypeError(f"{type(value).__name__} is no JSON data")
     return plain(to_list())
 
 
-def _is_empty(value: object) -> bool:
-    return value is None or (isinstance(value, str | list | tuple | dict) and not value)
+def _entries(record: object, keys: Iterable[Key]) -> Iterator[tuple[str, object]]:
+    """The keys of a record that are not left out, and their values."""
+    for key in keys:
+        *above, last = key.attribute.split(".")
+        owner = record
+        for name in above:
+            owner = None if owner is None else getattr(owner, name)
+        if owner is None:
+            continue
+        value = getattr(owner, last)
+        blank = isinstance(value, str | list | tuple | dict) and not value
+        if not (key.mark and value is None) and not (key.mark == "?" and blank):
+            yield key.name, value
 
 
 def _number(value: float) -> float | str:

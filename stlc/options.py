@@ -13,7 +13,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, Concatenate, Literal, ParamSpec, TypeVar, get_args, get_type_hints
+from types import MappingProxyType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Concatenate,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from stlc.diagnostics import usage
 
@@ -92,6 +104,47 @@ def taking(
 def given(options: Any) -> dict[str, Any]:
     """Keyword arguments that give the options of a dataclass."""
     return {each.name: getattr(options, each.name) for each in fields(options)}
+
+
+def parts(hint: Any) -> tuple[Any, Option | None, Callable[[Any], Any] | None]:
+    """Type of an option without its description, the description, and the function that reads its text."""
+    if get_origin(hint) in (Union, UnionType):
+        found = [parts(each) for each in get_args(hint)]
+        options = [each for each in found if each[1] is not None]
+        return (hint, None, None) if not options else (options[0][0] | None, *options[0][1:])
+    held = get_args(hint) if get_origin(hint) is Annotated else ()
+    if len(held) < 2 or not isinstance(held[1], Option):
+        return hint, None, None
+    return held[0], held[1], held[2] if len(held) > 2 else None
+
+
+def flags(name: str, option: Option | None) -> tuple[str, ...]:
+    """Flags of an option: its own, or `--held-out` of the field `held_out`."""
+    return (option and option.flags) or (f"--{name.rstrip('_').replace('_', '-')}",)
+
+
+def flags_of(options: type) -> dict[str, str]:
+    """Field of a dataclass of options -> its first flag."""
+    hints = get_type_hints(options, include_extras=True)
+    return {each.name: flags(each.name, parts(hints[each.name])[1])[0] for each in fields(options)}
+
+
+def words_of(options: Any) -> dict[str, tuple[str, ...]]:
+    """First flag of each option that is given -> the texts of its occurrences, "" for a switch."""
+    found = {}
+    for name, flag in flags_of(type(options)).items():
+        value = getattr(options, name)
+        if isinstance(value, Mapping):
+            value = [f"{key}={text}" for key, text in value.items()]
+        values = value if isinstance(value, list | tuple) else [value]
+        if values and value is not None and value is not False:
+            found[flag] = tuple("" if each is True else str(each) for each in values)
+    return found
+
+
+def command_line(words: Mapping[str, Sequence[str]]) -> list[str]:
+    """Words of a command line that gives options: flag -> the texts of its occurrences."""
+    return [each for flag, texts in words.items() for text in texts for each in (flag, text) if each]
 
 
 def require_no_jobs(cluster: str | None, jobs: int) -> None:
@@ -212,6 +265,7 @@ REQUIRE = Option(
 )
 METHOD_OPTION = Option("An option of --method; repeatable.", "NAME=VALUE", ("--option",), many=True)
 SystemName = Annotated[str | None, SYSTEM]
+NONE_GIVEN: Mapping[str, str] = MappingProxyType({})
 Overrides = Annotated[Mapping[str, str], SET, parse_overrides]
 MethodOptions = Annotated[Mapping[str, str], METHOD_OPTION, parse_options]
 Seconds = Annotated[float, Option(metavar="TIME"), parse_seconds]

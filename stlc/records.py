@@ -16,17 +16,15 @@ from typing import (
     Annotated,
     Any,
     Literal,
-    NotRequired,
     TypeVar,
     Union,
     get_args,
     get_origin,
     get_type_hints,
-    is_typeddict,
 )
 
 from stlc.diagnostics import Diagnostic, RunError
-from stlc.jsontext import Json, data_of, keys_of
+from stlc.jsontext import Json, Key, data_of, keys_of
 
 R = TypeVar("R")
 
@@ -40,9 +38,26 @@ _LISTS = (list, tuple, Sequence)
 
 
 @cache
-def hints_of(kind: type) -> dict[str, Any]:
-    """Key of a record's JSON -> type of its value: that of the field, or what the property returns."""
-    return {key.name: reduce(_hint, key.attribute.split("."), kind) for key in keys_of(kind)}
+def hints_of(kind: type) -> dict[Key, tuple[Any, bool]]:
+    """Key of a record's JSON -> type of its value, and whether the key is always there."""
+    found = {}
+    for key in keys_of(kind):
+        owner: Any = kind
+        there = not key.mark
+        *above, last = key.attribute.split(".")
+        for name in above:
+            hint = _hint(owner, name)
+            owner = _present(hint)
+            there &= owner is hint
+        hint = _hint(owner, last)
+        found[key] = (_present(hint) if key.mark == "??" else hint, there)
+    return found
+
+
+def _present(hint: Any) -> Any:
+    """Type of a value that is there: `X` of `X | None`."""
+    others = [each for each in get_args(hint) if each is not types.NoneType]
+    return others[0] if get_origin(hint) in _UNIONS and len(others) == 1 else hint
 
 
 def _hint(kind: type, name: str) -> Any:
@@ -76,8 +91,9 @@ def schema_of(kind: Any) -> dict[str, Any]:
     if kind in _NAMES:
         return {"type": _NAMES[kind]}
     if is_dataclass(kind):
-        inner = {name: schema_of(hint) for name, hint in hints_of(kind).items()}  # type: ignore[arg-type]
-        needed = [key.name for key in keys_of(kind) if not key.optional]  # type: ignore[arg-type]
+        hints = hints_of(kind)  # type: ignore[arg-type]
+        inner = {key.name: schema_of(hint) for key, (hint, _) in hints.items()}
+        needed = [key.name for key, (_, there) in hints.items() if there]
         return {"type": "object", "properties": inner} | ({"required": needed} if needed else {})
     if origin is Annotated:
         what = args[1]() if callable(args[1]) else args[1]
@@ -95,11 +111,6 @@ def schema_of(kind: Any) -> dict[str, Any]:
         return {"type": "array", "items": schema_of(args[0])}
     if origin in _UNIONS:
         return _union([schema_of(each) for each in args])
-    if is_typeddict(kind):
-        hints = get_type_hints(kind, include_extras=True)
-        needed = [name for name, hint in hints.items() if get_origin(hint) is not NotRequired]
-        inner = {n: schema_of(get_args(h)[0] if n not in needed else h) for n, h in hints.items()}
-        return {"type": "object", "properties": inner} | ({"required": needed} if needed else {})
     return {"type": "array", "items": {"type": ["number", "string"]}}  # an array of numbers
 
 
@@ -174,14 +185,13 @@ def read(kind: Any, value: Json, key: str = "") -> Any:
 def _read_record(kind: type, value: Json, key: str) -> Any:
     if not isinstance(value, dict):
         raise _unlike(value, "a JSON object", key)
-    hints, own = hints_of(kind), {each.name: each for each in fields(kind)}
-    given = {}
-    for each in keys_of(kind):
+    own, given = {each.name: each for each in fields(kind)}, {}
+    for each, (hint, _) in hints_of(kind).items():
         field = own.get(each.attribute)
         if field is None or not field.init:
             continue
         if each.name in value and not (value[each.name] is None and _has_default(field)):
-            given[each.attribute] = read(hints[each.name], value[each.name], _below(key, each.name))
+            given[each.attribute] = read(hint, value[each.name], _below(key, each.name))
         elif not _has_default(field):
             raise ValueError(f"{f'`{key}`' if key else 'it'} has no `{each.name}`")
     return kind(**given)

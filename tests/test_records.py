@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stlc.diagnostics import RunError
-from stlc.jsontext import Num, dumps, plain
+from stlc.jsontext import Num, dumps, keys_below, plain
 from stlc.records import from_json, schema_of
 
 
@@ -69,6 +69,25 @@ def test_keys_are_those_that_the_class_lists():
     assert list(found) == ["kind", "count", "least", "inner", "pair", "table", "double"]
     assert found["double"] == 6
     assert found["inner"] == [{"name": "x", "least": "inf"}]
+
+
+@dataclass(frozen=True)
+class Holder:
+    JSON: ClassVar = f"name {keys_below('outer', Outer)} text??"
+
+    name: str
+    outer: Outer | None = None
+    text: str | None = None
+
+
+@pytest.mark.parametrize("outer", [None, Outer("a", 3, (), least=None, more="x")])
+@pytest.mark.parametrize("text", [None, "", "x"])
+def test_keys_below_what_is_not_there_are_left_out(outer, text):
+    found, schema = plain(Holder("h", outer, text)), schema_of(Holder)
+    below = {} if outer is None else plain(outer)
+    assert found == {"name": "h", **below, **({} if text is None else {"text": text})}
+    assert misfits(found, schema) == []
+    assert (schema["required"], schema["properties"]["text"]) == (["name"], {"type": "string"})
 
 
 junk: Any = st.none() | st.booleans() | st.integers() | st.text(max_size=3) | st.just([]) | st.just({})

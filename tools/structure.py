@@ -28,8 +28,6 @@ from typing import Any, TypeAlias
 ROOT = Path(__file__).resolve().parent.parent
 WORST = 12
 """Number of pairs of rooms that are printed, those between which most names cross."""
-MIRRORED = 0.7
-"""Share of a document's fields from which on it repeats a record that has them too."""
 _UNCOUNTED = (ast.expr_context, ast.operator, ast.cmpop, ast.boolop, ast.unaryop)
 
 
@@ -252,18 +250,6 @@ def recorded(*names: str, least: int) -> Probe:
     return probe
 
 
-def mirrored(package: Package) -> Iterator[str]:
-    """Typed dictionaries with at least `MIRRORED` of their fields, three or more, in one dataclass."""
-    documents: list[tuple[Module, ast.ClassDef, set[str]]] = []
-    records: list[tuple[Module, ast.ClassDef, set[str]]] = []
-    for module, node in _nodes(package, "", ast.ClassDef):
-        typed = any(isinstance(base, ast.Name) and base.id == "TypedDict" for base in node.bases)
-        (documents if typed else records).append((module, node, _fields(node)))
-    for module, node, names in documents:
-        if len(names) >= 3 and max(len(names & other) for *_, other in records) >= MIRRORED * len(names):
-            yield f"{module.path}:{node.lineno} {node.name}"
-
-
 def _fields(node: ast.ClassDef) -> set[str]:
     return {
         each.target.id
@@ -289,7 +275,6 @@ MEANINGS = (
             "holds", "fails", "satisfied", "violated", "status", "low", "high", "robustness", "share", least=3
         ),
     ),
-    Meaning("document with the fields of a record", "cli/framework/documents.py", mirrored),
     Meaning(
         "online evaluator", "monitor/online/", defined(r"\w*Trackers?|Margins|Online", "monitor/online/")
     ),

@@ -18,10 +18,9 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.deployments import sampled_states
-from benchmarks.options import Output, RunsArgument, opened
+from benchmarks.options import Output, RunsArgument, SeedsOption, opened
 from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import Times, after_warm_up, one_thread
-from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.guard.candidates import Limits

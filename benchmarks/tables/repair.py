@@ -12,11 +12,10 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.options import Output, RunsArgument, opened
+from benchmarks.options import Output, RunsArgument, SeedsOption, opened
 from benchmarks.repairs import Mended, repairs
 from benchmarks.table import Columns, Table, measured_here, publish
 from benchmarks.timing import one_thread
-from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.controller.run.run import Run
 from stlc.options import parse_seeds

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import dataclass, is_dataclass, make_dataclass
 from functools import reduce
 from operator import or_
 from types import UnionType
-from typing import Any, Literal, NotRequired, TypedDict, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 from benchmarks.claims import Claim
 from benchmarks.deployments import DeploymentRow
@@ -33,33 +33,35 @@ from benchmarks.tables import (
     uncertain,
     verify,
 )
-from stlc.cli.framework.documents import Num
-from stlc.cli.framework.output import emit
+from stlc.cli.framework.output import Document, emit
 from stlc.cli.framework.program import command
-from stlc.cli.framework.results import DocumentRecord
+from stlc.jsontext import Num
 from stlc.records import schema_of
 
 NAME = "benchmarks/1"
-_dictionary: Any = TypedDict
 
 
-class FailedTraining(TypedDict):
+@dataclass(frozen=True)
+class FailedTraining:
     """Name of a measurement that failed, and the reason."""
 
     name: str
     why: str
 
 
-class Facts(TypedDict):
+@dataclass(frozen=True)
+class Facts:
     """Entries of a table's JSON document other than its rows; each table has some of them."""
 
-    page: NotRequired[str]
-    results: NotRequired[int]
-    trained: NotRequired[int]
-    kept: NotRequired[int]
-    driven: NotRequired[int]
-    planned: NotRequired[int]
-    failed: NotRequired[list[FailedTraining]]
+    JSON: ClassVar = "page? results? trained? kept? driven? planned? failed?"
+
+    page: str
+    results: int
+    trained: int
+    kept: int
+    driven: int
+    planned: int
+    failed: list[FailedTraining]
 
 
 ROWS: dict[str, dict[str, type]] = {
@@ -100,21 +102,23 @@ def schema() -> None:
 def document_schema() -> dict[str, Any]:
     """Return the schema of a whole document: keys that all commands share, and the result of one table."""
     results = [_result(name, rows) for name, rows in ROWS.items()]
-    frame = schema_of(DocumentRecord)
+    frame = schema_of(Document)
     frame["properties"] |= {"schema": {"const": NAME}, "result": schema_of(reduce(or_, [*results, None]))}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": NAME, **frame}
 
 
 def _result(name: str, rows: Mapping[str, type]) -> Any:
-    hints = get_type_hints(Facts, include_extras=True)
     lists = {key: list[document_type(row)] for key, row in rows.items()}  # type: ignore[misc]
-    return _dictionary(name, {"what": Literal[name], **hints, **lists})
+    keys = " ".join(("what", *lists, Facts.JSON))
+    return make_dataclass(
+        name, {"what": Literal[name], **lists}.items(), bases=(Facts,), frozen=True, namespace={"JSON": keys}
+    )
 
 
 def document_type(kind: Any) -> Any:
     """Return the type of the JSON form of values of the type `kind`.
 
-    A dataclass becomes a dictionary of its fields and properties.
+    A dataclass becomes one that has its properties as fields.
     """
     origin, args = get_origin(kind), get_args(kind)
     if is_dataclass(kind):
@@ -124,7 +128,7 @@ def document_type(kind: Any) -> Any:
             for name, each in vars(kind).items()
             if isinstance(each, property)
         }
-        return _dictionary("Record", {key: document_type(hint) for key, hint in hints.items()})
+        return make_dataclass("Record", [(key, document_type(hint)) for key, hint in hints.items()])
     if kind is float:
         return Num
     if origin in (Union, UnionType):

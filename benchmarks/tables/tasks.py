@@ -15,10 +15,9 @@ import typer
 
 from benchmarks.judged import ControlTask, NoAnswerError, asked, end_of, judged, tasks_in
 from benchmarks.measured import measured
-from benchmarks.options import OnlyOption, Output, ResultsOption, TrainedOption, chosen
+from benchmarks.options import OnlyOption, Output, ResultsOption, SeedsOption, TrainedOption, chosen
 from benchmarks.store import Key, Result, ResultStore
 from benchmarks.table import Columns, Table, listed, provenance, publish
-from stlc.cli.framework.options import SeedsOption
 from stlc.cli.framework.program import command
 from stlc.controller.search.planner import PLANNING_VERSION
 from stlc.controller.training.config import ENGINE_VERSION

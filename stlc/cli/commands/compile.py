@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stlc.cli.framework.options import JsonOption, SetOption
+from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command
-from stlc.options import SystemName, parse_overrides
+from stlc.options import NONE_GIVEN, Overrides, SystemName
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.documents import ParsedFile, ParsedFiles
     from stlc.compile.described import CompiledSpec
+
+
+@dataclass(frozen=True, slots=True)
+class ParsedFile:
+    """Syntax tree of a specification: kind of node and fields, as JSON."""
+
+    file: str
+    tree: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ParsedFiles:
+    """Syntax trees of several specifications."""
+
+    files: Sequence[ParsedFile]
+
 
 Part = Literal["all", "steps", "states", "ir", "ast", "dot"]
 
@@ -30,7 +46,7 @@ def compile_(
         list[str], typer.Argument(metavar="SPEC", help="The specification; for ast and dot several, or -.")
     ],
     system: SystemName = None,
-    set_: SetOption = None,
+    set_: Overrides = NONE_GIVEN,
     show: Annotated[
         Part, typer.Option("--show", metavar="PART", help="all, steps, states, ir, ast, or dot.")
     ] = "all",
@@ -84,11 +100,9 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
             findings += error.diagnostics
     if findings:
         raise SpecError(*findings)
-    trees: list[ParsedFile] = [
-        {"file": name, "tree": as_values(spec)} for name, spec in zip(names, specs, strict=True)
-    ]
+    trees = [ParsedFile(name, as_values(spec)) for name, spec in zip(names, specs, strict=True)]
     return Answer(
-        trees[0] if len(trees) == 1 else {"files": trees},
+        trees[0] if len(trees) == 1 else ParsedFiles(trees),
         lambda: emit(as_dot(specs) if show == "dot" else "\n\n".join(map(as_tree, specs))),
     )
 
@@ -110,13 +124,13 @@ def _files(spec: Path, system: str | None) -> list[str]:
 def _compiled(
     path: Path,
     system: str | None,
-    set_: list[str] | None,
+    overrides: Mapping[str, str],
     show: Literal["all", "steps", "states", "ir"],
 ) -> Answer[CompiledSpec]:
     """Compile the specification `path` for a system, without importing torch; print the part `show`.
 
-    `system` is the system file of `--system`, and `set_` are the values of `--set`. The specification is
-    compiled for recorded traces if the system file names it as the judge of closed-loop runs.
+    `system` is the system file of `--system`. The specification is compiled for recorded traces if the system
+    file names it as the judge of closed-loop runs.
     """
     from stlc.compile.described import CompiledSpec
     from stlc.compile.dump import dump
@@ -127,7 +141,6 @@ def _compiled(
     from stlc.files import find_spec, find_system, read_source
     from stlc.grammar.parser import parse
 
-    overrides = parse_overrides(set_)
     path = find_spec(path)
     spec = parse(read_source(path))
     wanted = system or spec.system

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -17,13 +18,32 @@ from stlc.diagnostics import StlcError
 from stlc.extras import commands
 from stlc.plugins import installed
 
-if TYPE_CHECKING:
-    from stlc.cli.framework.documents import InstallationFinding, InstallationReport
-
 MISSING = 5
 
 _SLOWER = "torch does its work, about ten times slower"
 _NEEDED = ("numpy", "lark", "pyyaml", "typer", "rich")
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing of an installation.
+
+    Attributes:
+        name: its name.
+        state: `off`: it is missing, but only some commands need it.
+        detail: its version or place, or the way to get it.
+    """
+
+    name: str
+    state: Literal["ok", "missing", "off"]
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class InstallationReport:
+    """Everything that an installation may have."""
+
+    findings: Sequence[Finding]
 
 
 @command("stlc doctor")
@@ -38,36 +58,28 @@ def doctor(
 
     completion = _completion()
     findings = [
-        _finding("stlc", "ok", f"{__version__} in {Path(__file__).parents[2]}"),
-        _finding("python", "ok", ".".join(map(str, sys.version_info[:3]))),
+        Finding("stlc", "ok", f"{__version__} in {Path(__file__).parents[2]}"),
+        Finding("python", "ok", ".".join(map(str, sys.version_info[:3]))),
         *(*_packages(), *_devices(quick=quick), _cache(), _compiler()),
-        _finding("completion", "ok" if completion else "off", completion or "stlc --install-completion"),
+        Finding("completion", "ok" if completion else "off", completion or "stlc --install-completion"),
         *_plugins(quick=quick),
     ]
-    missing = [finding["name"] for finding in findings if finding["state"] == "missing"]
+    missing = [finding.name for finding in findings if finding.state == "missing"]
 
     def show() -> None:
-        emit(table([(finding["name"], finding["state"], finding["detail"]) for finding in findings]))
+        emit(table([astuple(finding) for finding in findings]))
         say(f"missing: {', '.join(missing)}" if missing else "all that is needed is there")
 
-    return Answer({"findings": findings}, show, MISSING if missing else 0)
+    return Answer(InstallationReport(findings), show, MISSING if missing else 0)
 
 
-def _finding(name: str, state: Literal["ok", "missing", "off"], detail: str) -> InstallationFinding:
-    """Return one line of the report on the installation: the item `name`, its state, and details in words.
-
-    The state "off" means that the item is missing, but only some commands need it.
-    """
-    return {"name": name, "state": state, "detail": detail}
-
-
-def _packages() -> Iterator[InstallationFinding]:
+def _packages() -> Iterator[Finding]:
     for name in _NEEDED:
         found = _version(name)
-        yield _finding(name, "ok" if found else "missing", found or f"pip install {name}")
+        yield Finding(name, "ok" if found else "missing", found or f"pip install {name}")
     for package, advice in commands().items():
         found = _version(package)
-        yield _finding(package, "ok" if found else "off", found or advice)
+        yield Finding(package, "ok" if found else "off", found or advice)
 
 
 def _version(package: str) -> str:
@@ -79,52 +91,52 @@ def _version(package: str) -> str:
         return ""
 
 
-def _devices(*, quick: bool) -> Iterator[InstallationFinding]:
+def _devices(*, quick: bool) -> Iterator[Finding]:
     from stlc.provenance import hardware
 
     machine = hardware()
     memory = machine.get("memory_gib")
     detail = f"{machine.get('processor') or machine.get('machine')}, {machine.get('cores')} cores"
-    yield _finding("cpu", "ok", detail + (f", {memory} GiB" if memory else ""))
+    yield Finding("cpu", "ok", detail + (f", {memory} GiB" if memory else ""))
     if quick or find_spec("torch") is None:
         return
     import torch
 
     if torch.cuda.is_available():
         names = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
-        yield _finding("cuda", "ok", names)
+        yield Finding("cuda", "ok", names)
     else:
-        yield _finding("cuda", "off", "no device; everything runs on the processor")
+        yield Finding("cuda", "off", "no device; everything runs on the processor")
 
 
-def _plugins(*, quick: bool) -> Iterator[InstallationFinding]:
+def _plugins(*, quick: bool) -> Iterator[Finding]:
     """Yield a line for each plugin of other packages; it is imported unless `quick`."""
     for plugin in installed():
         try:
             _ = quick or plugin.load()
         except StlcError as error:
-            yield _finding(plugin.name, "off", " ".join((plugin.source, *error.diagnostics[0].note)))
+            yield Finding(plugin.name, "off", " ".join((plugin.source, *error.diagnostics[0].note)))
         else:
-            yield _finding(plugin.name, "ok", f"{plugin.source}, {plugin.group}")
+            yield Finding(plugin.name, "ok", f"{plugin.source}, {plugin.group}")
 
 
-def _cache() -> InstallationFinding:
+def _cache() -> Finding:
     """Return the line of the report on the cache folder, which keeps compiled kernels and parser tables."""
     from stlc.cache import Unusable, opened, why_not
 
     try:
         kept = opened()
     except Unusable:
-        return _finding("cache", "off", f"{why_not()}; starting takes 0.1 s longer, kernels are built anew")
+        return Finding("cache", "off", f"{why_not()}; starting takes 0.1 s longer, kernels are built anew")
     count, size = kept.size()
     if not os.access(kept.folder, os.W_OK):
-        return _finding("cache", "off", f"{kept.shown} cannot be written to; new kernels are not kept")
-    return _finding(
+        return Finding("cache", "off", f"{kept.shown} cannot be written to; new kernels are not kept")
+    return Finding(
         "cache", "ok", f"{kept.shown}: {count} file{'' if count == 1 else 's'}, {size / 1e6:.1f} MB"
     )
 
 
-def _compiler() -> InstallationFinding:
+def _compiler() -> Finding:
     """Return the line of the report on the C compiler.
 
     It says whether plans are evaluated in C or in torch, and names a recent failure of the compiler.
@@ -133,15 +145,15 @@ def _compiler() -> InstallationFinding:
 
     found = compiler()
     if found is None:
-        return _finding("compiler", "off", f"no C compiler (cc, gcc, clang, $CC); {_SLOWER}")
+        return Finding("compiler", "off", f"no C compiler (cc, gcc, clang, $CC); {_SLOWER}")
     before = remembered()
     why = works(found)
     if why:
-        return _finding("compiler", "off", f"{found} {why}; {_SLOWER}")
+        return Finding("compiler", "off", f"{found} {why}; {_SLOWER}")
     detail = f"{found}; training, search and backup run as C"
     if before:
         detail += f" (a short while ago it {before[0]}; it is tried again from now on)"
-    return _finding("compiler", "ok", detail)
+    return Finding("compiler", "ok", detail)
 
 
 def _completion() -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import unified_diff
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, ClassVar
 
 import typer
 
@@ -15,10 +16,19 @@ from stlc.cli.framework.program import command
 from stlc.diagnostics import Diagnostic, SpecError
 from stlc.files import STDIN, read_source, spec_files, write_atomic
 
-if TYPE_CHECKING:
-    from stlc.cli.framework.documents import FormattedFiles
-
 DIFFERS, INVALID = 1, 3
+
+
+@dataclass(frozen=True, slots=True)
+class FormattedFiles:
+    """Files that were formatted, those that changed, and whether they were written; else the difference."""
+
+    JSON: ClassVar = "files changed written diff??"
+
+    files: Sequence[str]
+    changed: Sequence[str]
+    written: bool
+    diff: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +75,8 @@ def fmt(
         elif result in changed:
             write_atomic(result.name, result.after)
 
-    names_changed = [result.name for result in changed]
-    record: FormattedFiles = {"files": list(names), "changed": names_changed, "written": not dry}
-    if diff:
-        record["diff"] = "".join(map(_diff, changed))
+    text = "".join(map(_diff, changed)) if diff else None
+    record = FormattedFiles(names, [result.name for result in changed], not dry, text)
 
     def show() -> None:
         show_diagnostics(findings)
@@ -79,11 +87,11 @@ def fmt(
 
 def _tell(record: FormattedFiles, alike: int) -> None:
     """Print the differences or the names of changed files, then `alike`, the number of unchanged files."""
-    if record.get("diff"):
-        emit(record["diff"].rstrip("\n"))
-    for name in record["changed"]:
+    if record.diff:
+        emit(record.diff.rstrip("\n"))
+    for name in record.changed:
         if name != STDIN:
-            say(f"{'changed' if record['written'] else 'would change'} {name}")
+            say(f"{'changed' if record.written else 'would change'} {name}")
     if alike:
         say(f"{alike} {'file' if alike == 1 else 'files'} left as {'it is' if alike == 1 else 'they are'}")
 

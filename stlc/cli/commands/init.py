@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +19,6 @@ from stlc.files import SPECS, SYSTEMS, write_atomic
 from stlc.registry import did_you_mean
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.documents import CreatedFiles
     from stlc.dynamics.declaration.decl import SystemDecl
     from stlc.signature import Column
 
@@ -43,6 +43,13 @@ def examples(incomplete: str = "") -> list[str]:
     """
     found = {system.removesuffix(".yaml") for _, system in _pairs()}
     return [name for name in (FIRST, *sorted(found), EMPTY) if name.startswith(incomplete)]
+
+
+@dataclass(frozen=True, slots=True)
+class CreatedFiles:
+    """Files that were written."""
+
+    files: Sequence[str]
 
 
 @command(
@@ -103,7 +110,7 @@ def init(
             emit(visible(str(path)))
         say(f"next: {following}")
 
-    return Answer({"files": [str(path) for path in files]}, show)
+    return Answer(CreatedFiles([*map(str, files)]), show)
 
 
 def _require_new(paths: Iterable[Path], *, force: bool) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from stlc.cli.framework.options import JsonOption, SpecsArgument
-from stlc.cli.framework.output import Answer, emit, emit_json, say, wants_color
+from stlc.cli.framework.output import Answer, Document, emit, say, wants_color
 from stlc.cli.framework.program import command
 from stlc.diagnostics import CODES, Diagnostic, usage
 from stlc.escape import sarif_message, uri, workflow_data, workflow_property
@@ -90,7 +90,7 @@ def _show(format_: Format, result: Lint, code: int) -> None:
     findings = result.findings
     match format_:
         case "json":
-            emit_json("lint/1", ok=code == CLEAN, exit_code=code, diagnostics=findings, result=result)
+            Document("lint/1", code, findings, result).print()
         case "github":
             if findings:
                 emit(github(findings))

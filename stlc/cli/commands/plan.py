@@ -12,15 +12,21 @@ import typer
 from stlc.activity import PULSE
 from stlc.cli.framework.options import (
     FailUnderOption,
-    MethodOptionsOption,
-    SetOption,
-    planner_choice,
     require_separate,
 )
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics
 from stlc.cli.framework.program import command, noting_signals
 from stlc.diagnostics import usage
-from stlc.options import Seed, SystemName, parse_count, parse_overrides
+from stlc.options import (
+    NONE_GIVEN,
+    MethodOptions,
+    Option,
+    Overrides,
+    Seed,
+    SystemName,
+    parse_count,
+    parse_seconds,
+)
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
@@ -49,14 +55,17 @@ def plan(
     ] = None,
     method: Annotated[
         str,
-        typer.Option(
-            "--method", "-m", metavar="|".join((*PLANNERS.installed, "FILE.py")), help="The planner."
+        Option(
+            f"The planner; by default {PLANNERS.default}.",
+            "|".join((*PLANNERS.installed, "FILE.py")),
+            ("--method", "-m"),
         ),
+        PLANNERS.chosen,
     ] = PLANNERS.default,
-    option: MethodOptionsOption = None,
+    option: MethodOptions = NONE_GIVEN,
     budget: Annotated[
-        str, typer.Option(metavar="TIME", help="Processor time per initial state at most.")
-    ] = "1s",
+        float, Option("Processor time per initial state at most; by default 1s.", "TIME"), parse_seconds
+    ] = 1.0,
     evaluations: Annotated[
         str | None, typer.Option(metavar="N", help="Judged plans per initial state at most.")
     ] = None,
@@ -74,7 +83,7 @@ def plan(
         Path, typer.Option("--out", "-o", metavar="FILE", help="Trace of the plans (.npz, .csv, .mcap).")
     ] = Path("plan.npz"),
     fail_under: FailUnderOption = None,
-    set_: SetOption = None,
+    set_: Overrides = NONE_GIVEN,
 ) -> Answer[Plans]:
     """Plan from initial states, without training.
 
@@ -91,19 +100,20 @@ def plan(
     from stlc.controller.problem.load import load_task
     from stlc.controller.search.plan_traces import following, starts_of, trace_of
     from stlc.controller.search.planner import PlanBudget, PlanSearch, planner_named, prepared
+    from stlc.controller.search.planner_policy import PlannerChoice
     from stlc.stopping import leaving
     from stlc.trace import check_writable, save_trace
 
     check_writable(output)
     require_separate([("--out", output)], (spec, system, from_))
-    choice = planner_choice(method, option, budget)
+    choice = PlannerChoice(method, option, budget)
     judged = None if evaluations is None else parse_count(evaluations, "--evaluations")
-    planner = planner_named(choice.name, **choice.options)
-    task = load_task(spec, system, parse_overrides(set_), scenario=tube, whole=True)
+    planner = planner_named(method, **option)
+    task = load_task(spec, system, set_, scenario=tube, whole=True)
     show_diagnostics(task.compiled.warnings)
     model = None if tube is None else TubeModel(task)
     states = starts_of(task, from_, starts, seed)
-    limits = PlanBudget(choice.seconds, judged, _target(target))
+    limits = PlanBudget(budget, judged, _target(target))
 
     def save(found: PlanResult) -> None:
         if len(found.rho):

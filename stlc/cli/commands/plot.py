@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +17,6 @@ from stlc.diagnostics import usage
 from stlc.escape import visible
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.documents import PlottedTrace
     from stlc.grammar import ast
     from stlc.monitor.verdict import Monitor
     from stlc.signature import Column
@@ -25,6 +25,15 @@ if TYPE_CHECKING:
     from stlc.view.style import Picture
 
 _FORMATS = (".svg", ".png", ".pdf")
+
+
+@dataclass(frozen=True, slots=True)
+class PlottedTrace:
+    """Picture of a recording, and the numbers of the traces that it shows."""
+
+    trace: str
+    picture: str
+    shown: Sequence[int]
 
 
 @command(
@@ -90,7 +99,7 @@ def plot(
             say(remark)
         emit(visible(str(target)))
 
-    return Answer({"trace": str(path), "picture": str(target), "shown": shown}, show)
+    return Answer(PlottedTrace(str(path), str(target), shown), show)
 
 
 def _target(output: Path | None, trace: Path) -> Path:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -19,8 +20,61 @@ from stlc.escape import visible
 from stlc.options import Runs
 from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, every_run, remove_run
 
-if TYPE_CHECKING:
-    from stlc.cli.framework import documents
+
+@dataclass(frozen=True, slots=True)
+class ListedRun:
+    """A run with the facts of its `run.json`, as they stand there."""
+
+    run: str
+    path: str
+    status: str
+    accuracy: float | None
+    spec: Any
+    system_path: Any
+    steps: Any
+    seed: Any
+    started: Any
+
+
+@dataclass(frozen=True, slots=True)
+class RunList:
+    """Runs of a folder."""
+
+    runs: Sequence[ListedRun]
+
+
+@dataclass(frozen=True, slots=True)
+class DifferentFact:
+    """Fact in which two runs differ, with both values."""
+
+    key: str
+    values: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class RunComparison:
+    """Differences of two runs: facts, and names of input files."""
+
+    runs: Sequence[str]
+    facts: Sequence[DifferentFact]
+    files: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class RunContent:
+    """A run, its `run.json`, and the files in its folder."""
+
+    run: str
+    record: Mapping[str, Any]
+    files: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class RemovedRuns:
+    """Runs that were removed."""
+
+    removed: Sequence[str]
+
 
 Sort = Literal["time", "acc", "name"]
 
@@ -38,7 +92,7 @@ GROUP = group("List, show, compare and remove runs.", "stlc runs", default=_defa
 def list_(
     sort: Annotated[Sort, typer.Option(help="Newest last, best last, or by name.")] = "time",
     runs: Runs = RUNS,
-) -> Answer[documents.RunList]:
+) -> Answer[RunList]:
     """List all runs."""
     found = [(run, *_record(run)) for run in every_run(runs)]
     if sort == "acc":
@@ -53,11 +107,11 @@ def list_(
         else:
             say(f"there is no run in {runs}; train one: stlc train specs/traffic.stl --system car.yaml")
 
-    return Answer({"runs": [_listed(*each) for each in found]}, show)
+    return Answer(RunList([_listed(*each) for each in found]), show)
 
 
 @subcommand(GROUP, "show", "stlc runs show latest")
-def show(run: RunArgument = "latest", runs: Runs = RUNS) -> Answer[documents.RunContent]:
+def show(run: RunArgument = "latest", runs: Runs = RUNS) -> Answer[RunContent]:
     """Show the settings and results of a run."""
     folder = RunDir.open(run, runs)
     record = folder.record()
@@ -70,7 +124,7 @@ def show(run: RunArgument = "latest", runs: Runs = RUNS) -> Answer[documents.Run
         emit("\n".join(visible(f"  {key:<{width}}  {value}") for key, value in facts.items()))
         emit("files\n" + "\n".join(visible(f"  {name}") for name in files))
 
-    return Answer({"run": folder.shown, "record": record, "files": files}, tell)
+    return Answer(RunContent(folder.shown, record, files), tell)
 
 
 @subcommand(GROUP, "diff", "stlc runs diff 1 2")
@@ -78,7 +132,7 @@ def diff(
     first: RunArgument,
     second: Annotated[str, typer.Argument(metavar="OTHER", help="The run to compare with.")] = "latest",
     runs: Runs = RUNS,
-) -> Answer[documents.RunComparison]:
+) -> Answer[RunComparison]:
     """Show the differences between two runs: options, inputs, results.
 
     Exit code: 0, or 1 if they differ.
@@ -88,9 +142,9 @@ def diff(
     texts = [name for name in (SPEC, SYSTEM) if _text(one, name) != _text(other, name)]
     rows = [*facts, *((name, "differs", "differs") for name in texts)]
     text = table(rows, header=("", one.name, other.name))
-    values: list[documents.DifferentFact] = [{"key": key, "values": list(pair)} for key, *pair in facts]
+    values = [DifferentFact(key, pair) for key, *pair in facts]
     return Answer(
-        {"runs": [one.shown, other.shown], "facts": values, "files": texts},
+        RunComparison((one.shown, other.shown), values, texts),
         lambda: emit(text if rows else f"{one.name} and {other.name} do not differ"),
         1 if rows else 0,
     )
@@ -103,7 +157,7 @@ def rm(
     ],
     force: Annotated[bool, typer.Option("--force", help="Also runs in progress, and damaged ones.")] = False,
     runs: Runs = RUNS,
-) -> Answer[documents.RemovedRuns]:
+) -> Answer[RemovedRuns]:
     """Remove the folders of runs.
 
     A run that is in progress or damaged is removed only with --force. The links to the newest run are
@@ -123,7 +177,7 @@ def rm(
         for name in removed:
             say(f"removed {name}")
 
-    return Answer({"removed": removed}, tell)
+    return Answer(RemovedRuns(removed), tell)
 
 
 def flattened(record: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -196,18 +250,9 @@ def _steps(run: RunDir, record: Mapping[str, Any], status: str) -> str:
     return planned
 
 
-def _listed(run: RunDir, record: Mapping[str, Any], status: str) -> documents.ListedRun:
-    return {
-        "run": f"{run.path.parent.name}/{run.name}",
-        "path": run.shown,
-        "status": status,
-        "accuracy": _accuracy(record),
-        "spec": record.get("spec"),
-        "system_path": record.get("system_path"),
-        "steps": record.get("steps"),
-        "seed": record.get("seed"),
-        "started": record.get("started"),
-    }
+def _listed(run: RunDir, record: Mapping[str, Any], status: str) -> ListedRun:
+    facts = {name: record.get(name) for name in ("spec", "system_path", "steps", "seed", "started")}
+    return ListedRun(f"{run.path.parent.name}/{run.name}", run.shown, status, _accuracy(record), **facts)
 
 
 _VOLATILE = ("started", "finished", "command", "result.seconds", "seconds")

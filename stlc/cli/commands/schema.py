@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from stlc.cli.framework.output import emit
+from stlc.cli.framework.output import Document, emit
 from stlc.cli.framework.program import command
-from stlc.cli.framework.results import RESULTS, DocumentRecord, result_of
+from stlc.cli.framework.results import RESULTS, result_of
 from stlc.diagnostics import usage
 from stlc.registry import did_you_mean
 
@@ -67,9 +67,9 @@ def load_schema(name: str) -> dict[str, Any]:
     from stlc.records import schema_of
 
     if command == LINE:
-        from stlc.cli.framework.documents import RobustnessLine
+        from stlc.controller.deployment.live import RobustnessLine
 
         return {"$schema": _DIALECT, "title": wanted, **schema_of(RobustnessLine)}
-    frame = schema_of(DocumentRecord)
+    frame = schema_of(Document)
     frame["properties"] |= {"schema": {"const": wanted}, "result": schema_of(result_of(command))}
     return {"$schema": _DIALECT, "title": wanted, **frame}

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stlc.cli.framework.options import SetOption
 from stlc.cli.framework.output import Answer, emit, say, show_diagnostics, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.escape import visible
-from stlc.options import Seed, parse_overrides
+from stlc.options import NONE_GIVEN, Overrides, Seed
 
 if TYPE_CHECKING:
     from stlc.diagnostics import Diagnostic
@@ -29,12 +28,12 @@ GROUP = group("Show, check and list system files.", "stlc system show car.yaml")
 
 
 @subcommand(GROUP, "show", "stlc system show car.yaml")
-def show(system: _File, set_: SetOption = None) -> Answer[SystemFacts]:
+def show(system: _File, set_: Overrides = NONE_GIVEN) -> Answer[SystemFacts]:
     """Show the declarations of a system file, from states to scenarios."""
     from stlc.dynamics.declaration.decl import describe as in_words
     from stlc.dynamics.facts import SystemFacts
 
-    decl = _load(system, parse_overrides(set_))
+    decl = _load(system, set_)
 
     def tell() -> None:
         say(f"system {decl.path}")
@@ -51,7 +50,7 @@ def check(
         int, typer.Option(min=0, help="Steps of the rollouts; with 0 the file is only read.")
     ] = 32,
     seed: Seed = 0,
-    set_: SetOption = None,
+    set_: Overrides = NONE_GIVEN,
 ) -> Answer[SystemFacts]:
     """Validate a system file with random rollouts.
 
@@ -61,7 +60,7 @@ def check(
     """
     from stlc.dynamics.facts import DrivenSteps, SystemFacts
 
-    decl = _load(system, parse_overrides(set_))
+    decl = _load(system, set_)
     warnings = _roll_out(decl, steps, seed) if steps else decl.warnings
     compared: list[Comparison] = []
     robots = [function for function in decl.functions if function.body is not None]
@@ -109,7 +108,7 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def _load(name: str, overrides: dict[str, str]) -> SystemDecl:
+def _load(name: str, overrides: Mapping[str, str]) -> SystemDecl:
     from stlc.dynamics.load import load_system_decl
     from stlc.files import find_system
 

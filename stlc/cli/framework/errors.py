@@ -14,7 +14,7 @@ from typing import Any
 import typer
 
 from stlc.cli.framework.help import MOVED_OPTIONS
-from stlc.cli.framework.output import emit_json, show_diagnostics
+from stlc.cli.framework.output import Document, show_diagnostics
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, os_reason
 from stlc.extras import absent
 
@@ -56,7 +56,7 @@ def report(error: BaseException, argv: Sequence[str]) -> int:
             return _stopped(INTERRUPTED, argv)
     known = _known(error) or _crash(error, argv)
     if wants_json(argv):
-        emit_json(_schema(argv), ok=False, exit_code=known.exit_code, diagnostics=known.diagnostics)
+        Document(_schema(argv), known.exit_code, known.diagnostics).print()
     else:
         show_diagnostics(known.diagnostics)
     return known.exit_code
@@ -68,7 +68,7 @@ def _stopped(code: int, argv: Sequence[str]) -> int:
     If the command was interrupted and its options ask for JSON, a JSON document is printed.
     """
     if code in (INTERRUPTED, TERMINATED) and wants_json(argv):
-        emit_json(_schema(argv), ok=False, exit_code=code)
+        Document(_schema(argv), code).print()
     return code
 
 

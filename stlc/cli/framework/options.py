@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,11 +12,9 @@ import typer
 from stlc.cli.framework.completion import run_names
 from stlc.diagnostics import usage
 from stlc.files import STDIN, real
-from stlc.options import METHOD_OPTION, REQUIRE, SET, parse_pairs, parse_seconds
-from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
-    from stlc.controller.search.planner_policy import PlannerChoice
+    pass
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on the standard output.")]
 RunArgument = Annotated[
@@ -31,9 +29,6 @@ SpecsArgument = Annotated[
     list[str] | None,
     typer.Argument(metavar="FILE…", help="Specifications, folders, or -; the current folder if none."),
 ]
-SetOption = Annotated[list[str] | None, SET]
-RequireOption = Annotated[list[str] | None, REQUIRE]
-SeedsOption = Annotated[str, typer.Option("--seeds", metavar="SEEDS", help="Such as 0..9 or 0,3.")]
 FailUnderOption = Annotated[
     float | None,
     typer.Option(
@@ -44,19 +39,6 @@ FailUnderOption = Annotated[
         help="Exit with 1 if a smaller share satisfies everything, else with 0.",
     ),
 ]
-PicturesOption = Annotated[bool, typer.Option(help="Draw pictures and the report.")]
-MethodOptionsOption = Annotated[list[str] | None, METHOD_OPTION]
-
-
-def planner_choice(name: str, pairs: Sequence[str] | None, budget: str) -> PlannerChoice:
-    """Return the planner called `name` (`--method`), with the values of `--option` and `--budget`.
-
-    `pairs` are the values `NAME=VALUE` of `--option`. Raises UsageError (U101).
-    """
-    from stlc.controller.search.planner_policy import PlannerChoice
-
-    options = parse_pairs(pairs, "--option", "NAME=VALUE", "tries=500")
-    return PlannerChoice(PLANNERS.chosen(name), options, parse_seconds(budget))
 
 
 def require_separate(

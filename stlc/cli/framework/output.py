@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, Literal, TextIO, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TextIO, TypeVar, cast
 
 from stlc.activity import PULSE
 from stlc.diagnostics import Diagnostic, Notice
 from stlc.escape import screen, visible
-from stlc.jsontext import dumps, plain
+from stlc.jsontext import dumps
+from stlc.version import __version__
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -51,34 +52,37 @@ def say(text: str) -> None:
         _write(sys.stderr, visible(text))
 
 
-def emit_json(
-    schema: str,
-    *,
-    ok: bool,
-    exit_code: int,
-    diagnostics: Iterable[Diagnostic] = (),
-    result: object = None,
-) -> None:
-    """Write the JSON document of a command to the standard output.
+@dataclass(frozen=True, slots=True)
+class Document:
+    """JSON document of a command.
 
-    Args:
-        schema: name and major number, such as "check/1".
-        ok: whether the command succeeded and its answer is positive, such as "satisfied".
+    Attributes:
+        schema: name and major number of its JSON Schema, such as "check/1".
         exit_code: exit code of the command.
         diagnostics: errors and warnings.
         result: record of the command; numbers that are not finite are written as texts.
     """
-    from stlc.version import __version__
 
-    document = {
-        "stlc": __version__,
-        "schema": schema,
-        "ok": ok,
-        "exit_code": exit_code,
-        "diagnostics": plain(list(diagnostics)),
-        "result": plain(result),
-    }
-    emit(dumps(document, indent=2))
+    JSON: ClassVar = "stlc schema ok exit_code diagnostics result"
+
+    schema: str
+    exit_code: int
+    diagnostics: Sequence[Diagnostic] = ()
+    result: Any = None
+
+    @property
+    def stlc(self) -> str:
+        """Version of stlc."""
+        return __version__
+
+    @property
+    def ok(self) -> bool:
+        """True if the command succeeded and its answer is positive, such as "satisfied"."""
+        return self.exit_code == 0
+
+    def print(self) -> None:
+        """Write the document to the standard output."""
+        emit(dumps(self, indent=2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +107,7 @@ class Answer(Generic[R]):
         `schema` names the JSON Schema of the document, such as "check/1".
         """
         if as_json:
-            ok, findings = self.code == 0, self.diagnostics
-            emit_json(schema, ok=ok, exit_code=self.code, diagnostics=findings, result=self.result)
+            Document(schema, self.code, tuple(self.diagnostics), self.result).print()
         else:
             self.show()
         return self.code

@@ -17,8 +17,8 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from types import FrameType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from types import FrameType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -31,7 +31,7 @@ from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.output import COLOR, QUIET, Answer, ColorMode, emit, noticing, silence
 from stlc.diagnostics import Diagnostic, PluginError, UsageError
 from stlc.foreign import driving
-from stlc.options import Option, described
+from stlc.options import Option, described, flags, parts
 from stlc.registry import Registry
 from stlc.version import __version__
 
@@ -143,7 +143,7 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     if answers and not passed:
         option = inspect.Parameter.POSITIONAL_OR_KEYWORD
         spread.append(inspect.Parameter("json", option, default=False, annotation=JsonOption))
-    read = {each.name: (each.default, parse) for each in spread if (parse := _parts(each.annotation)[2])}
+    read = {each.name: (each.default, parse) for each in spread if (parse := parts(each.annotation)[2])}
     spread = [_on_command_line(each, *told.get(each.name, (None, ""))) for each in spread]
 
     def run(**values: Any) -> Any:
@@ -163,31 +163,18 @@ def flat(function: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-def _parts(hint: Any) -> tuple[Any, Option | None, Callable[[Any], Any] | None]:
-    """Type of an option without its description, the description, and the function that reads its text."""
-    if get_origin(hint) in (Union, UnionType):
-        found = [_parts(each) for each in get_args(hint)]
-        described = [each for each in found if each[1] is not None]
-        return (hint, None, None) if not described else (described[0][0] | None, *described[0][1:])
-    parts = get_args(hint) if get_origin(hint) is Annotated else ()
-    if len(parts) < 2 or not isinstance(parts[1], Option):
-        return hint, None, None
-    return parts[0], parts[1], parts[2] if len(parts) > 2 else None
-
-
 def _on_command_line(parameter: inspect.Parameter, metavar: str | None, told: str) -> inspect.Parameter:
     """Return a parameter as typer declares it, if an `Option` or the docstring (`told`) describes it."""
-    kind, option, parse = _parts(parameter.annotation)
+    kind, option, parse = parts(parameter.annotation)
     if option is None and not told:
         return parameter
     option = option or Option()
     help_, _, shown = (told or option.help).removesuffix(".").partition("; by default ")
-    name = f"--{parameter.name.rstrip('_').replace('_', '-')}"
     if parse is not None or option.many:
         kind = list[str] | None if option.many else str | None
         parameter = parameter.replace(default=None)
     found = typer.Option(
-        *(option.flags or (name,)),
+        *flags(parameter.name, option),
         help=f"{help_}.",
         metavar=metavar or option.metavar,
         min=option.least,

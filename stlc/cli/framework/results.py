@@ -5,11 +5,9 @@ from __future__ import annotations
 from functools import reduce
 from importlib import import_module
 from operator import or_
-from typing import Any, TypedDict
+from typing import Any
 
-from stlc.diagnostics import Diagnostic
-
-_DOCUMENTS = "stlc.cli.framework.documents"
+_COMMANDS = "stlc.cli.commands"
 RESULTS: dict[str, tuple[str, ...]] = {
     "certify": (
         "stlc.assurance.certificates:BoundedDrives",
@@ -19,10 +17,10 @@ RESULTS: dict[str, tuple[str, ...]] = {
     "check": ("stlc.assurance.certificate:BoundedVerdict", "stlc.assurance.certificate:JudgedFiles"),
     "compile": (
         "stlc.compile.described:CompiledSpec",
-        f"{_DOCUMENTS}:ParsedFile",
-        f"{_DOCUMENTS}:ParsedFiles",
+        f"{_COMMANDS}.compile:ParsedFile",
+        f"{_COMMANDS}.compile:ParsedFiles",
     ),
-    "doctor": (f"{_DOCUMENTS}:InstallationReport",),
+    "doctor": (f"{_COMMANDS}.doctor:InstallationReport",),
     "explain": (
         "stlc.grammar.manual:CodeList",
         "stlc.grammar.manual:Page",
@@ -36,33 +34,22 @@ RESULTS: dict[str, tuple[str, ...]] = {
         "stlc.assurance.falsified:ReplayedCounterexample",
         "stlc.assurance.falsified:ReplayedFinding",
     ),
-    "fmt": (f"{_DOCUMENTS}:FormattedFiles",),
-    "init": (f"{_DOCUMENTS}:CreatedFiles",),
+    "fmt": (f"{_COMMANDS}.fmt:FormattedFiles",),
+    "init": (f"{_COMMANDS}.init:CreatedFiles",),
     "lint": ("stlc.monitor.linted:Lint",),
     "plan": ("stlc.assurance.verification.planned:Plans",),
-    "plot": (f"{_DOCUMENTS}:PlottedTrace",),
+    "plot": (f"{_COMMANDS}.plot:PlottedTrace",),
     "report": ("stlc.view.report:Report",),
     "runs": tuple(
-        f"{_DOCUMENTS}:{name}" for name in ("RunList", "RunComparison", "RunContent", "RemovedRuns")
+        f"{_COMMANDS}.runs:{name}" for name in ("RunList", "RunComparison", "RunContent", "RemovedRuns")
     ),
     "simulate": ("stlc.assurance.simulated:Simulation", "stlc.plants.judge:PlantSimulation"),
     "stlc": (),
     "system": ("stlc.dynamics.facts:SystemList", "stlc.dynamics.facts:SystemFacts"),
-    "train": (f"{_DOCUMENTS}:TrainedRun", f"{_DOCUMENTS}:TrainedRuns"),
+    "train": (f"{_COMMANDS}.train.trained:TrainedRun", f"{_COMMANDS}.train.trained:TrainedRuns"),
     "verify": ("stlc.assurance.verification.verified:Verified",),
 }
 """Name of a command, or `stlc` for those without a result -> `module:class` of its results."""
-
-
-class DocumentRecord(TypedDict):
-    """Keys that the documents of all commands share."""
-
-    stlc: str
-    schema: str
-    ok: bool
-    exit_code: int
-    diagnostics: list[Diagnostic]
-    result: Any
 
 
 def result_of(command: str) -> Any:

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 A = TypeVar("A")
 End: TypeAlias = Literal["open", "strict", "truncate"]
 """Verdict on a trace that is too short: bounds over all continuations, an error, or that of cut windows."""
-Status: TypeAlias = Literal["satisfied", "violated", "inconclusive", "out of scope"]
+StatusInScope: TypeAlias = Literal["satisfied", "violated", "inconclusive"]
+Status: TypeAlias = Literal[StatusInScope, "out of scope"]
 """Outcome of a requirement; out of scope if an assumption does not hold."""
 TOLERANCE = 1e-6
 """A requirement counts as satisfied if its robustness is >= -TOLERANCE, in float64.
@@ -62,7 +63,7 @@ def violated(rho: Any, tolerance: float | None = None) -> Any:
     return rho < -(tolerance_of(rho) if tolerance is None else tolerance)
 
 
-def status_of(violated: bool, satisfied: bool) -> Status:
+def status_of(violated: bool, satisfied: bool) -> StatusInScope:
     """Return the status of what is violated, satisfied, or neither."""
     return "violated" if violated else "satisfied" if satisfied else "inconclusive"
 

@@ -2,19 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.semantics.tolerance import StatusInScope
 from stlc.controller.guard.candidates import SOURCES
+from stlc.jsontext import Count, Num
 from stlc.monitor.online.margins import Margin, Margins
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.batched import Setting
     from stlc.controller.deployment.simulator import SimulationStep
     from stlc.controller.problem.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class LiveMargin:
+    """Bounds on the robustness of a requirement until now, and the number of violated instants."""
+
+    status: StatusInScope
+    low: Num
+    high: Num
+    violated: Count
+
+
+@dataclass(frozen=True, slots=True)
+class RobustnessLine:
+    """Line that `stlc simulate --robustness` writes for an agent at a step.
+
+    Attributes:
+        step, t: step of the deployment, and its time in seconds.
+        seed, agent: seed of the run, and number of the agent.
+        decided: what made its plan; None after the last step, as are the following.
+        plan_rho: robustness of the plan that is followed.
+        policy_rho: robustness of the plan of the policy.
+        plan_safe: whether the plan that is followed satisfies the requirements tagged `@safety`.
+        margins: name of a requirement -> its margin.
+    """
+
+    step: Count
+    t: float
+    seed: int
+    agent: Count
+    decided: str | None
+    plan_rho: Num | None
+    policy_rho: Num | None
+    plan_safe: bool | None
+    margins: Mapping[str, LiveMargin]
 
 
 class LiveMonitor:
@@ -62,31 +100,28 @@ class LiveMonitor:
         name, t0 = SOURCES[int(decision.source[row])], int(decision.t0[row])
         return f"{name} T0={t0}" if name == "backup" else name
 
-    def records(self) -> Iterator[dict[str, Any]]:
-        """Yield, for the latest step, one JSON object per agent.
-
-        `stlc simulate --robustness` writes these objects.
-        """
+    def lines(self) -> Iterator[RobustnessLine]:
+        """Yield, for the latest step, the line of each agent."""
         assert self.moment is not None
         margins, decision = self.margins, self.moment.decision
         for row in range(len(self.moment.x)):
             seed, agent = divmod(row, self.setting.agents)
-            yield {
-                "step": self.moment.step,
-                "t": round(self.time, 9),
-                "seed": self.setting.seeds[seed],
-                "agent": agent,
-                "decided": self.decided(row),
-                "plan_rho": None if decision is None else float(decision.rho[row]),
-                "policy_rho": None if decision is None else float(decision.policy_rho[row]),
-                "plan_safe": None if decision is None else bool(decision.safe[row]),
-                "margins": {
-                    name: {
-                        "status": found.status(row),
-                        "low": float(found.low[row]),
-                        "high": float(found.high[row]),
-                        "violated": int(found.violated[row]),
-                    }
+            yield RobustnessLine(
+                step=self.moment.step,
+                t=round(self.time, 9),
+                seed=self.setting.seeds[seed],
+                agent=agent,
+                decided=self.decided(row),
+                plan_rho=None if decision is None else float(decision.rho[row]),
+                policy_rho=None if decision is None else float(decision.policy_rho[row]),
+                plan_safe=None if decision is None else bool(decision.safe[row]),
+                margins={
+                    name: LiveMargin(
+                        found.status(row),
+                        float(found.low[row]),
+                        float(found.high[row]),
+                        int(found.violated[row]),
+                    )
                     for name, found in margins.items()
                 },
-            }
+            )

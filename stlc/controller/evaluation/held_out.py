@@ -6,7 +6,7 @@ import io
 import json
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -70,7 +70,7 @@ class Score:
     searched: Tensor
     endless: float | None = None
 
-    def summary(self) -> dict[str, object]:
+    def summary(self) -> dict[str, Any]:
         """The shares and counts as a JSON object for `run.json`."""
         return {
             "accuracy": self.accuracy,

@@ -70,6 +70,25 @@ that ended early is repeated by one of as many simulations.
 """
 
 
+@dataclass(frozen=True, slots=True)
+class FalsificationRounds:
+    """Counts of the rounds of a training.
+
+    Attributes:
+        rounds: number of rounds.
+        drives: number of drives with a verdict.
+        failing: number of drives that violated a requirement.
+        last_share: share of the drives of the last round that did.
+        states: number of kept states.
+    """
+
+    rounds: int
+    drives: int
+    failing: int
+    last_share: float
+    states: int
+
+
 @dataclass(slots=True)
 class FailureStates:
     """States of failing drives, and the progress of the rounds that supply them.
@@ -159,15 +178,9 @@ class FailureStates:
         order = torch.randperm(len(self.states), generator=generator)[:count]
         return self.states[order.to(self.states.device)]
 
-    def summary(self) -> dict[str, float | int]:
+    def summary(self) -> FalsificationRounds:
         """Counts for the record of the run."""
-        return {
-            "rounds": self.rounds,
-            "drives": self.drives,
-            "failing": self.failing,
-            "last_share": self.latest,
-            "states": len(self.states),
-        }
+        return FalsificationRounds(self.rounds, self.drives, self.failing, self.latest, len(self.states))
 
     # ------------------------------------------------------------- checkpoints
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir.support import columns_in, history
-from stlc.compile.semantics.tolerance import Status, satisfied, status_of, violated
+from stlc.compile.semantics.tolerance import StatusInScope, satisfied, status_of, violated
 from stlc.monitor.instants import window_of
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.recompute import RecomputeTracker
@@ -40,7 +40,7 @@ class Margin:
     violated: Counts
     open: NDArray[np.bool_]
 
-    def status(self, trace: int) -> Status:
+    def status(self, trace: int) -> StatusInScope:
         """Violated if violated at any window start of the trace, satisfied if at none and none is open."""
         return status_of(bool(self.violated[trace]), not self.open[trace])
 

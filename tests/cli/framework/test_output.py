@@ -9,9 +9,9 @@ import pytest
 from stlc.cli.framework import output
 from stlc.cli.framework.output import (
     COLOR,
+    Document,
     console,
     emit,
-    emit_json,
     say,
     show_diagnostics,
     table,
@@ -40,7 +40,7 @@ def test_the_result_and_the_talk_take_different_ways(capsys):
 
 
 def test_a_document_is_json_for_every_reader(capsys):
-    emit_json("check/1", ok=False, exit_code=1, result={"robustness": [float("-inf"), 0.5]})
+    Document("check/1", 1, result={"robustness": [float("-inf"), 0.5]}).print()
     document = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert document["result"] == {"robustness": ["-inf", 0.5]}
     assert list(document) == ["stlc", "schema", "ok", "exit_code", "diagnostics", "result"]

@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import typer
 
-from stlc.cli.framework.options import RequireOption, SetOption
 from stlc.compile.semantics.tolerance import TOLERANCE, End
 from stlc.diagnostics import usage
 from stlc.escape import operand
 from stlc.monitor.check import Question, seconds_of
-from stlc.options import Runs, SystemName, parse_overrides, parse_pairs
+from stlc.options import (
+    REQUIRE,
+    SET,
+    Runs,
+    SystemName,
+    command_line,
+    flags_of,
+    parse_overrides,
+    parse_pairs,
+    words_of,
+)
 from stlc.registry import SEMANTICS
 
 if TYPE_CHECKING:
@@ -44,8 +53,8 @@ class Traces:
 
     spec: Path | None = None
     system: SystemName = None
-    set_: SetOption = None
-    require: RequireOption = None
+    set_: Annotated[list[str] | None, SET] = None
+    require: Annotated[list[str] | None, REQUIRE] = None
     map_: list[str] | None = None
     resample: str | None = None
     between: list[str] | None = None
@@ -58,28 +67,22 @@ class Traces:
     runs: Runs = Path("runs")
 
     def words(self) -> dict[str, tuple[str, ...]]:
-        """The options as they were given: name -> the values of all occurrences, "" for a switch."""
-        found: dict[str, tuple[str, ...]] = {}
-        for name, option in _declared(type(self)).items():
-            value = getattr(self, option)
-            if value is None or value is False or value == [] or option == "runs":
-                continue
-            values = value if isinstance(value, list | tuple) else [value]
-            found[name] = tuple("" if each is True else str(each) for each in values)
-        return found
+        """The options as they were given: flag -> the texts of all occurrences, "" for a switch."""
+        return {flag: texts for flag, texts in words_of(self).items() if flag != "--runs"}
 
     @property
     def replay(self) -> tuple[str, ...]:
         """Words of a command line that reads the same trace, to explain one of its violations."""
         given = self.words()
         words = [operand(spec) for spec in given.get("--spec", ())]
-        words += [word for name in _REPLAYED for value in given.get(name, ()) for word in (name, value)]
+        words += command_line({flag: given.get(flag, ()) for flag in _REPLAYED})
         return (*words, *(("--group", "none") if self.group == "none" else ()))
 
     @classmethod
     def from_words(cls, words: Mapping[str, Sequence[str]]) -> Self:
         """Return the options that `words` gave. Raises ValueError for an option that there is not."""
-        declared, hints, given = _declared(cls), get_type_hints(cls), dict[str, Any]()
+        declared = {flag: name for name, flag in flags_of(cls).items()}
+        hints, given = get_type_hints(cls), dict[str, Any]()
         for name, values in words.items():
             kind = str(hints.get(declared.get(name, "")))
             if name not in declared or not values or not all(isinstance(value, str) for value in values):
@@ -117,11 +120,6 @@ _REPLAYED = (
     *("--system", "--map", "--set", "--resample", "--dt", "--max-gap", "--between", "--clock", "--fps"),
     *("--columns", "--uncertain"),
 )
-
-
-def _declared(kind: type) -> dict[str, str]:
-    """Name of each option of a dataclass of options -> its field."""
-    return {f"--{each.name.rstrip('_').replace('_', '-')}": each.name for each in fields(kind)}
 
 
 TRACES = Traces()

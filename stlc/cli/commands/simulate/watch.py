@@ -112,5 +112,5 @@ def _write(monitor: LiveMonitor, stream: TextIO) -> None:
     from stlc.jsontext import dumps
 
     with tolerate_closed(stream):
-        stream.writelines(dumps(record) + "\n" for record in monitor.records())
+        stream.writelines(dumps(line) + "\n" for line in monitor.lines())
         stream.flush()

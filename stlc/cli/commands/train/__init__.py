@@ -14,19 +14,21 @@ import typer
 
 from stlc.cli.commands.train.many import Many, train_many
 from stlc.cli.framework.completion import run_names
-from stlc.cli.framework.options import PicturesOption, SetOption
 from stlc.cli.framework.output import Answer, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, usage
 from stlc.options import (
+    NONE_GIVEN,
     Cluster,
     Jobs,
+    Option,
+    Overrides,
     Runs,
     SystemName,
+    flags_of,
     given,
-    parse_overrides,
     parse_seeds,
 )
 from stlc.registry import METHODS
@@ -34,7 +36,7 @@ from stlc.rundir import RUNS, RunDir
 
 if TYPE_CHECKING:
     from stlc.cli.commands.train.session import Session
-    from stlc.cli.framework.documents import TrainedRun, TrainedRuns
+    from stlc.cli.commands.train.trained import TrainedRun, TrainedRuns
     from stlc.controller.problem.task import Task
     from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
@@ -61,9 +63,11 @@ def train(
     system: SystemName = None,
     options: TrainOptions = OPTIONS,
     seeds: Annotated[
-        str | None,
-        typer.Option(metavar="SEEDS", help="Several runs, such as 0..2 or 0,3, in processes of their own."),
-    ] = None,
+        Sequence[int],
+        Option("Several runs, such as 0..2 or 0,3, in processes of their own.", "SEEDS"),
+        parse_seeds,
+    ]
+    | None = None,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     resume: Annotated[
@@ -75,8 +79,8 @@ def train(
         str | None, typer.Option(metavar="tensorboard", help="Also write the curves for TensorBoard.")
     ] = None,
     runs: Runs = RUNS,
-    pictures: PicturesOption = True,
-    set_: SetOption = None,
+    pictures: Annotated[bool, typer.Option(help="Draw pictures and the report.")] = True,
+    set_: Overrides = NONE_GIVEN,
 ) -> Answer[TrainedRun | TrainedRuns]:
     """Train a policy that satisfies a specification.
 
@@ -88,7 +92,7 @@ def train(
     changed = {name: value for name, value in given(options).items() if value != getattr(usual, name)}
     if "budget" in changed and "steps" in changed:
         raise usage("`--budget` and `--steps` contradict each other")
-    own = {"--system": system, "--seeds": seeds, "--name": name, "--set": set_, "--cluster": cluster}
+    own = {"--system": system, "--seeds": seeds, "--name": name, "--set": set_ or None, "--cluster": cluster}
     logger = _logger(log)
     if resume is not None:
         if isinstance(options.steps, StepSchedule):
@@ -103,14 +107,15 @@ def train(
     from stlc.controller.training.launch import Launch
 
     config = TrainConfig(**given(options))
-    launch = Launch(root=runs, name=name, overrides=parse_overrides(set_), command=sys.argv[1:])
-    drawn = parse_seeds(seeds) if seeds is not None else (options.seed,)
+    launch = Launch(root=runs, name=name, overrides=set_, command=sys.argv[1:])
     if len(specs) < 2:  # errors of a single specification are reported once, before the first of several runs
         with one_voice():
             task = _task(specs, system, launch.overrides, config.method)
             if seeds is None and cluster is None:
                 return _train(task, config, launch, logger).conclude(pictures=pictures)
-    return train_many(Many(specs, system, config, launch, drawn, jobs, cluster, log, pictures))
+    return train_many(
+        Many(specs, system, options, launch, seeds or (options.seed,), jobs, cluster, log, pictures)
+    )
 
 
 def _check_together(specs: Sequence[Path], jobs: int, given: Mapping[str, object]) -> None:
@@ -232,8 +237,7 @@ def _refuse_on_resume(own: Mapping[str, object], changed: Mapping[str, object]) 
     Only the length of the training and `--device` can be changed. `changed` are options of the training.
     """
     named = [option for option, value in own.items() if value is not None]
-    flags = {"options": "--option", "clock": "--budget-clock"}
-    named += [flags.get(name, f"--{name.replace('_', '-')}") for name in changed]
+    named += [flag for name, flag in flags_of(TrainOptions).items() if name in changed]
     named = [option for option in named if option not in ("--budget", "--steps", "--device")]
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"

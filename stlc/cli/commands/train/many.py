@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from stlc.cli.commands.train.trained import JudgedTraining, TrainedJob, TrainedRun, TrainedRuns
 from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.escape import operand
+from stlc.options import command_line, words_of
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.documents import TrainedJob, TrainedRuns
     from stlc.controller.parallel.jobs import Job, JobResult
-    from stlc.controller.training.config import TrainConfig
     from stlc.controller.training.launch import Launch
+    from stlc.controller.training.options import TrainOptions
 
 HEADER = ("seed", "drives", "accuracy", "95 % interval", "known feasible", "worst requirement", "time", "run")
 ENDED = 70
@@ -42,7 +43,7 @@ class Many:
     Attributes:
         specs: files of the specifications.
         system: system file of `--system`, or None; allowed for a single specification only.
-        config: training options that all runs share.
+        options: training options that all runs share.
         launch: folder, name and overrides of the runs.
         seeds: seeds with which each specification is trained for; None is the seed in the system file.
         jobs: number of runs at a time, each in its own process.
@@ -53,7 +54,7 @@ class Many:
 
     specs: Sequence[Path]
     system: str | None
-    config: TrainConfig
+    options: TrainOptions
     launch: Launch
     seeds: Sequence[int | None]
     jobs: int
@@ -81,34 +82,16 @@ class Many:
         """
         from stlc.controller.parallel.jobs import Job
 
-        config, launch = self.config, self.launch
-        threads = config.threads or (1 if self.jobs > 1 or self.cluster is not None else None)
+        options, launch = self.options, self.launch
+        threads = options.threads or (1 if self.jobs > 1 or self.cluster is not None else None)
         seeded = "" if part.seed is None else f"-seed{part.seed}"
         name = None if launch.name is None else f"{launch.name}{seeded}"
-        options: Mapping[str, object] = {
-            "--seed": part.seed,
-            "--system": self.system,
-            "--budget": None if config.budget is None else f"{config.budget!r}s",
-            "--budget-clock": config.clock,
-            "--steps": config.steps,
-            "--method": config.method,
-            "--name": name,
-            "--device": config.device,
-            "--threads": threads,
-            "--plans": config.plans,
-            "--lr": config.lr,
-            "--batch": config.batch,
-            "--held-out": config.held_out,
-            "--drives": config.drives,
-            "--log": self.log,
-            "--runs": launch.root,
-        }
-        given = [word for key, value in options.items() if value is not None for word in (key, str(value))]
-        changed = [word for key, value in launch.overrides.items() for word in ("--set", f"{key}={value}")]
-        own = [word for key, value in config.options.items() for word in ("--option", f"{key}={value}")]
+        words = words_of(replace(options, seed=part.seed, threads=threads))
+        own = {"--system": self.system, "--name": name, "--log": self.log, "--runs": launch.root}
+        words |= {flag: (str(value),) for flag, value in own.items() if value is not None}
+        words["--set"] = tuple(f"{key}={value}" for key, value in launch.overrides.items())
         drawn = () if self.pictures else ("--no-pictures",)
-        driven = ("--falsify",) if config.falsify else ()
-        arguments = (operand(str(part.spec)), *given, *own, *changed, *driven, *drawn)
+        arguments = (operand(str(part.spec)), *command_line(words), *drawn)
         if self.cluster is None:
             return Job(self.name(part), arguments)
         from stlc.controller.parallel.inputs import input_files
@@ -124,7 +107,7 @@ def train_many(many: Many) -> Answer[TrainedRuns]:
     """
     from stlc.controller.parallel import executor
 
-    cores, gpus = many.config.threads or 1, int(many.config.device != "cpu")
+    cores, gpus = many.options.threads or 1, int(many.options.device != "cpu")
     started = "begins" if many.cluster is None else "is sent"
     processes = executor(many.jobs, many.cluster, cores=cores, gpus=gpus)
     found: dict[str, JobResult] = {}
@@ -138,16 +121,18 @@ def train_many(many: Many) -> Answer[TrainedRuns]:
         say(f"interrupted; runs that were going are saved: stlc runs list --runs {many.launch.root}")
         raise
     records = [_record(part, found[many.name(part)]) for part in many.parts]
-    code = max((each["exit_code"] if each["exit_code"] >= 0 else ENDED) for each in records)
-    return Answer({"runs": records}, lambda: emit(_table(records, several=len(many.specs) > 1)), code)
+    code = max(each.exit_code if each.exit_code >= 0 else ENDED for each in records)
+    return Answer(TrainedRuns(records), lambda: emit(_table(records, several=len(many.specs) > 1)), code)
 
 
 def _record(part: Part, ended: JobResult) -> TrainedJob:
-    seed = {} if part.seed is None else {"seed": part.seed}
-    why = {"why": ended.why} if ended.result.get("accuracy") is None else {}
-    made: Any = {"spec": str(part.spec), **seed, "exit_code": ended.code, **why, **ended.result}
-    record: TrainedJob = made
-    return record
+    facts = dict(ended.result)
+    run = TrainedRun(facts.pop("run"), facts.pop("seconds")) if facts else None
+    if run is None or not facts:
+        return TrainedJob(str(part.spec), part.seed, ended.code, ended.why, run)
+    return TrainedJob(
+        str(part.spec), part.seed, ended.code, trained=replace(run, judged=JudgedTraining(**facts))
+    )
 
 
 def _line(ended: JobResult) -> str:
@@ -164,7 +149,7 @@ def _table(records: Sequence[TrainedJob], *, several: bool) -> str:
     A row with the mean follows the runs of each specification that was trained several times.
     """
     rows: list[tuple[str, ...]] = []
-    for spec, group in groupby(records, key=lambda record: record["spec"]):
+    for spec, group in groupby(records, key=lambda record: record.spec):
         own = list(group)
         lines = [*map(_cells, own), *_mean(own)]
         rows += [(spec, *line) if several else line for line in lines]
@@ -172,35 +157,31 @@ def _table(records: Sequence[TrainedJob], *, several: bool) -> str:
 
 
 def _cells(record: TrainedJob) -> tuple[str, ...]:
-    seed = str(record.get("seed", ""))
-    if record.get("accuracy") is None:
-        return (seed, "", f"exit code {record['exit_code']}")
-    low, high = record["interval"]
-    shares, feasible = record["requirements"], record["feasible"]
-    worst = min(shares, key=shares.__getitem__)
-    return (
-        *(seed, _drives(record), f"{record['accuracy']:.4f}", f"[{low:.4f}, {high:.4f}]"),
-        *(f"{feasible:.4f}", f"{worst} {shares[worst]:.4f}"),
-        *(f"{record['seconds']:.0f} s", record["run"]),
-    )
-
-
-def _drives(record: TrainedJob) -> str:
-    """The drives that obey under the recommended guard, or under that with which most do."""
     from stlc.view.learning import best_drives
 
-    best = best_drives(record)
-    return "" if best is None else f"{best['satisfied']:,} of {best['drives']:,}, {best['guard']}"
+    seed = "" if record.seed is None else str(record.seed)
+    run = record.trained
+    if run is None or run.judged is None:
+        return (seed, "", f"exit code {record.exit_code}")
+    found, best = run.judged, best_drives({"closed_loop": run.judged.closed_loop})
+    drives = "" if best is None else f"{best['satisfied']:,} of {best['drives']:,}, {best['guard']}"
+    low, high = found.interval
+    worst = min(found.requirements, key=found.requirements.__getitem__)
+    return (
+        *(seed, drives, f"{found.accuracy:.4f}", f"[{low:.4f}, {high:.4f}]"),
+        *(f"{found.feasible:.4f}", f"{worst} {found.requirements[worst]:.4f}"),
+        *(f"{run.seconds:.0f} s", run.run),
+    )
 
 
 def _mean(records: Sequence[TrainedJob]) -> list[tuple[str, ...]]:
     """Row with the means over the runs that succeeded, as a list; empty if fewer than two succeeded."""
-    finished = [record for record in records if record.get("accuracy") is not None]
+    finished = [each.trained.judged for each in records if each.trained and each.trained.judged]
     if len(finished) < 2:
         return []
     from statistics import fmean
 
-    accuracies = [record["accuracy"] for record in finished]
+    accuracies = [found.accuracy for found in finished]
     spread = f"{min(accuracies):.4f} to {max(accuracies):.4f}"
-    accuracy, feasible = fmean(accuracies), fmean(record["feasible"] for record in finished)
+    accuracy, feasible = fmean(accuracies), fmean(found.feasible for found in finished)
     return [("mean", "", f"{accuracy:.4f}", spread, f"{feasible:.4f}")]

@@ -14,11 +14,12 @@ from rich.live import Live
 from rich.text import Text
 
 from stlc.cli.framework.output import console as open_console
+from stlc.jsontext import plain
 from stlc.units import time_text
 from stlc.view.learning import driven_lines
 
 if TYPE_CHECKING:
-    from stlc.cli.framework.documents import FalsificationRounds, TrainedRun
+    from stlc.cli.commands.train.trained import TrainedRun
 
 LINE_EVERY = 25.0  # seconds between lines without a terminal
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -305,21 +306,27 @@ def final_screen(
         unsolved: description of the initial states from which no satisfying plan is known.
         picture: path of a picture of the failures.
     """
-    low, high = result["interval"]
-    rows = [("closed loop", line) for line in driven_lines(result)]
-    if rounds := result.get("falsification"):
-        rows.append(("falsification", rounds_text(rounds)))
-    accuracy = f"{result['accuracy']:.3f}   95 % interval [{low:.3f}, {high:.3f}]"
-    starts = f" on {result['held_out']:,} held-out starts" + (f"   {spark}" if spark else "")
+    found = result.judged
+    assert found is not None
+    low, high = found.interval
+    rows = [("closed loop", line) for line in driven_lines({"closed_loop": plain(found.closed_loop)})]
+    if (rounds := found.falsification) is not None:
+        last = f"{percent(rounds.last_share)} of the last round's failed"
+        count = f"{rounds.rounds} round{'' if rounds.rounds == 1 else 's'}"
+        rows.append(
+            ("falsification", f"{count}, {rounds.drives:,} drives, {last}; {rounds.states:,} states kept")
+        )
+    accuracy = f"{found.accuracy:.3f}   95 % interval [{low:.3f}, {high:.3f}]"
+    starts = f" on {found.held_out:,} held-out starts" + (f"   {spark}" if spark else "")
     rows.append(("plan accuracy", accuracy + starts))
-    if feasible := result.get("feasible"):
-        share, searched = percent(result["accuracy"] / feasible), result["searched"]
-        estimate = f" (an estimate: {searched:,} starts were searched or solved)"
-        partly = 0 < searched < result["held_out"]
-        rows.append(("known feasible", f"{feasible:.3f}   of which {share} are satisfied{estimate * partly}"))
-    if judged := result.get("judged_seconds"):
+    if feasible := found.feasible:
+        estimate = f" (an estimate: {found.searched:,} starts were searched or solved)"
+        partly = 0 < found.searched < found.held_out
+        share = f"{percent(found.accuracy / feasible)} are satisfied{estimate * partly}"
+        rows.append(("known feasible", f"{feasible:.3f}   of which {share}"))
+    if judged := found.judged_seconds:
         rows.append(("judged", f"on missions of {time_text(judged)}; what is required has no end"))
-    verdict, requirements = result.get("verdict"), result["requirements"]
+    verdict, requirements = found.verdict, found.requirements
     if verdict is not None:
         rows.append(("verdict", f"{verdict.level}: {verdict.sentence}"))
     if requirements and min(requirements.values()) < 1.0:
@@ -327,8 +334,8 @@ def final_screen(
         rows += [("worst", f"{worst} {requirements[worst]:.3f}"), ("worst", region)]
     rows += [("unsolved", unsolved), ("picture", picture)]
     rows += [("what helps", advice) for advice in ([] if verdict is None else verdict.advice)]
-    steps = f", {result['steps']:,} steps" if result.get("steps") else ""
-    took = f"{result['seconds']:.0f} s of training and verdict{steps}   {result['run']}"
+    steps = f", {found.steps:,} steps" if found.steps else ""
+    took = f"{result.seconds:.0f} s of training and verdict{steps}   {result.run}"
     rows.append(("finished", took))
     rows = [(label, text) for label, text in rows if text]
     labels = ["", *(label for label, _ in rows)]
@@ -337,13 +344,6 @@ def final_screen(
         for above, (label, text) in zip(labels, rows, strict=False)
     ]
     return lines if verdict is None else [*lines, "", f"Next:  {verdict.command}"]
-
-
-def rounds_text(found: FalsificationRounds) -> str:
-    """Text on the rounds of a training with `--falsify`."""
-    last = f"{percent(found['last_share'])} of the last round's failed"
-    rounds = f"{found['rounds']} round{'' if found['rounds'] == 1 else 's'}"
-    return f"{rounds}, {found['drives']:,} drives, {last}; {found['states']:,} states kept"
 
 
 def _emphasised(line: str) -> Text:

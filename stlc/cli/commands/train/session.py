@@ -12,12 +12,14 @@ import typer
 
 from stlc.activity import PULSE
 from stlc.cli.commands.train.progress import TrainingDisplay, final_screen
+from stlc.cli.commands.train.trained import JudgedTraining, TrainedRun
 from stlc.cli.framework.errors import INTERRUPTED, TERMINATED
 from stlc.cli.framework.output import Answer, console, say, show_diagnostics
+from stlc.controller.training.failures import FalsificationRounds
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
-from stlc.jsontext import plain
+from stlc.records import from_json
 from stlc.rundir import LATEST, RUNS, RunDir, Status
 from stlc.stopping import age, leaving
 from stlc.view.learning import Commands, learning_of_run
@@ -25,7 +27,6 @@ from stlc.view.learning import Commands, learning_of_run
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
-    from stlc.cli.framework.documents import TrainedRun
     from stlc.controller.training.tensorboard import Opener, TensorBoardLogger
 
 BESIDE = 10.0
@@ -168,25 +169,24 @@ class Session:
         interrupted = TERMINATED if signal.SIGTERM in self._signals else INTERRUPTED
         if not self.writes:
             raise typer.Exit(interrupted if outcome.interrupted else 0)
-        result: TrainedRun = {"run": folder.shown, "seconds": outcome.seconds}
         if outcome.score is None:
             self._say_interrupted()
-            return Answer(result, lambda: None, interrupted)
+            return Answer(TrainedRun(folder.shown, outcome.seconds), lambda: None, interrupted)
         if pictures:
             draw_report(folder)
-        summary: Any = outcome.score.summary()
-        result |= summary
-        if outcome.simulated is not None:
-            closed_loop: Any = plain(outcome.simulated)
-            result["closed_loop"] = closed_loop
-        learning = learning_of_run(folder, _commands(folder, outcome.ranks))
-        if learning is not None:
-            result["verdict"] = learning
         record = folder.record()
-        result |= {"steps": record.get("steps"), "schedule": record.get("schedule")}
-        rounds: Any = record.get("falsification")
-        if rounds is not None:
-            result["falsification"] = rounds
+        rounds = record.get("falsification")
+        judged = JudgedTraining(
+            **outcome.score.summary(),
+            closed_loop=outcome.simulated,
+            verdict=learning_of_run(folder, _commands(folder, outcome.ranks)),
+            steps=record.get("steps"),
+            schedule=record.get("schedule"),
+            falsification=None
+            if rounds is None
+            else from_json(FalsificationRounds, rounds, f"{folder.shown}/run.json"),
+        )
+        result = TrainedRun(folder.shown, outcome.seconds, judged)
         reasons = () if outcome.why is None else (outcome.why,)
 
         def show() -> None:

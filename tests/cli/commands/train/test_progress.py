@@ -2,6 +2,7 @@
 
 import io
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -17,6 +18,8 @@ from stlc.cli.commands.train.progress import (
     native_text,
     sparkline,
 )
+from stlc.cli.commands.train.trained import JudgedTraining, TrainedRun
+from stlc.controller.training.failures import FalsificationRounds
 from stlc.view.learning import Learning
 
 RECORD = {"spec": "traffic", "system_path": "examples/car.yaml", "seed": 0, "threads": 2}
@@ -35,18 +38,17 @@ ROW = {
     "s_per_step": 0.0112,
 }
 VERDICT = Learning("trained", 0.988, "it is good", (), "stlc simulate --backup")
-RESULT = {
-    "run": "runs/traffic/0001-quiet-heron",
-    "seconds": 61.2,
-    "accuracy": 0.957,
-    "interval": [0.951, 0.962],
-    "held_out": 5000,
-    "requirements": {"no_collision": 0.996, "stop_sign": 0.971},
-    "feasible": 0.969,
-    "searched": 5000,
-    "steps": 5900,
-    "verdict": VERDICT,
-}
+JUDGED = JudgedTraining(
+    accuracy=0.957,
+    interval=(0.951, 0.962),
+    held_out=5000,
+    requirements={"no_collision": 0.996, "stop_sign": 0.971},
+    feasible=0.969,
+    searched=5000,
+    steps=5900,
+    verdict=VERDICT,
+)
+RESULT = TrainedRun("runs/traffic/0001-quiet-heron", 61.2, JUDGED)
 REGION = "fails in 63 % of the starts with sign = stop"
 
 
@@ -183,11 +185,16 @@ def test_the_closing_screen_says_all_that_matters():
         "Next:  stlc simulate --backup",
     ]
     poor = Learning("undertrained", 0.03, "it is poor", ("more time", "luck"), "stlc train --resume 7")
-    lines = final_screen({**RESULT, "verdict": poor})
+    lines = final_screen(replace(RESULT, judged=replace(JUDGED, verdict=poor)))
     assert lines[2] == "verdict         undertrained: it is poor"
     assert lines[-5:-3] == ["what helps      more time", "                luck"]
     assert lines[-1] == "Next:  stlc train --resume 7"
-    assert any("missions of 2 min;" in line for line in final_screen({**RESULT, "judged_seconds": 120.0}))
+    rounds = FalsificationRounds(2, 40, 9, 0.25, 512)
+    longer = replace(JUDGED, judged_seconds=120.0, falsification=rounds)
+    lines = final_screen(replace(RESULT, judged=longer))
+    assert any("missions of 2 min;" in line for line in lines)
+    told = "falsification   2 rounds, 40 drives, 25.0 % of the last round's failed; 512 states kept"
+    assert told in lines
 
 
 def test_the_closing_screen_can_go_elsewhere():

@@ -29,6 +29,9 @@ def returned(job: Job, seed: int, code: int) -> JobResult:
         "held_out": 100,
         "requirements": {"stop": 0.96, "go": 0.99},
         "feasible": 0.97,
+        "searched": 100,
+        "steps": 9,
+        "schedule": None,
         "closed_loop": {
             "recommended": "full",
             "guards": [
