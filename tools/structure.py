@@ -267,7 +267,7 @@ def _nodes(package: Package, within: str, *kinds: type[ast.AST]) -> Iterator[tup
 
 _SEARCHES = "GradientAscent|Searcher|GaussNewton|StagedSearch|RelaxedSearch|CertifiedSearch|SearchPlanner"
 MEANINGS = (
-    Meaning("numbers of one step", "dynamics/model/schedule.py", written("dict(_.lets) | _")),
+    Meaning("numbers of one step", "dynamics/model/step.py", written("dict(_.lets) | _")),
     Meaning(
         "verdict on a requirement",
         "monitor/judgement.py",

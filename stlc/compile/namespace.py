@@ -25,6 +25,9 @@ Mask: TypeAlias = Any
 Pick: TypeAlias = Literal["min", "max"]
 """The extremum that an operator takes."""
 
+ScanBody: TypeAlias = Callable[[Sequence[Array], Sequence[Array]], tuple[Sequence[Array], Sequence[Array]]]
+"""Function that `Ops.scan` calls at each time."""
+
 
 @final
 @dataclass(frozen=True, slots=True)
@@ -166,6 +169,23 @@ class Ops(Protocol):
     def cummax(self, x: Array) -> Array:
         """Running maximum along axis 0."""
 
+    def accumulate(self, start: Array, x: Array) -> Array:
+        """Running sum along axis 0 of `start`, (1, …), and `x`, (count, …): (count + 1, …)."""
+
+    def scan(
+        self, body: ScanBody, carry: Sequence[Array], rows: Sequence[Array], count: int
+    ) -> Sequence[Sequence[Array]]:
+        """Call `body` for each of `count` times, and return the arrays that it yields.
+
+        Each is (count, …), and is given as its parts along axis 0, which `cat` puts together.
+
+        Args:
+            body: function (carry, rows) -> (carry of the next time, arrays to yield), all (1, …).
+            carry: arrays (1, …) that go from one time to the next; these are the first ones.
+            rows: arrays (count, …), or (1, …) if they are constant over time; `body` gets a row of each.
+            count: number of calls, at least 1.
+        """
+
     def softmax(self, x: Array, k: float) -> Array:
         """`log(sum(exp(k x))) / k` over axis 0, which is kept with length 1; stable, also with infinities.
 
@@ -220,6 +240,12 @@ class Ops(Protocol):
     def stack(self, parts: Sequence[Array]) -> Array:
         """Stack arrays along a new axis 0."""
 
+    def split(self, x: Array) -> Sequence[Array]:
+        """Split `x` into its rows, (1, …) each."""
+
+    def repeat(self, x: Array, count: int) -> Array:
+        """Expand `x`, (1, …) or (count, …), to (count, …)."""
+
     def flip(self, x: Array) -> Array:
         """Reverse `x` along axis 0."""
 
@@ -234,6 +260,24 @@ class Ops(Protocol):
 
     def quiet(self) -> AbstractContextManager[object]:
         """Context manager in which division by zero and invalid operations give inf and NaN, not warnings."""
+
+
+class ScanByRows:
+    """Base of array libraries: `Ops.scan` as a loop over rows."""
+
+    __slots__ = ()
+    split: Callable[[Array], Sequence[Array]]
+
+    def scan(
+        self, body: ScanBody, carry: Sequence[Array], rows: Sequence[Array], count: int
+    ) -> Sequence[Sequence[Array]]:
+        """Call `body` for each of `count` times; return the rows of each array that it yields."""
+        taken = [[each] * count if len(each) == 1 else self.split(each) for each in rows]
+        history = []
+        for row in zip(*taken, strict=True) if taken else [()] * count:
+            carry, found = body(carry, row)
+            history.append(found)
+        return list(zip(*history, strict=True))
 
 
 class FloatConstants:

@@ -129,7 +129,7 @@ class Bound:
         found = self._checked(values, shape)
         if wanted and not given:
             found = found.detach().numpy()
-        elif given and not wanted:
+        elif given:
             found = torch.as_tensor(found).to(components[0])
         return [found] if self.result is None else [found[..., i] for i in range(self.result)]
 

@@ -213,8 +213,9 @@ class System:
         Returns the next states (B, n). `switch` selects exact jumps or their smooth blends.
         """
         before = self._named(x)
-        moved = self._stepper(switch).step(before, self._inputs(u), switch) | self._later(before)
-        return torch.stack([moved[name] for name in self.names], 1)
+        moved = self._stepper(switch).step(before | self._inputs(u), TORCH, switch)
+        later = before | moved | self._later(before)
+        return torch.stack([later[name] for name in self.names], 1)
 
     def with_added(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """Append the parameters and timers of a specification to states: (B, n - added) -> (B, n).
@@ -292,19 +293,18 @@ class System:
         """
         sizes = {"states": len(self.names), "controls": len(self.control_names)}
         check_plans(self.decl.name, tuple(x0.shape), tuple(u.shape), **sizes)
-        start = dict(zip(self.names, x0.t().contiguous().unbind(0), strict=True))
+        start = dict(zip(self.names, TORCH.split(x0.t().contiguous()), strict=True))
         inputs = dict(zip(self.control_names, u.permute(2, 1, 0).contiguous().unbind(0), strict=True))
-        moving = {name: column for name, column in start.items() if name not in self._timer_step.next}
-        columns = self._stepper(switch).rollout(moving, inputs, u.shape[1], switch)
+        moving = {name: column for name, column in start.items() if name not in self._timer_step.moving}
+        columns = self._stepper(switch).rollout(moving, inputs, u.shape[1], TORCH, switch)
         return columns | self._timers_over_time(start, columns, u.shape[1])
 
     def _later(self, before: Columns) -> Columns:
         with torch.no_grad():
-            after = self._timer_step.step(before, {}, HARD)
-        return {timer.name: after[timer.name] for timer in self.timers}
+            return self._timer_step.step(before, TORCH)
 
     def _timers_over_time(self, start: Columns, columns: Columns, steps: int) -> Columns:
-        """Roll out the timers from their initial values in `start`, (B,) each.
+        """Roll out the timers from their initial values in `start`, (1, B) each.
 
         `columns` has the other states over time, (T+1, B) each. Returns timer -> values over time, (T+1, B).
         """
@@ -313,8 +313,7 @@ class System:
         with torch.no_grad():
             seen = {name: column[:-1].detach() for name, column in columns.items()}
             first = {timer.name: start[timer.name] for timer in self.timers}
-            later = self._timer_step.rollout(first, seen, steps, HARD)
-        return {timer.name: later[timer.name] for timer in self.timers}
+            return self._timer_step.rollout(first, seen, steps, TORCH)
 
     @cached_property
     def _timer_step(self) -> Stepper:

@@ -7,7 +7,7 @@ previous plans.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
@@ -16,7 +16,6 @@ from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph, Value, joined
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, build_graph, require_numbers
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import columns_in
 from stlc.compile.semantics.kinds.exact import Exact
 from stlc.compile.semantics.tolerance import overall, satisfied, violated
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
@@ -24,7 +23,7 @@ from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.controls import raw_width, shares
-from stlc.dynamics.model.schedule import RolloutStage, blocks, schedule
+from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.description import (
     MARGIN,
@@ -60,91 +59,8 @@ def rollout(step: ModelStep, start: Mapping[str, Value], controls: Mapping[str, 
     Raises:
         Untranslatable: the step calls a Python function.
     """
-    require_numbers([*(num for _, num in step.lets), *step.next.values()])
-    steps = len(next(iter(controls.values())))
-    rollout = _Rollout(start, controls, step.next.keys(), steps)
-    for stage in schedule(step):
-        rollout.run(stage)
-    still = {name: value.expand(steps + 1, value.shape[1]) for name, value in start.items()}
-    return still | rollout.states
-
-
-class _Rollout:
-    """Computation of the states under plans, in stages.
-
-    Where possible, a stage is computed for all time steps at once.
-
-    A stage is a group of states and intermediate variables. They depend only on each other and on earlier
-    stages. If states depend on each other, the stage is computed step by step. `states` holds the states
-    computed by previous stages, (steps + 1, batch). `now` holds the values of states, controls and variables
-    at each step: (steps, batch), or (1, batch) if constant in time.
-    """
-
-    def __init__(
-        self, start: Mapping[str, Value], controls: Mapping[str, Value], moving: Iterable[str], steps: int
-    ) -> None:
-        self.start, self.steps = start, steps
-        self.states: Columns = {}
-        moving = frozenset(moving)
-        self.now: Columns = {name: value for name, value in start.items() if name not in moving}
-        self.now |= controls
-
-    def run(self, stage: RolloutStage) -> None:
-        """Compute the states and variables of `stage` for all time steps, and store them.
-
-        All earlier stages must already be computed.
-        """
-        if stage.early:
-            self.now.update(ArrayProgram(stage.early)(self.now, ONNX))
-        for state, source in stage.follows.items():
-            self._enter(state, ONNX.cat([self.start[state], self._full(source)]))
-        for state, source in stage.sums.items():
-            parts = ONNX.cat([self.start[state], self._full(source)])
-            axis = parts.graph.constant(0, "int64")
-            (total,) = parts.graph.emit("CumSum", (parts, axis), [parts.shape], parts.kind)
-            self._enter(state, total)
-        if stage.blocks:
-            self._loop(stage)
-
-    def _enter(self, name: str, column: Value) -> None:
-        self.states[name] = column
-        self.now[name] = column[:-1]
-
-    def _full(self, name: str) -> Value:
-        value = self.now[name]
-        return value.expand(self.steps, value.shape[1])
-
-    def _loop(self, stage: RolloutStage) -> None:
-        """Compute the states of a stage step by step, because they depend on one another."""
-        inside = stage.stepped.keys() | {name for block in stage.blocks for name in block}
-        read = {name for block in stage.blocks for num in block.values() for name in columns_in(num)}
-        outside = sorted(read - inside)
-        timed = [name for name in outside if len(self.now[name]) == self.steps]
-        steady = [name for name in outside if name not in timed]
-        blocks = [ArrayProgram(block) for block in stage.blocks]
-        moving, sources = list(stage.stepped), list(stage.stepped.values())
-        kept = list(dict.fromkeys((*sources, *stage.lets)))
-
-        def turn(
-            graph: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
-        ) -> tuple[Sequence[Value], Sequence[Value]]:
-            env = {name: self.now[name].on(graph) for name in steady}
-            env |= dict(zip(timed, rows, strict=False))
-            env |= dict(zip(moving, now, strict=True))
-            for block in blocks:
-                env.update(block(env, ONNX))
-            later = [env[name].expand(1, BATCH, like=now[0]) for name in sources]
-            return later, [env[name] for name in kept]
-
-        carried = [self.start[name] for name in moving]
-        rows = [self.now[name] for name in timed] or [
-            carried[0].graph.constant([[float(k)] for k in range(self.steps)])
-        ]
-        seen = carried[0].graph.repeated(carried, rows, turn)
-        history = dict(zip(kept, seen, strict=True))
-        for state, source in stage.stepped.items():
-            self._enter(state, ONNX.cat([self.start[state], history[source]]))
-        self.now.update((name, history[name]) for name in stage.lets)
+    require_numbers(step.numbers.values())
+    return Stepper(step).rollout(start, controls, len(next(iter(controls.values()))), ONNX)
 
 
 def assigned(numbers: Mapping[str, ir.Num], columns: Mapping[str, Value]) -> Columns:
@@ -201,31 +117,25 @@ def _closed_loop(task: Task, network: ClosedLoopActor, state: Mapping[str, Value
 
     Arguments and result are those of `proposed`, with one plan per agent.
     """
-    step = task.system.exact_step
-    numbers = dict(step.lets) | {f"{name}'": number for name, number in step.next.items()}
-    require_numbers(list(numbers.values()))
-    programs = [ArrayProgram(block) for block in blocks(numbers)]
-    moving = list(step.next)
+    require_numbers(task.system.exact_step.numbers.values())
+    stepper = Stepper(task.system.exact_step)
+    still = [name for name in state if name not in stepper.moving]
 
-    def turn(
-        graph: OnnxGraph, now: Sequence[Value], rows: Sequence[Value]
-    ) -> tuple[Sequence[Value], Sequence[Value]]:
-        env = {name: value.on(graph) for name, value in state.items()} | dict(zip(moving, now, strict=True))
-        seen = joined([_observed(task, env), rows[0].expand(1, BATCH, like=now[0])])
+    def step(now: Sequence[Value], rows: Sequence[Value]) -> tuple[list[Value], list[Value]]:
+        elapsed, *given = rows
+        env = dict(zip((*still, *stepper.moving), (*given, *now), strict=True))
+        seen = joined([_observed(task, env), elapsed.expand(1, BATCH, like=now[0])])
         raw = _squashed(network.outputs, _layers(network, seen.T.cast("float32")).T.rows())
         actions = {
             each.name: ONNX_OPS.clamp(raw[each.name].cast("float64"), each.low, each.high)
             for each in network.outputs
         }
-        env |= actions
-        for program in programs:
-            env.update(program(env, ONNX))
-        later = [env[f"{name}'"].expand(1, BATCH, like=now[0]) for name in moving]
-        return later, list(actions.values())
+        return list(stepper.step(env | actions, ONNX).values()), list(actions.values())
 
-    carried = [state[name] for name in moving]
-    elapsed = carried[0].graph.constant([[k / task.horizon] for k in range(task.horizon)])
-    controls = carried[0].graph.repeated(carried, [elapsed], turn)
+    carry = [state[name] for name in stepper.moving]
+    elapsed = carry[0].graph.constant([[k / task.horizon] for k in range(task.horizon)])
+    rows = [elapsed, *(state[name] for name in still)]
+    controls = [joined(parts) for parts in ONNX_OPS.scan(step, carry, rows, task.horizon)]
     planes = [each.reshaped(1, task.horizon, BATCH) for each in controls]
     return joined(planes).transposed(2, 1, 0).reshaped(BATCH, 1, task.horizon, len(controls))
 

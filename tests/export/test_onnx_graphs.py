@@ -10,11 +10,11 @@ import torch
 from helpers.exported import CART, exported, mission, untrained
 from helpers.onnx_graphs import computed
 
-from stlc.compile.backends.onnx import graph as graphs
+from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.onnx import ops
 from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import substitute
-from stlc.compile.semantics.switch import Hard
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
@@ -79,7 +79,7 @@ def test_mirrors_and_angles_are_those_of_the_network(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("written_out", [True, False])
 def test_every_stage_of_a_step_is_rolled(written_out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(graphs, "UNROLLED_NODES", 10**9 if written_out else 0)
+    monkeypatch.setattr(ops, "UNROLLED_NODES", 10**9 if written_out else 0)
     x, y, z, u = (ir.Signal(name) for name in ("x", "y", "z", "u"))
     feeds = ir.Op("add", (ir.Op("mul", (y, z)), u))
     step = ModelStep(
@@ -164,11 +164,7 @@ def test_a_step_of_many_parts_is_written_once(substeps: int) -> None:
         "push": rng.normal(size=(40, 4)),
     }
     found = computed({f"{name}*": value for name, value in states.items()}, given)
-    plain = Stepper(step).rollout(
-        {name: torch.from_numpy(given[name][0]) for name in ("angle", "speed")},
-        {"push": torch.from_numpy(given["push"])},
-        40,
-        Hard(),
-    )
-    for name in ("angle", "speed"):
+    start = {name: given[name] for name in ("angle", "speed")}
+    plain = Stepper(step).rollout(start, {"push": given["push"]}, 40, NUMPY)
+    for name in start:
         np.testing.assert_allclose(found[f"{name}*"], plain[name], rtol=1e-12, atol=1e-12)

@@ -150,11 +150,7 @@ class Mode:
         return [table[name] for name in names]
 
     def truths(self, boxes: Sequence[Box], names: Sequence[str]) -> Truths:
-        """Truth of the conditions over boxes.
-
-        Raises:
-            ValueError: the states are undefined somewhere in the boxes, by what is known.
-        """
+        """Truth of the conditions over boxes."""
         assert self.conditions is not None
         states = self.states(corners(boxes, self.coordinates), names, FORMS)
         table = {name: spread(form, len(boxes)) for name, form in zip(names, states, strict=True)}

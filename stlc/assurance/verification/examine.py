@@ -146,7 +146,7 @@ class Examiner:
             found.proved += narrowed(self._plans, mode, boxes, at[chosen], others=found.left.append)
 
     def _examine(self, found: BatchResult, mode: Mode, batch: BoxBatch, rng: np.random.Generator) -> None:
-        boxes = self._admitted(found, mode, batch)
+        boxes = self._admitted(mode, batch)
         if not boxes:
             return
         samples = self._sampled(found, mode, boxes, rng)
@@ -169,18 +169,13 @@ class Examiner:
             else:  # its part inside of `where` is found by dividing it
                 found.left += box.split(int(np.argmax(batch.effects * box.half)))
 
-    def _admitted(self, found: BatchResult, mode: Mode, batch: BoxBatch) -> list[Box]:
+    def _admitted(self, mode: Mode, batch: BoxBatch) -> list[Box]:
         """The boxes that may contain a state that meets `where`."""
         asked = [box for box in batch.boxes if not box.inside]
         inside = [box for box in batch.boxes if box.inside]
         if not asked:
             return inside
-        try:
-            truth = mode.truths(asked, self._plans.names)
-        except ValueError:
-            for box in asked:
-                found.left += box.split(int(np.argmax(box.half)))
-            return inside
+        truth = mode.truths(asked, self._plans.names)
         return inside + [
             replace(box, inside=bool(truth.sure[i])) for i, box in enumerate(asked) if truth.possible[i]
         ]

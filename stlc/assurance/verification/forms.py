@@ -300,17 +300,15 @@ class FormOps(FloatConstants):
     def sqrt(self, x: Forms) -> Forms:
         """Square root: the chord over the range, and half its greatest distance from the curve.
 
-        Raises:
-            ValueError: a number may be negative by more than rounding.
+        It is undefined where a number may be negative by more than rounding.
         """
         bound, slack = x.range, 4.0 * SLACK * (1.0 + np.abs(x.centre))
-        if not (bound.low >= -slack).all():
-            raise ValueError("the root of a number that may be negative")
         low, high = np.maximum(bound.low, 0.0), np.maximum(bound.high, 1e-300)
         slope = 1.0 / (np.sqrt(low) + np.sqrt(high))
         start = np.sqrt(low) - slope * low
         half = 0.5 * (0.25 / slope - start)
-        return x.times(slope).widened(start + half, half + slope * slack)
+        found, good = x.times(slope).widened(start + half, half + slope * slack), bound.low >= -slack
+        return found if good.all() else picked(good, found, self._by_range("sqrt", x))
 
     def norm(self, *components: Operand) -> Forms:
         """Euclidean norm: at least its tangent at the centre, which is at most `h` below it.

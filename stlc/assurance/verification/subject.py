@@ -18,7 +18,7 @@ from stlc.assurance.verification.judged import BoxVerdicts, Judge
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.diagnostics import usage
-from stlc.dynamics.model.schedule import blocks
+from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import build_step
 
 if TYPE_CHECKING:
@@ -64,13 +64,12 @@ class VerificationSubject(ABC):
         try:
             self.modes = modes_of(decl.init)
             step = build_step(decl, soft=False)
-            numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
-            self._blocks = [ArrayProgram(block) for block in blocks(numbers)]
+            self._stepper = Stepper(step)
         except (ValueError, Unsupported) as error:
             raise usage(f"this cannot be verified: {error}") from None
         self._task = task
         self.names = tuple(task.system.names)
-        self._moved = tuple(step.next)
+        self._moved = self._stepper.moving
         self._observe = ArrayProgram({str(i): num for i, num in enumerate(task.system.observed)})
         self._controls = [control.name for control in decl.controls]
         formulas = [rule.formula for rule in task.compiled.requirements]
@@ -129,11 +128,7 @@ class VerificationSubject(ABC):
         `index` is the number of the choice, or one number for each box, (boxes,).
         """
         count = len(mode.coordinates)
-        try:
-            drawn = mode.states(corners(boxes, mode.coordinates), self.names, FORMS)
-        except ValueError:  # a root of a number that may be negative, over a large box
-            unknown = np.full(len(boxes), np.inf)
-            return BoxVerdicts(-unknown, unknown, np.stack([box.half for box in boxes]))
+        drawn = mode.states(corners(boxes, mode.coordinates), self.names, FORMS)
         start = {name: spread(form, len(boxes)) for name, form in zip(self.names, drawn, strict=True)}
         with FORMS.quiet():
             history, decided = self._followed(start, np.broadcast_to(index, len(boxes)), count)
@@ -159,12 +154,9 @@ class VerificationSubject(ABC):
     ) -> tuple[dict[str, Forms], int]:
         """Forms of the states one step later, and the number of symbols; large remainders become symbols."""
         batch = len(next(iter(env.values())).centre)
-        moving = {**env, **dict(zip(self._controls, controls, strict=True))}
-        for block in self._blocks:
-            moving.update(block(moving, FORMS))
-        later = dict(env)
-        for name in self._moved:
-            form = spread(moving[f"{name}'"], batch)
+        now, later = {**env, **dict(zip(self._controls, controls, strict=True))}, dict(env)
+        for name, moved in self._stepper.step(now, FORMS).items():
+            form = spread(moved, batch)
             symbols = max(symbols, len(form.generators))
             if (form.rest > _LARGE * self._sizes[name]).any():
                 form, symbols = form.with_symbol(symbols), symbols + 1

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stlc.assurance.verification.forms import FORMS, Floats, Forms, ranges
+from stlc.assurance.verification.forms import FORMS, Floats, Forms, ranges, spread
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval import Intervals
@@ -30,8 +30,8 @@ from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.diagnostics import usage
+from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.samplers import Drawing
-from stlc.dynamics.model.schedule import blocks
 from stlc.dynamics.model.step import build_step, commands
 from stlc.dynamics.uncertainty.disturbance import ErrorSizes
 from stlc.dynamics.uncertainty.perturbed import perturbable
@@ -195,7 +195,7 @@ class TubeModel:
         for column in self._first if steps else ():
             if column.name in start:
                 found = column.value({**env, **errors.factors}, FORMS, symbols.drawn)
-                env[column.name] = _full(found, symbols.batch)
+                env[column.name] = spread(found, symbols.batch)
         history = {name: [form] for name, form in env.items()}
         for step in range(u.shape[1]):
             plan = u[:, step].T
@@ -305,10 +305,8 @@ class _Motion:
 
     def __init__(self, decl: SystemDecl, timers: Sequence[Timer]) -> None:
         step = build_step(replace(decl, feedback=None), soft=False)
-        later = {**step.next, **{timer.name: timer.update for timer in timers}}
-        self.numbers = dict(step.lets) | {f"{name}'": num for name, num in later.items()}
-        self._blocks = [ArrayProgram(block) for block in blocks(self.numbers)]
-        self._moved = tuple(later)
+        step = replace(step, next={**step.next, **{timer.name: timer.update for timer in timers}})
+        self.numbers, self._stepper = step.numbers, Stepper(step)
         self._controls = [control.name for control in decl.controls]
         self._feedback = decl.feedback
         self._commands = ArrayProgram(commands(decl)) if decl.feedback is not None else None
@@ -324,35 +322,16 @@ class _Motion:
         """
         given = [Forms.point(each) for each in plan]
         if self._commands is not None:
-            found = _computed(self._commands, {**env, **dict(zip(self._controls, given, strict=True))})
+            found = self._commands({**env, **dict(zip(self._controls, given, strict=True))}, FORMS)
             given = [found[name] for name in self._controls]
         acted = given if errors is None else errors.acted(given)
         if self._feedback is not None:
             ends = zip(acted, self._feedback.low, self._feedback.high, strict=True)
             acted = [FORMS.clamp(*each) for each in ends]
         factors = {} if errors is None else errors.factors
-        moving = {**env, **dict(zip(self._controls, acted, strict=True)), **factors}
-        for block in self._blocks:
-            moving.update(_computed(block, moving))
-        later = {name: _full(moving[f"{name}'"], symbols.batch) for name in self._moved}
-        return {**env, **later}
-
-
-def _computed(program: ArrayProgram, env: Mapping[str, Forms]) -> _Env:
-    """Run a program over forms; by intervals where a root of a number that may be negative is asked for."""
-    try:
-        return program(env, FORMS)
-    except ValueError:
-        found = program({name: form.range for name, form in env.items()}, INTERVALS)
-        return {name: Forms.between(each.low, each.high) for name, each in found.items()}
-
-
-def _full(form: Forms, batch: int) -> Forms:
-    if form.shape == (batch,):
-        return form
-    count = len(form.generators)
-    generators = np.broadcast_to(form.generators.reshape(count, -1), (count, batch))
-    return Forms(np.broadcast_to(form.centre, batch), generators, np.broadcast_to(form.rest, batch))
+        now = {**env, **dict(zip(self._controls, acted, strict=True)), **factors}
+        later = self._stepper.step(now, FORMS).items()
+        return {**env, **{name: spread(form, symbols.batch) for name, form in later}}
 
 
 class _Judge:
@@ -393,11 +372,7 @@ class _Judge:
 def _margins(program: ArrayProgram, env: Mapping[str, Intervals], forms: Mapping[str, Forms]) -> Intervals:
     """Intervals that contain the values of a program, (T+1, B): those by forms within those by intervals."""
     plain: Intervals = program({name: env[name] for name in program.columns}, INTERVALS)["margin"]
-    try:
-        form: Forms = program({name: forms[name] for name in program.columns}, FORMS)["margin"]
-        linear = form.range
-    except ValueError:
-        return plain
+    linear = program({name: forms[name] for name in program.columns}, FORMS)["margin"].range
     low: Floats = np.fmax(plain.low, linear.low)  # one is NaN where it alone cannot exclude undefined values
     return Intervals(low, np.maximum(np.fmin(plain.high, linear.high), low))
 

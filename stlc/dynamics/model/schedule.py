@@ -48,7 +48,7 @@ def schedule(step: ModelStep) -> tuple[RolloutStage, ...]:
 
     A stage reads only its own states and expressions, and those of earlier stages.
     """
-    numbers = dict(step.lets) | {f"{name}'": num for name, num in step.next.items()}
+    numbers = step.numbers
     reads = {name: columns_in(num) & (numbers.keys() | step.next.keys()) for name, num in numbers.items()}
     reads |= {name: frozenset((f"{name}'",)) for name in step.next}
     level: dict[str, int] = {}

@@ -27,6 +27,11 @@ class ModelStep:
     lets: tuple[tuple[str, ir.Num], ...]
     next: Mapping[str, ir.Num]
 
+    @property
+    def numbers(self) -> Mapping[str, ir.Num]:
+        """All expressions: name of an intermediate result, or of a state with `'` appended -> expression."""
+        return dict(self.lets) | {f"{name}'": num for name, num in self.next.items()}
+
 
 def build_step(decl: SystemDecl, *, soft: bool) -> ModelStep:
     """Build the step of a declaration.

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from helpers.onnx_graphs import computed
 
-from stlc.compile.backends.onnx import graph as graphs
+from stlc.compile.backends.onnx import ops
 from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph, joined
+from stlc.compile.backends.onnx.ops import ONNX
 
 ARRAY = np.arange(15.0).reshape(5, 3) - 4.0
 
@@ -69,16 +70,16 @@ def test_shapes_that_do_not_fit_are_not_written() -> None:
 def test_a_loop_is_the_same_written_out_and_as_a_node(
     written_out: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(graphs, "UNROLLED_NODES", 10**9 if written_out else 0)
+    monkeypatch.setattr(ops, "UNROLLED_NODES", 10**9 if written_out else 0)
     graph = OnnxGraph()
     x, first = graph.input("x", (5, BATCH)), graph.input("first", (1, BATCH))
     factor, unread = first * 0.5, first + 9.0
 
-    def turn(inner, now, rows):
-        total = now[0] + rows[0] * factor.on(inner)
-        return [total, now[0]], [total * 2.0, factor.on(inner), now[1]]
+    def body(now, rows):
+        total = now[0] + rows[0] * rows[1]
+        return [total, now[0]], [total * 2.0, rows[1], now[1]]
 
-    doubled, same, before = graph.repeated([first, first], [x], turn)
+    doubled, same, before = map(joined, ONNX.scan(body, [first, first], [x, factor], 5))
     scans = [node for node in graph.needed([doubled]) if node.op == "Scan"]
     assert bool(scans) != written_out
     assert unread.name not in {name for node in graph.needed([doubled]) for name in node.outputs}

@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stlc.compile.augment.timers import Timer, clock_of
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard, StraightThrough, Switch, Tanh
+from stlc.dynamics.model.rollout import Stepper
+from stlc.dynamics.model.step import build_step
 from stlc.dynamics.system import System
 
 Make = Callable[..., System]
@@ -113,6 +117,12 @@ def _is_its_steps(system: System, switch: Switch) -> None:
         states.append(system.step(states[-1], u[:, t], switch))
     stepped = torch.stack(states, 1)
     assert (scheduled - stepped).abs().max() < 1e-10
+    start = dict(zip(system.names, x0.detach().numpy().T[:, None], strict=True))
+    inputs = dict(zip(system.control_names, u.detach().numpy().transpose(2, 1, 0), strict=True))
+    stepper = Stepper(build_step(system.decl, soft=not switch.exact))
+    by_numpy = stepper.rollout(start, inputs, 8, NUMPY, switch)
+    for name, column in zip(system.names, scheduled.detach().numpy().T, strict=True):
+        np.testing.assert_allclose(by_numpy[name], column, rtol=1e-9, atol=1e-9)
     weights = torch.randn(stepped.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     for ours, theirs in zip(
         torch.autograd.grad((scheduled * weights).sum(), [x0, u]),

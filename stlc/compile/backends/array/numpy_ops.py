@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.kernel import Strided, window_kernel
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.namespace import Array, FloatConstants, Mask, Ops, Pick, Sliding
+from stlc.compile.namespace import Array, FloatConstants, Mask, Ops, Pick, ScanByRows, Sliding
 
 _WIDE = 8
 """Columns from which the C kernel beats pairwise doubling."""
@@ -26,7 +26,7 @@ _LARGE_KERNEL = 1 << 16
 
 
 @final
-class NumpyOps(FloatConstants):
+class NumpyOps(FloatConstants, ScanByRows):
     """Implementation of `stlc.compile.namespace.Ops` for NumPy arrays, without gradients."""
 
     name = "numpy"
@@ -98,6 +98,15 @@ class NumpyOps(FloatConstants):
 
     def cummax(self, x: Array) -> Array:
         return np.maximum.accumulate(x, axis=0)
+
+    def accumulate(self, start: Array, x: Array) -> Array:
+        return np.cumsum(np.concatenate((start, x)), axis=0)
+
+    def split(self, x: Array) -> Sequence[Array]:
+        return np.split(x, len(x))
+
+    def repeat(self, x: Array, count: int) -> Array:
+        return np.broadcast_to(x, (count, *x.shape[1:]))
 
     def join(self, items: Sequence[Array], pick: Pick) -> Array:
         choose = np.minimum if pick == "min" else np.maximum

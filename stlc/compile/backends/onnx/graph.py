@@ -23,9 +23,6 @@ Attribute: TypeAlias = "int | tuple[int, ...] | GraphBody"
 BATCH = 1 << 40
 """Axis length known only at run time; all such axes in one operation have the same length."""
 
-UNROLLED_NODES = 600
-"""Nodes up to which a loop is unrolled: a `Scan` node costs some microseconds per iteration."""
-
 
 @dataclass(frozen=True, slots=True)
 class GraphNode:
@@ -135,39 +132,6 @@ class OnnxGraph:
             self.nodes.append(GraphNode(op, names, tuple(value.name for value in made), facts))
             self._known[key] = made
         return self._known[key]
-
-    def repeated(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
-        """Write a loop over rows: unrolled if it is short, else as a `Scan` node.
-
-        Args:
-            carried: initial values of the loop state.
-            rows: values (count, …); an iteration gets one row (1, …) of each.
-            turn: loop body, a function (graph, loop state, rows) -> (next loop state, outputs). It adds
-                operations to the graph that it gets. If it reads a value of the enclosing graph, it must
-                convert the value by `Value.on`. The arrays of the loop state keep their shapes. Each output
-                is (1, …).
-
-        Returns:
-            Outputs of all iterations, (count, …) each.
-        """
-        inner, count = OnnxGraph(prefix=f"{self.prefix}s{len(self.nodes)}."), rows[0].shape[0]
-        now = [inner.input(f"{inner.prefix}i{i}", each.shape, each.kind) for i, each in enumerate(carried)]
-        row = [inner.input(f"{inner.prefix}r{i}", each.shape[1:], each.kind) for i, each in enumerate(rows)]
-        later, kept = turn(inner, now, [each.reshaped(1, *each.shape) for each in row])
-        body = GraphBody(inner, (*later, *kept))
-        if count * len(body.nodes) <= UNROLLED_NODES:
-            return self._unrolled(carried, rows, turn)
-        shapes = [each.shape for each in later] + [(count, *each.shape) for each in kept]
-        facts: dict[str, Attribute] = {"body": body, "num_scan_inputs": len(rows)}
-        outputs = self.emit("Scan", (*carried, *rows), shapes, carried[0].kind, facts)
-        return tuple(each.reshaped(count, *each.shape[2:]) for each in outputs[len(later) :])
-
-    def _unrolled(self, carried: Sequence[Value], rows: Sequence[Value], turn: Turn) -> tuple[Value, ...]:
-        history = []
-        for row in zip(*(each.rows() for each in rows), strict=True):
-            carried, kept = turn(self, carried, row)
-            history.append(kept)
-        return tuple(joined(each) for each in zip(*history, strict=True))
 
     def branched(self, where: Value, yes: Branch, no: Branch) -> tuple[Value, ...]:
         """Write a condition as an `If` node: only the operations of one branch are executed.
@@ -358,9 +322,6 @@ class Value:
 
 
 Branch: TypeAlias = Callable[[OnnxGraph], Sequence[Value]]
-Turn: TypeAlias = Callable[
-    [OnnxGraph, Sequence[Value], Sequence[Value]], tuple[Sequence[Value], Sequence[Value]]
-]
 
 
 def joined(parts: Sequence[Value], axis: int = 0) -> Value:

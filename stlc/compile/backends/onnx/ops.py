@@ -14,14 +14,18 @@ from typing import TypeAlias, cast, final
 from stlc.compile.backends.array.arith import ArrayProgram, inputs
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.backends.onnx.graph import BATCH, Kind, Value, joined
+from stlc.compile.backends.onnx.graph import BATCH, Attribute, GraphBody, Kind, OnnxGraph, Value, joined
 from stlc.compile.backends.schedule import spanning
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import defined
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
-from stlc.compile.namespace import FloatConstants, Ops, Pick, Sliding
+from stlc.compile.namespace import FloatConstants, Ops, Pick, ScanByRows, Sliding
 
 Number: TypeAlias = Value | float
+_ScanBody: TypeAlias = Callable[[Sequence[Value], Sequence[Value]], tuple[Sequence[Value], Sequence[Value]]]
+
+UNROLLED_NODES = 600
+"""Nodes up to which a loop is unrolled: a `Scan` node costs some microseconds per iteration."""
 
 
 def _like(*numbers: Number) -> Value:
@@ -46,7 +50,7 @@ def _comparison(op: str) -> Callable[[OnnxOps, Number, Number], Value]:
 
 
 @final
-class OnnxOps(FloatConstants):
+class OnnxOps(FloatConstants, ScanByRows):
     """Implementation of `stlc.compile.namespace.Ops` for symbolic arrays.
 
     If an operand of min or max is NaN, so is the result.
@@ -166,6 +170,35 @@ class OnnxOps(FloatConstants):
     def cummax(self, x: Value) -> Value:
         return _running(x, "Max")
 
+    def accumulate(self, start: Value, x: Value) -> Value:
+        parts = self.cat([start, x])
+        (out,) = x.graph.emit("CumSum", (parts, x.graph.constant(0, "int64")), [parts.shape], x.kind)
+        return out
+
+    def scan(
+        self, body: _ScanBody, carry: Sequence[Value], rows: Sequence[Value], count: int
+    ) -> Sequence[Sequence[Value]]:
+        """Write a loop: unrolled if it is short, else as a `Scan` node."""
+
+        def shaped(now: Sequence[Value], taken: Sequence[Value]) -> tuple[list[Value], Sequence[Value]]:
+            later, found = body(now, taken)
+            return [to.expand(*at.shape, like=at) for at, to in zip(now, later, strict=True)], found
+
+        graph = carry[0].graph
+        inner = OnnxGraph(prefix=f"{graph.prefix}s{len(graph.nodes)}.")
+        now = [inner.input(f"{inner.prefix}i{i}", each.shape, each.kind) for i, each in enumerate(carry)]
+        timed = [each for each in rows if len(each) == count] or [graph.constant([[0.0]] * count)]
+        row = [inner.input(f"{inner.prefix}r{i}", each.shape[1:], each.kind) for i, each in enumerate(timed)]
+        taken = iter([each.reshaped(1, *each.shape) for each in row])
+        later, found = shaped(now, [next(taken) if len(each) == count else each.on(inner) for each in rows])
+        written = GraphBody(inner, (*later, *found))
+        if count * len(written.nodes) <= UNROLLED_NODES:
+            return super().scan(shaped, carry, rows, count)
+        shapes = [each.shape for each in later] + [(count, *each.shape) for each in found]
+        facts: dict[str, Attribute] = {"body": written, "num_scan_inputs": len(timed)}
+        outputs = graph.emit("Scan", (*carry, *timed), shapes, carry[0].kind, facts)
+        return [[each.reshaped(count, *each.shape[2:])] for each in outputs[len(later) :]]
+
     def extrema(self, x: Value, pick: Pick, window: Sliding) -> None:
         """Return None: there is no special method for windows."""
 
@@ -197,6 +230,12 @@ class OnnxOps(FloatConstants):
     def cat(self, parts: Sequence[Value]) -> Value:
         widest = max(parts, key=lambda part: part.shape[-1])
         return joined([part.expand(part.shape[0], *widest.shape[1:], like=widest) for part in parts])
+
+    def split(self, x: Value) -> Sequence[Value]:
+        return x.rows()
+
+    def repeat(self, x: Value, count: int) -> Value:
+        return x.expand(count, *x.shape[1:])
 
     def flip(self, x: Value) -> Value:
         return x[::-1] if x.shape[0] > 1 else x

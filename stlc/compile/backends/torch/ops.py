@@ -24,7 +24,7 @@ from stlc.compile.backends.torch.extrema import (
 )
 from stlc.compile.backends.torch.guarded import lerp, sifted
 from stlc.compile.ir.functions import FUNCTIONS
-from stlc.compile.namespace import Mask, Ops, Pick, Sliding
+from stlc.compile.namespace import Mask, Ops, Pick, ScanByRows, Sliding
 
 
 class _MaskedRows(torch.autograd.Function):
@@ -108,6 +108,29 @@ class _SmoothMax2(torch.autograd.Function):
         return by_a, by_b, None
 
 
+class _Accumulated(torch.autograd.Function):
+    """Autograd function: running sum of `start` (1, …) and `x` (count, …). Faster than `cumsum`."""
+
+    @staticmethod
+    def forward(ctx: Any, start: Tensor, x: Tensor) -> Tensor:  # noqa: ARG004
+        out = x.new_empty(len(x) + 1, *x.shape[1:])
+        rows = out.unbind(0)
+        rows[0].copy_(start[0])
+        for before, after, added in zip(rows, rows[1:], x.unbind(0), strict=False):
+            torch.add(before, added, out=after)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG004
+        if torch.is_grad_enabled():  # the gradient is to be differentiated in turn
+            below = grad.flip(0).cumsum(0).flip(0)
+        else:
+            below = grad.clone(memory_format=torch.contiguous_format)
+            for row, later in pairwise(below.unbind(0)[::-1]):
+                later.add_(row)
+        return below[:1], below[1:]
+
+
 @lru_cache(maxsize=4096)
 def _constant(value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
@@ -123,7 +146,7 @@ def _pair(a: Tensor | float, b: Tensor | float) -> tuple[Tensor, Tensor]:
 
 
 @final
-class TorchOps:
+class TorchOps(ScanByRows):
     """Implementation of `stlc.compile.namespace.Ops` for torch tensors.
 
     Results keep dtype and device. Operands are `(time, batch)`, or of any shapes that broadcast. Reductions
@@ -217,6 +240,18 @@ class TorchOps:
 
     def cummax(self, x: Tensor) -> Tensor:
         return torch.cummax(x, dim=0).values
+
+    def accumulate(self, start: Tensor, x: Tensor) -> Tensor:
+        if torch.compiler.is_exporting():  # a single operation
+            return torch.cat((start, x)).cumsum(0)
+        out: Tensor = _Accumulated.apply(start, x)  # type: ignore[no-untyped-call]
+        return out
+
+    def split(self, x: Tensor) -> Sequence[Tensor]:
+        return torch.chunk(x, len(x))
+
+    def repeat(self, x: Tensor, count: int) -> Tensor:
+        return x.expand(count, *x.shape[1:])
 
     def join(self, items: Sequence[Tensor], pick: Pick) -> Tensor:
         """Exact minimum or maximum of arrays.
