@@ -22,7 +22,7 @@ PROGRAM = Program(
     package="benchmarks.tables",
     groups={
         "Controllers": ("paper", "ablation", "family", "worlds", "disturbed", "latency", "repair", "step"),
-        "Monitors": ("robustness", "gym"),
+        "Monitors": ("robustness", "streams", "gym"),
         "Tasks": ("tasks",),
         "Assurance": ("falsify", "searches", "certificates", "uncertain", "verify", "ainncs"),
     },

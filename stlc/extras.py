@@ -30,7 +30,7 @@ EXTRAS = {
     "cluster": ("ray",),
     "plan": ("highspy",),
     "panda": ("pybullet", "pytorch-kinematics"),
-    "bench": ("stable-baselines3", "cma", "casadi"),
+    "bench": ("stable-baselines3", "cma", "casadi", "reelay", "sentil", "mstlo-python"),
 }
 """Extras with the packages that they bring, named as in `pyproject.toml`."""
 CPU_BUILD = "pip install torch --index-url https://download.pytorch.org/whl/cpu"

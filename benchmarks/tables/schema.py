@@ -29,6 +29,7 @@ from benchmarks.tables import (
     family,
     latency,
     paper,
+    streams,
     tasks,
     uncertain,
     verify,
@@ -86,6 +87,7 @@ ROWS: dict[str, dict[str, type]] = {
     "verify": {"rows": verify.VerifyRow},
     "ainncs": {"rows": ainncs.AinncsRow},
     "tasks": {"rows": tasks.TaskRow},
+    "streams": {"rows": streams.StreamRow, "agreement": streams.AgreementRow},
 }
 """Name of a table -> key in its result -> record of a row."""
 
