@@ -292,7 +292,7 @@ default one never intervenes; simulations compare the others with it."""
 
 METHODS: PackageRegistry[Any] = PackageRegistry(
     "method",
-    "stlc.controller.methods",
+    "stlc.controller.training.methods",
     "METHOD",
     default="guided",
     group="stlc.methods",
@@ -303,7 +303,7 @@ METHODS: PackageRegistry[Any] = PackageRegistry(
 
 PLANNERS: PackageRegistry[Any] = PackageRegistry(
     "planner",
-    "stlc.controller.methods.planners",
+    ("stlc.controller.search.planners", "stlc.controller.run.planners"),
     "PLANNER",
     default="search",
     group="stlc.planners",

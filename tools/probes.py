@@ -219,7 +219,7 @@ _FORMULAS = "tests/compile/backends/test_c_formulas.py::test_every_operator_over
 _SLOPES = "tests/compile/backends/test_c_adjoint.py::test_every_function_has_the_gradient_of_torch"
 _STREAMS = "tests/monitor/online/test_streams.py::test_a_stream_gives_what_the_whole_trace_gives"
 _EXPORT, _BACKENDS = "tests/export", "tests/compile/backends"
-_GRAPHS, _MILP = f"{_EXPORT}/test_onnx_graphs.py", "tests/controller/methods/test_milp.py"
+_GRAPHS, _MILP = f"{_EXPORT}/test_onnx_graphs.py", "tests/controller/search/planners/test_milp.py"
 _WRITE, _ONNX, _EXTREMA = (
     f"{_EXPORT}/test_write.py",
     f"{_BACKENDS}/test_ops_onnx.py",

@@ -2,7 +2,7 @@
 
 A planner proposes plans; `PlanSearch` judges them exactly in float64, keeps the best plan of each initial
 state, and compares time and number of judged plans with the budget. A planner is one file in
-`stlc.controller.methods.planners`.
+`stlc.controller.search.planners`.
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from stlc.controller.methods.planners import milp
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, PlanSearch, plan
+from stlc.controller.search.planners import milp
 from stlc.diagnostics import UsageError
 from stlc.dynamics.system import System
 from stlc.grammar.parser import parse

@@ -24,7 +24,7 @@ from stlc.diagnostics import RunError, SystemFileError, UsageError
 from stlc.registry import METHODS
 from stlc.rundir import RunDir
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 SPEC, CAR = str(ROOT / "specs/traffic.stl"), str(ROOT / "examples/car.yaml")
 
 COASTING = '''"""Coasting: the least force at every step, a planner that learns nothing."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stlc.controller.methods.planners.search import SearchPlanner
 from stlc.controller.options import bounded
+from stlc.controller.search.planners.search import SearchPlanner
 
 
 @dataclass(frozen=True, slots=True)

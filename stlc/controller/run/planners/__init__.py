@@ -1,0 +1,1 @@
+"""Planners of trained runs, one per file, beside those of `stlc.controller.search.planners`."""
