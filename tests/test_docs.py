@@ -19,8 +19,8 @@ from benchmarks.__main__ import PROGRAM as MEASURE
 from stlc.cli.framework.app import PROGRAM as STLC
 from stlc.cli.framework.app import main
 from stlc.diagnostics import CODES
+from stlc.dynamics.declaration.schema.record import reference
 from stlc.dynamics.declaration.sections import SystemKeys
-from stlc.dynamics.schema.record import reference
 from stlc.grammar.manual import read_page
 from stlc.plants.declaration import PlantKeys
 

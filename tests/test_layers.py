@@ -59,7 +59,7 @@ HOMES = {
     "rich": ("stlc.cli", "stlc.view"),
     "typer": ("stlc.cli", "benchmarks"),
     "click": (),
-    "yaml": ("stlc.dynamics.schema.yaml_nodes", "benchmarks.tables.ainncs"),
+    "yaml": ("stlc.dynamics.declaration.schema.yaml_nodes", "benchmarks.tables.ainncs"),
     "pydantic": (),
     "matplotlib": ("stlc.view", "stlc.controller.sketch"),  # what worlds draw with, while they draw
     "pygls": ("stlc.editor",),
@@ -242,7 +242,7 @@ def test_a_library_is_imported_only_where_it_belongs():
 
 
 def test_schemas_do_not_import_torch():
-    light = ("stlc.dynamics.schema", "stlc.dynamics.declaration", "stlc.dynamics.load")
+    light = ("stlc.dynamics.declaration", "stlc.dynamics.load")
     strays = [
         entry
         for entry in every_import()

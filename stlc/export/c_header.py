@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
     from stlc.compile.augment.timers import Timer
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.dynamics.schema.names import ControlDecl
+    from stlc.dynamics.declaration.schema.names import ControlDecl
     from stlc.signature import Column
 
 

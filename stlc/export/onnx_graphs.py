@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.dynamics.schema.names import ControlDecl
+    from stlc.dynamics.declaration.schema.names import ControlDecl
 
 
 # --------------------------------------------------------------------------------------------- rollout

@@ -12,9 +12,9 @@ from typing import Any, get_args
 from stlc.diagnostics import Label
 from stlc.dynamics.declaration.columns import unit_text
 from stlc.dynamics.declaration.inputs import InputDecl, Interpolate
-from stlc.dynamics.schema.names import Context, Names
-from stlc.dynamics.schema.reader import Reader, first_line
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.names import Context, Names
+from stlc.dynamics.declaration.schema.reader import Reader, first_line
+from stlc.dynamics.declaration.schema.record import (
     EXPRESSION,
     FLAG,
     LINE,
@@ -35,8 +35,8 @@ from stlc.dynamics.schema.record import (
     values_of,
     word,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Node, Scalar, Sequence, load_yaml
-from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Node, Scalar, Sequence, load_yaml
+from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
 from stlc.files import read_source
 from stlc.plants.kinds import KINDS, ControllerLayout, Layout, PlantKind, Port
 from stlc.source import Source, Span

@@ -26,8 +26,8 @@ from stlc.dynamics.model.controls import raw_width, squash, unsquash
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from stlc.dynamics.declaration.schema.names import ControlDecl
     from stlc.dynamics.model.mirror import Mirror
-    from stlc.dynamics.schema.names import ControlDecl
 
 
 VARIATIONS = (0.01, 0.05)

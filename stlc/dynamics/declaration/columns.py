@@ -16,10 +16,10 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import add, multiply
 from stlc.compile.ir.ranges import usual_range
 from stlc.dynamics.declaration.motion import Assign, JumpDecl, shared_draws, state_assigns
-from stlc.dynamics.schema.expressions import SECOND, written
-from stlc.dynamics.schema.names import Context, ControlDecl, Names, Squash, component_names
-from stlc.dynamics.schema.reader import Reader
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.expressions import SECOND, written
+from stlc.dynamics.declaration.schema.names import Context, ControlDecl, Names, Squash, component_names
+from stlc.dynamics.declaration.schema.reader import Reader
+from stlc.dynamics.declaration.schema.record import (
     EXPRESSION,
     FLAG,
     INSTANT,
@@ -36,7 +36,7 @@ from stlc.dynamics.schema.record import (
     values_of,
     word,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.grammar import ast
 from stlc.registry import INTEGRATORS
 from stlc.signature import MAX_COMPONENTS, Column, Role

@@ -24,8 +24,8 @@ from stlc.dynamics.declaration.init import InitDecl
 from stlc.dynamics.declaration.inputs import InputDecl
 from stlc.dynamics.declaration.learning import Feedback, ObjectiveDecl, PolicyDecl, TrainDecl
 from stlc.dynamics.declaration.motion import Assign, JumpDecl
+from stlc.dynamics.declaration.schema.names import ControlDecl
 from stlc.dynamics.declaration.tables import TableDecl
-from stlc.dynamics.schema.names import ControlDecl
 from stlc.escape import visible
 from stlc.files import real
 from stlc.signature import Column, Signature

@@ -13,10 +13,10 @@ from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.columns import read_levels
 from stlc.dynamics.declaration.learning import INTEGERS, Term, term_list
 from stlc.dynamics.declaration.motion import SETS, Assign, components, rate_unit, read_sets, states_of
-from stlc.dynamics.schema.expressions import written
-from stlc.dynamics.schema.names import Context, base_name
-from stlc.dynamics.schema.reader import first_line
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.expressions import written
+from stlc.dynamics.declaration.schema.names import Context, base_name
+from stlc.dynamics.declaration.schema.reader import first_line
+from stlc.dynamics.declaration.schema.record import (
     EXPRESSION,
     INSTANT,
     LINE,
@@ -38,8 +38,8 @@ from stlc.dynamics.schema.record import (
     values_of,
     word,
 )
-from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
-from stlc.dynamics.schema.yaml_nodes import Node, Scalar
+from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.declaration.schema.yaml_nodes import Node, Scalar
 from stlc.files import named_in
 from stlc.grammar import ast
 from stlc.runtime.prefixes import SAMPLES, SAMPLINGS, Sampling

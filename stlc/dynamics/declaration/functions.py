@@ -11,9 +11,9 @@ from stlc.compile.frontend.scope import External
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.dynamics.declaration.kinematics import chain, position, read_urdf
-from stlc.dynamics.schema.names import Context
-from stlc.dynamics.schema.record import OF, TEXT, key, read, word
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node
+from stlc.dynamics.declaration.schema.names import Context
+from stlc.dynamics.declaration.schema.record import OF, TEXT, key, read, word
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node
 from stlc.files import named_in
 from stlc.source import Span
 from stlc.units import parse_unit

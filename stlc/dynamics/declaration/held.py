@@ -20,10 +20,10 @@ from stlc.dynamics.declaration.columns import (
 )
 from stlc.dynamics.declaration.motion import Assign, state_assigns
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
-from stlc.dynamics.schema.expressions import SECOND, written
-from stlc.dynamics.schema.names import Context, base_name
-from stlc.dynamics.schema.reader import first_line
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.expressions import SECOND, written
+from stlc.dynamics.declaration.schema.names import Context, base_name
+from stlc.dynamics.declaration.schema.reader import first_line
+from stlc.dynamics.declaration.schema.record import (
     EXPRESSION,
     FLAG,
     OF,
@@ -35,7 +35,7 @@ from stlc.dynamics.schema.record import (
     read,
     values_of,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Node
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Node
 from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import Unit

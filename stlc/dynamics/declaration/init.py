@@ -17,10 +17,10 @@ from stlc.compile.frontend.scope import Known
 from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.dynamics.declaration.motion import Assign, column_assign, shared_draws, state_assigns, states_of
-from stlc.dynamics.schema.expressions import written
-from stlc.dynamics.schema.names import Context, base_name, component_names
-from stlc.dynamics.schema.reader import first_line
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.expressions import written
+from stlc.dynamics.declaration.schema.names import Context, base_name, component_names
+from stlc.dynamics.declaration.schema.reader import first_line
+from stlc.dynamics.declaration.schema.record import (
     EXPRESSION,
     NAME,
     OF,
@@ -35,7 +35,7 @@ from stlc.dynamics.schema.record import (
     read,
     section,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Sequence
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Sequence
 from stlc.files import named_in
 from stlc.signature import Column
 from stlc.source import Span

@@ -19,11 +19,11 @@ from stlc.compile.ir.algebra import add, multiply, substitute, total
 from stlc.dynamics.declaration.columns import RANGE, name_columns, read_ranges, unit_text
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.sampled import CLOCK, Sampled, clock, declared
-from stlc.dynamics.schema.expressions import SECOND
-from stlc.dynamics.schema.names import Context, base_name
-from stlc.dynamics.schema.reader import first_line
-from stlc.dynamics.schema.record import OF, SECONDS, integer, key, read, word
-from stlc.dynamics.schema.yaml_nodes import Entry, Node
+from stlc.dynamics.declaration.schema.expressions import SECOND
+from stlc.dynamics.declaration.schema.names import Context, base_name
+from stlc.dynamics.declaration.schema.reader import first_line
+from stlc.dynamics.declaration.schema.record import OF, SECONDS, integer, key, read, word
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Node
 from stlc.jsontext import Num
 from stlc.signature import Column
 from stlc.units import Unit

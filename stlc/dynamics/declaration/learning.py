@@ -13,9 +13,9 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import substitute
 from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.motion import Assign, component_texts, state_assigns
-from stlc.dynamics.schema.expressions import SECOND, written
-from stlc.dynamics.schema.names import Context, ControlDecl, each_number
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.expressions import SECOND, written
+from stlc.dynamics.declaration.schema.names import Context, ControlDecl, each_number
+from stlc.dynamics.declaration.schema.record import (
     EXPRESSION,
     NAME,
     OF,
@@ -32,8 +32,8 @@ from stlc.dynamics.schema.record import (
     reads,
     word,
 )
-from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
-from stlc.dynamics.schema.yaml_nodes import Node, Scalar
+from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.declaration.schema.yaml_nodes import Node, Scalar
 from stlc.grammar import ast
 from stlc.registry import METHODS
 from stlc.signature import Column

@@ -14,10 +14,10 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import map_parts
 from stlc.compile.ir.functions import sampler_names
 from stlc.compile.ir.traverse import subexpressions
-from stlc.dynamics.schema.expressions import SECOND, written
-from stlc.dynamics.schema.names import Context
-from stlc.dynamics.schema.reader import first_line
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.expressions import SECOND, written
+from stlc.dynamics.declaration.schema.names import Context
+from stlc.dynamics.declaration.schema.reader import first_line
+from stlc.dynamics.declaration.schema.record import (
     FLAG,
     FORMULA,
     NAME,
@@ -29,8 +29,8 @@ from stlc.dynamics.schema.record import (
     number,
     values_of,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar
-from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar
+from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
 from stlc.registry import closest
 from stlc.signature import Column
 from stlc.units import Unit

@@ -14,7 +14,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import add
 from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.motion import Assign
-from stlc.dynamics.schema.names import Context
+from stlc.dynamics.declaration.schema.names import Context
 from stlc.signature import Column
 from stlc.source import Span
 from stlc.units import Unit

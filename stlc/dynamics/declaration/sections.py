@@ -56,10 +56,9 @@ from stlc.dynamics.declaration.motion import (
     state_assigns,
 )
 from stlc.dynamics.declaration.sampled import Sampled, in_order
-from stlc.dynamics.declaration.tables import TableDecl, TableKeys, read_tables
-from stlc.dynamics.schema.names import Context, Names, base_name
-from stlc.dynamics.schema.reader import Reader, first_line
-from stlc.dynamics.schema.record import (
+from stlc.dynamics.declaration.schema.names import Context, Names, base_name
+from stlc.dynamics.declaration.schema.reader import Reader, first_line
+from stlc.dynamics.declaration.schema.record import (
     EXPRESSION,
     VECTOR,
     Json,
@@ -71,7 +70,16 @@ from stlc.dynamics.schema.record import (
     read,
     section,
 )
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence, load_node, load_yaml
+from stlc.dynamics.declaration.schema.yaml_nodes import (
+    Entry,
+    Mapping,
+    Node,
+    Scalar,
+    Sequence,
+    load_node,
+    load_yaml,
+)
+from stlc.dynamics.declaration.tables import TableDecl, TableKeys, read_tables
 from stlc.files import named_in, read_source, real
 from stlc.signature import Signature
 from stlc.source import Source

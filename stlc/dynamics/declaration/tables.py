@@ -13,11 +13,11 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import multiply, total
 from stlc.compile.ir.support import columns_in
 from stlc.dynamics.declaration.columns import unit_text
-from stlc.dynamics.schema.names import Context
-from stlc.dynamics.schema.reader import first_line
-from stlc.dynamics.schema.record import EXPRESSION, OF, key, raw, read, word
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar
-from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
+from stlc.dynamics.declaration.schema.names import Context
+from stlc.dynamics.declaration.schema.reader import first_line
+from stlc.dynamics.declaration.schema.record import EXPRESSION, OF, key, raw, read, word
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar
+from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
 from stlc.units import DIMENSIONLESS, Unit
 
 Extrapolate: TypeAlias = Literal["linear", "hold"]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.namespace import Array, Ops
-from stlc.dynamics.schema.names import ControlDecl
+from stlc.dynamics.declaration.schema.names import ControlDecl
 
 EPS = 1e-6
 """Offset that keeps the gradient of an angle finite where both components are 0."""

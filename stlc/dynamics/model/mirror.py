@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from stlc.compile.namespace import Ops
     from stlc.dynamics.declaration.motion import Assign
-    from stlc.dynamics.schema.names import ControlDecl
+    from stlc.dynamics.declaration.schema.names import ControlDecl
 
 HARD = Hard()
 

@@ -1,6 +1,6 @@
 """Parametric uncertainty: a factor for every uncertain number of the dynamics, and the perturbed system.
 
-`stlc.dynamics.uncertainty.uncertain` says which numbers these are.
+`stlc.dynamics.declaration.uncertain` says which numbers these are.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import Assign
+from stlc.dynamics.declaration.schema.names import Names, NumberChanges, base_name, each_number
+from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.declaration.schema.yaml_nodes import Sequence
 from stlc.dynamics.declaration.sections import Motion, SystemKeys, motion_of, sections_of
+from stlc.dynamics.declaration.uncertain import NumbersInUse, UncertainNumbers, uncertain_numbers
 from stlc.dynamics.model.samplers import Drawing, completed
-from stlc.dynamics.schema.names import Names, NumberChanges, base_name, each_number
-from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
-from stlc.dynamics.schema.yaml_nodes import Sequence
 from stlc.dynamics.system import System
-from stlc.dynamics.uncertainty.uncertain import NumbersInUse, UncertainNumbers, uncertain_numbers
 
 if TYPE_CHECKING:
     from stlc.dynamics.model.rollout import Columns

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from stlc.dynamics.schema.record import TEXT, key, number, word
+from stlc.dynamics.declaration.schema.record import TEXT, key, number, word
 from stlc.extras import needed
 from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, Port, UnfitError
 from stlc.registry import did_you_mean

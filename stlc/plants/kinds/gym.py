@@ -17,7 +17,7 @@ from typing import Any, final
 
 import numpy as np
 
-from stlc.dynamics.schema.record import TEXT, key, raw
+from stlc.dynamics.declaration.schema.record import TEXT, key, raw
 from stlc.extras import needed
 from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, Port, UnfitError
 

@@ -25,7 +25,7 @@ from typing import Any, final
 
 import numpy as np
 
-from stlc.dynamics.schema.record import TEXT, integer, key, number, word
+from stlc.dynamics.declaration.schema.record import TEXT, integer, key, number, word
 from stlc.extras import needed
 from stlc.foreign import module_at
 from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, UnfitError, vector

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from stlc.dynamics.schema.record import key, number
+from stlc.dynamics.declaration.schema.record import key, number
 from stlc.plants.kinds import PlantKind
 
 

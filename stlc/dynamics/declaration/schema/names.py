@@ -12,9 +12,9 @@ from stlc.compile.frontend.scope import Entry, Known, Scope, enforced
 from stlc.compile.frontend.values import Number, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Label, SystemFileError
-from stlc.dynamics.schema.expressions import SECOND, Expressions
-from stlc.dynamics.schema.reader import Reader
-from stlc.dynamics.schema.yaml_nodes import Scalar
+from stlc.dynamics.declaration.schema.expressions import SECOND, Expressions
+from stlc.dynamics.declaration.schema.reader import Reader
+from stlc.dynamics.declaration.schema.yaml_nodes import Scalar
 from stlc.grammar import ast
 from stlc.jsontext import Num
 from stlc.signature import Column

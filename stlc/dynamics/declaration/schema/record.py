@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from stlc.dynamics.schema.reader import MAX_NAME
+from stlc.dynamics.declaration.schema.reader import MAX_NAME
 from stlc.units import DIMENSIONLESS
 
 if TYPE_CHECKING:
-    from stlc.dynamics.schema.names import Context
-    from stlc.dynamics.schema.yaml_nodes import Node
+    from stlc.dynamics.declaration.schema.names import Context
+    from stlc.dynamics.declaration.schema.yaml_nodes import Node
 
 R = TypeVar("R")
 T = TypeVar("T")

@@ -12,7 +12,7 @@ from stlc.diagnostics import CODES, StlcError
 from stlc.dynamics.load import load_system_decl, parse_system
 from stlc.source import Source
 
-GOLDEN = Path(__file__).parents[2] / "golden" / "dynamics"
+GOLDEN = Path(__file__).parents[3] / "golden" / "dynamics"
 
 GOOD = """\
 stlc: 1

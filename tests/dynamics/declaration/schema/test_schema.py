@@ -16,7 +16,7 @@ from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
 from stlc.source import Source
 from stlc.units import parse_unit
-from tests.dynamics.schema.test_schema_diagnostics import GOOD
+from tests.dynamics.declaration.schema.test_schema_diagnostics import GOOD
 
 Make = Callable[..., System]
 

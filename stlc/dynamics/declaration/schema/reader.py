@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from stlc.diagnostics import Diagnostic, Findings, Label, SystemFileError, tell
-from stlc.dynamics.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
+from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar, Sequence
 from stlc.escape import unseen
 from stlc.registry import closest
 from stlc.source import Source, Span

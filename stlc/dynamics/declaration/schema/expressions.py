@@ -21,9 +21,9 @@ from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import Diagnostic, StlcError
-from stlc.dynamics.schema.reader import Reader, first_line
-from stlc.dynamics.schema.yaml_nodes import Node, Scalar
-from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
+from stlc.dynamics.declaration.schema.reader import Reader, first_line
+from stlc.dynamics.declaration.schema.yaml_nodes import Node, Scalar
+from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.source import Span

@@ -11,11 +11,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
-from stlc.dynamics.schema import yaml_nodes
-from stlc.dynamics.schema.yaml_nodes import Mapping, Node, Scalar, Sequence, load_yaml
+from stlc.dynamics.declaration.schema import yaml_nodes
+from stlc.dynamics.declaration.schema.yaml_nodes import Mapping, Node, Scalar, Sequence, load_yaml
 from stlc.source import Source
 
-EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[4] / "examples"
 
 
 def load(text: str) -> Mapping:

@@ -9,14 +9,24 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
+from stlc.dynamics.declaration.schema.names import Context, Names
+from stlc.dynamics.declaration.schema.reader import Reader
+from stlc.dynamics.declaration.schema.record import (
+    FLAG,
+    OF,
+    integer,
+    json_schema,
+    key,
+    keys_of,
+    read,
+    reference,
+    word,
+)
+from stlc.dynamics.declaration.schema.yaml_nodes import load_yaml
 from stlc.dynamics.declaration.sections import SystemKeys, system_schema
-from stlc.dynamics.schema.names import Context, Names
-from stlc.dynamics.schema.reader import Reader
-from stlc.dynamics.schema.record import FLAG, OF, integer, json_schema, key, keys_of, read, reference, word
-from stlc.dynamics.schema.yaml_nodes import load_yaml
 from stlc.source import Source
 
-EXAMPLES = sorted((Path(__file__).parents[3] / "examples").glob("*.yaml"))
+EXAMPLES = sorted((Path(__file__).parents[4] / "examples").glob("*.yaml"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,11 @@ from typing import Any
 from stlc.compile.frontend.scope import Definition
 from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.schema.names import Names, NumberChanges, base_name
+from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
+from stlc.dynamics.declaration.schema.yaml_nodes import Node, Scalar
+from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
 from stlc.dynamics.declaration.sections import SystemKeys, motion_of
-from stlc.dynamics.schema.names import Names, NumberChanges, base_name
-from stlc.dynamics.schema.yaml_nodes import Mapping as MappingNode
-from stlc.dynamics.schema.yaml_nodes import Node, Scalar
-from stlc.dynamics.schema.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.grammar.traverse import children, descendants
