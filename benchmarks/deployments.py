@@ -19,7 +19,8 @@ from benchmarks.store import BENCHMARKS, Key, Result, ResultStore
 from benchmarks.table import Table, listed, publish
 from benchmarks.training import Place, benchmark_order
 from stlc.cli.framework.output import say
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.evaluation.deployment import decided, feasible_states
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, is_progress, measure
@@ -38,7 +39,7 @@ from stlc.jsontext import plain
 from stlc.options import parse_limit, parse_seeds
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
-from stlc.rundir import SPEC, SYSTEM, RunDir
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -241,7 +242,8 @@ def key_of(run: Run, scenario: str, guard: str, setting: Setting) -> Key:
     limit = setting.limit if kind.intervenes and kind.timed else None
     errors = laid.errors if laid is not None and laid.errors != ErrorsDecl() else None
     spec, system, policy = (
-        sha256((folder / name).read_text(encoding="utf-8")) for name in (SPEC, SYSTEM, "ckpt/last.json")
+        sha256((folder / name).read_text(encoding="utf-8"))
+        for name in (RunDir.SPEC, RunDir.SYSTEM, "ckpt/last.json")
     )
     name = run.task.compiled.name
     return Key(

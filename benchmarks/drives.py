@@ -21,7 +21,8 @@ from benchmarks.measured import Measured, has_changed, measured, reason
 from benchmarks.plannings import PlanCell, time_text
 from benchmarks.store import Key, Result, ResultStore, load
 from benchmarks.timing import Times, one_thread
-from stlc.controller.deployment.simulator import DeploymentRecording, Setting
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording
 from stlc.controller.evaluation.deployment import decided
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.metrics import METRICS, measure

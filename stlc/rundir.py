@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, os_reason, usage
 from stlc.escape import file_part, shell
@@ -38,26 +38,12 @@ from stlc.files import (
     write_atomic,
 )
 from stlc.jsontext import data_of, dumps
+from stlc.options import RUNS
 from stlc.records import read
 from stlc.registry import did_you_mean
 from stlc.source import Source
 
 Status = Literal["running", "finished", "interrupted", "failed"]
-
-RUNS = Path("runs")
-LATEST = "latest"
-ROWS = "train.jsonl"
-SPEC = "spec.stl"
-SYSTEM = "system.yaml"
-TRACE = "trace.npz"
-SCENE = "scene.npz"
-UNGUARDED = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
-"""Trace and scene of the first seed without guard, stored beside the guarded ones."""
-SIMULATION = "eval/simulate.json"
-HELD_OUT = "eval/held_out.npz"
-
-MOST_JSON, MOST_ARRAYS = 50_000_000, 2_000_000_000
-"""Largest sizes in bytes of a file of JSON, and of a file of arrays or tensors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +135,20 @@ class RunDir:
         path: path of the folder.
     """
 
+    LATEST: ClassVar = "latest"
+    ROWS: ClassVar = "train.jsonl"
+    SPEC: ClassVar = "spec.stl"
+    SYSTEM: ClassVar = "system.yaml"
+    TRACE: ClassVar = "trace.npz"
+    SCENE: ClassVar = "scene.npz"
+    UNGUARDED: ClassVar = ("eval/unguarded_trace.npz", "eval/unguarded_scene.npz")
+    """Trace and scene of the first seed without guard, stored beside the guarded ones."""
+    SIMULATION: ClassVar = "eval/simulate.json"
+    HELD_OUT: ClassVar = "eval/held_out.npz"
+    MOST_JSON: ClassVar = 50_000_000
+    MOST_ARRAYS: ClassVar = 2_000_000_000
+    """Largest sizes in bytes of a file of JSON, and of a file of arrays or tensors."""
+
     path: Path
 
     # ------------------------------------------------------------------ making and finding
@@ -171,8 +171,8 @@ class RunDir:
         with reported(f"make a run below `{root}`"):
             home.mkdir(parents=True, exist_ok=True)
             path = _reserve(home, words)
-            _point(home / LATEST, path.name)
-            _point(root / LATEST, f"{home.name}/{path.name}")
+            _point(home / RunDir.LATEST, path.name)
+            _point(root / RunDir.LATEST, f"{home.name}/{path.name}")
         return cls(path)
 
     @classmethod
@@ -182,7 +182,7 @@ class RunDir:
         Raises:
             UsageError: R101, there is no run below `root`.
         """
-        linked = root / LATEST
+        linked = root / RunDir.LATEST
         if (linked / RECORD).is_file():
             return _resolved(linked)
         runs = sorted(every_run(root), key=lambda run: run.path.stat().st_mtime)
@@ -219,7 +219,7 @@ class RunDir:
                 return _of_spec(given, root)
             run = _resolved(folder)
             return run if (run.path / RECORD).is_file() else run.checked()
-        return cls.newest(root) if str(where) == LATEST else _by_name(str(where), root)
+        return cls.newest(root) if str(where) == RunDir.LATEST else _by_name(str(where), root)
 
     def checked(self) -> RunDir:
         """Return this run if its record (`run.json`) can be read. Raises RunError (R101) if not."""
@@ -294,7 +294,7 @@ class RunDir:
             RunError: R101, it is missing, damaged, or not of that type (see `stlc.records.read`); R110, it is
                 no file of the run.
         """
-        data = self.read(name, MOST_JSON)
+        data = self.read(name, RunDir.MOST_JSON)
         try:
             return of_kind(data, kind)
         except (ValueError, RecursionError) as error:
@@ -358,7 +358,7 @@ class RunDir:
         """
         if not self.has(name):
             return []
-        data, rows = self.read(name, MOST_JSON), []
+        data, rows = self.read(name, RunDir.MOST_JSON), []
         for number, line in enumerate(data[: data.rfind(b"\n") + 1].split(b"\n"), 1):
             try:
                 rows += [of_kind(line, TrainingRow)] if line else []
@@ -403,7 +403,7 @@ def _resolved(folder: Path) -> RunDir:
         RunError: R110, `latest` leads elsewhere.
     """
     path = folder.resolve()
-    if folder.name == LATEST and not path.is_relative_to(folder.parent.resolve()):
+    if folder.name == RunDir.LATEST and not path.is_relative_to(folder.parent.resolve()):
         raise refused(folder, "it leads out of its folder")
     return RunDir(path)
 
@@ -419,7 +419,7 @@ def remove_run(run: RunDir) -> None:
         shutil.rmtree(run.path)
     runs = every_run(home.parent)
     for folder in (home, home.parent):
-        link = folder / LATEST
+        link = folder / RunDir.LATEST
         if not link.is_symlink() or link.exists():
             continue
         left = [entry for entry in runs if folder in entry.path.parents]
@@ -490,7 +490,7 @@ def _names(run: RunDir) -> tuple[str, str, str, str]:
 def _slug(name: str) -> str:
     """Part of a path for the name of a specification or run; never that of the link `latest`."""
     part = file_part(name, empty="spec")
-    return f"{part}-spec" if part.lower() == LATEST else part
+    return f"{part}-spec" if part.lower() == RunDir.LATEST else part
 
 
 def require_name(words: str) -> str:
@@ -602,8 +602,8 @@ def recorded_trace(what: str, runs: Path) -> Path:
             raise missing from None
     else:
         folder = RunDir.open(what, runs)
-    if not folder.has(TRACE):
+    if not folder.has(RunDir.TRACE):
         advice = (f"record one: {shell(('stlc', 'simulate', folder.name))}",)
         raise UsageError(Diagnostic("U102", f"`{folder.shown}` has no trace", help=advice))
-    folder.file(TRACE, MOST_ARRAYS)
-    return Path(folder.shown) / TRACE
+    folder.file(RunDir.TRACE, RunDir.MOST_ARRAYS)
+    return Path(folder.shown) / RunDir.TRACE

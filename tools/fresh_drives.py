@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from stlc.controller.deployment.simulator import Setting
+from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.closed_loop import closed_loop
 from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.evaluation.rules import rules_of

@@ -40,7 +40,7 @@ from stlc.controller.sketch import (
     tails,
 )
 from stlc.files import write_atomic
-from stlc.rundir import SIMULATION, RunDir
+from stlc.rundir import RunDir
 from stlc.view.animation import Animation, clear_artists, frames_in, save_animation, save_still
 from stlc.view.run_animation import RecordedScene, animation_of, recorded_scene
 from stlc.view.style import INK, MUTED
@@ -147,7 +147,7 @@ _TOLD = {"without": "unsafe without the guard", "guarded": "with it", "lost": "c
 
 def unsafe_in(run: RunDir) -> list[Unsafe]:
     """Unsafe ships of each seed in the newest deployment."""
-    document = json.loads((run.path / SIMULATION).read_text(encoding="utf-8"))
+    document = json.loads((run.path / RunDir.SIMULATION).read_text(encoding="utf-8"))
     found = []
     for seed in document["seeds"]:
         each = {

@@ -26,7 +26,7 @@ from stlc.assurance.conformal import lower_bound
 from stlc.assurance.drives import PolicyDrives
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.controller.deployment.simulator import Setting
+from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.rules import rules_of
 from stlc.controller.run.run import Run
 from stlc.registry import GUARDS

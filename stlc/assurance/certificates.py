@@ -203,7 +203,7 @@ def _subject(name: str | None, options: CertifyOptions) -> tuple[Subject, Path, 
 def _policy(name: str, options: CertifyOptions) -> PolicyDrives:
     """Drives of the policy of a run."""
     from stlc.assurance.drives import PolicyDrives
-    from stlc.controller.deployment.simulator import Setting
+    from stlc.controller.deployment.batched import Setting
     from stlc.controller.evaluation.rules import rules_of
     from stlc.controller.guard.margins import parse_margins
     from stlc.controller.run.run import Run

@@ -21,7 +21,8 @@ from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
 from stlc.compile.semantics.tolerance import satisfied, violated
-from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import Recorder, simulate
 from stlc.controller.evaluation.executed import executed_robustness
 from stlc.controller.evaluation.rules import Rules, rules_for, verdict_on_runs
 from stlc.controller.guard.guard import Guard
@@ -33,7 +34,7 @@ from stlc.jsontext import plain
 from stlc.monitor.judgement import chosen
 from stlc.provenance import sha256
 from stlc.registry import GUARDS
-from stlc.rundir import MOST_ARRAYS, RunDir
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from stlc.controller.deployment.simulator import DeploymentRecording, Watch
@@ -208,5 +209,5 @@ def _policy(folder: RunDir) -> str:
     parts = [folder.read(CONFIG)]
     if folder.has(f"{FOLDER}/{POINTER}"):
         name = folder.read_json(f"{FOLDER}/{POINTER}", CheckpointHead)["file"]
-        parts.append(folder.read(f"{FOLDER}/{name}", MOST_ARRAYS))
+        parts.append(folder.read(f"{FOLDER}/{name}", RunDir.MOST_ARRAYS))
     return sha256(b"\0".join(sha256(part).encode() for part in parts))

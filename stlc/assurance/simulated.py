@@ -13,7 +13,8 @@ from stlc.activity import PULSE
 from stlc.assurance.certificate import Assessment, Claim, assess
 from stlc.assurance.drives import sample_of
 from stlc.assurance.options import SimulateOptions
-from stlc.controller.deployment.simulator import Setting, Watch
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import Watch
 from stlc.controller.evaluation.archive import save_scene, save_trace_of, save_unguarded
 from stlc.controller.evaluation.deployment import (
     Deployment,
@@ -34,7 +35,7 @@ from stlc.dynamics.uncertainty.disturbance import errors_of
 from stlc.jsontext import Count
 from stlc.options import checked_share
 from stlc.registry import GUARDS, PLANNERS
-from stlc.rundir import SCENE, SIMULATION
+from stlc.rundir import RunDir
 from stlc.trace import check_writable
 from stlc.units import time_text
 
@@ -327,7 +328,7 @@ class _Order:
         run, setting, options = self.run, self.setting, self.options
         last = list(found.values())[-1].recording
         save_trace_of(run, last, setting, options.record, rules=rules)
-        save_scene(run.dir.place(SCENE), last.scene)
+        save_scene(run.dir.place(RunDir.SCENE), last.scene)
         alone = found.get(GUARDS.default)
         beside = alone.recording if alone is not None and len(found) > 1 else None
         save_unguarded(run, beside, setting, rules)
@@ -348,7 +349,7 @@ class _Order:
             guards={name: self.record(each, self.assured(name, each, rules)) for name, each in found.items()},
             planners={name: self.record(each) for name, each in planners.items()},
         )
-        run.dir.write_json(SIMULATION, result)
+        run.dir.write_json(RunDir.SIMULATION, result)
         return result
 
     def record(self, found: Deployment, assurance: Assessment | None = None) -> GuardedRuns:

@@ -26,6 +26,18 @@ GROUND, WALL, STONE, GOAL, WATER, BANK, CHARGE = (
 ROAD, STOP_LIGHT = "#e3e5e8", "#e5383b"
 NOTE = "#4a4f57"
 """Colour of small text."""
+SURROUNDINGS_ON_DARK = {
+    GROUND: "#1d2229",
+    WALL: "#5a616d",
+    STONE: "#7b828e",
+    WATER: "#15232f",
+    BANK: "#3a4334",
+    CHARGE: "#6e5a1e",
+    NOTE: "#b4bbc6",
+    ROAD: "#2b3038",
+    STOP_LIGHT: "#ff6b66",
+}
+"""Colours of surroundings and small text -> those that replace them on a dark background."""
 FADED = 0.75
 """Opacity of an agent's past path; a weaker one would make the policy's colour look like plan repair's."""
 

@@ -13,7 +13,7 @@ import torch
 
 from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.graph import BATCH, KINDS, GraphBody, GraphNode, OnnxGraph, Value
-from stlc.controller.guard import candidates as backup
+from stlc.controller.guard.candidates import grid_of
 from stlc.controller.run.run import Run, spec_hash, system_hash
 from stlc.diagnostics import usage
 from stlc.export.onnx_graphs import deciding, falling, following, judging
@@ -179,7 +179,7 @@ def _facts(run: Run) -> dict[str, object]:
     The prefixes are the sequences of actions that the backup policy tries as the first part of a plan. They
     are given by the values of each control, and by their lengths.
     """
-    task, grid = run.task, backup.grid_of(run.task)
+    task, grid = run.task, grid_of(run.task)
     feedback = task.system.decl.feedback
     return {
         "format": FORMAT,

@@ -16,7 +16,7 @@ from stlc.dynamics.scenario import under
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
-from stlc.rundir import MOST_ARRAYS, SIMULATION, SPEC, SYSTEM, TRACE, RunDir
+from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.source import Source, Span
 from stlc.trace import Trace, load_trace
@@ -25,7 +25,7 @@ from stlc.view.held_out import HeldOut, load_held_out
 T = TypeVar("T")
 Record = Mapping[str, Any]
 
-TEXTS = (SPEC, SYSTEM, "compiled.txt", "config.resolved.yaml")
+TEXTS = (RunDir.SPEC, RunDir.SYSTEM, "compiled.txt", "config.resolved.yaml")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +152,13 @@ def read_contents(run: RunDir) -> RunContents:
     Raises:
         RunError: R101, the folder is not a run.
     """
-    system = run.source(SYSTEM) if run.has(SYSTEM) else None
+    system = run.source(RunDir.SYSTEM) if run.has(RunDir.SYSTEM) else None
     decl = None if system is None else readable(lambda: load_system_decl(system))
     simulation = simulation_of(run)
     read = {name: run.read(name).decode("utf-8", "replace") for name in TEXTS if run.has(name)}
-    spec = readable(lambda: replace(parse(Source(SPEC, read.get(SPEC, ""))), library=read_library(run)))
+    spec = readable(
+        lambda: replace(parse(Source(RunDir.SPEC, read.get(RunDir.SPEC, ""))), library=read_library(run))
+    )
     scenario = (simulation or {}).get("scenario")
     deployed = decl if decl is None or scenario is None else readable(lambda: under(decl, str(scenario)))
     return RunContents(
@@ -171,14 +173,16 @@ def read_contents(run: RunDir) -> RunContents:
         simulation=simulation,
         units={} if decl is None or spec is None else readable(lambda: _units(spec, decl)) or {},
         usual={} if deployed is None else {"agents": deployed.test.agents, "steps": deployed.test.steps},
-        trace=archived(run, TRACE, load_trace),
+        trace=archived(run, RunDir.TRACE, load_trace),
         system=system,
     )
 
 
 def simulation_of(run: RunDir) -> Record | None:
     """Content of `eval/simulate.json`; None without one. Raises RunError (R101, R110) if it is damaged."""
-    found: Record | None = run.read_json(SIMULATION, StoredSimulation) if run.has(SIMULATION) else None
+    found: Record | None = (
+        run.read_json(RunDir.SIMULATION, StoredSimulation) if run.has(RunDir.SIMULATION) else None
+    )
     return found
 
 
@@ -195,7 +199,7 @@ def archived(run: RunDir, name: str, read: Callable[[Path], T]) -> T | None:
 
     Raises RunError (R110) if it is no file of the run.
     """
-    path = run.file(name, MOST_ARRAYS)
+    path = run.file(name, RunDir.MOST_ARRAYS)
     return readable(lambda: read(path))
 
 

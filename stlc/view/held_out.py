@@ -18,7 +18,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE, satisfied, violated
 from stlc.diagnostics import StlcError
 from stlc.escape import picture
 from stlc.records import from_json
-from stlc.rundir import HELD_OUT, MOST_ARRAYS, RunDir
+from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.trace.formats.npz import read_arrays
 from stlc.view.style import BLUE, INK, MUTED, RED, Picture, new_figure, picture_style
@@ -132,7 +132,7 @@ def load_held_out(run: RunDir) -> HeldOut | None:
 
     Raises RunError (R110) if it is no file of the run.
     """
-    path = run.file(HELD_OUT, MOST_ARRAYS)
+    path = run.file(RunDir.HELD_OUT, RunDir.MOST_ARRAYS)
     try:
         file = read_arrays(path)
         meta = from_json(HeldOutNames, str(file["meta"]), path)

@@ -20,7 +20,7 @@ from stlc.diagnostics import StlcError
 from stlc.dynamics.load import load_system_decl
 from stlc.escape import operand, shell
 from stlc.registry import GUARDS
-from stlc.rundir import SYSTEM, RunDir
+from stlc.rundir import RunDir
 from stlc.signature import Signature
 from stlc.view.held_out import HeldOut, find_weakness, load_held_out, weakness_text
 from stlc.view.words import seconds as duration
@@ -227,7 +227,7 @@ def learning_of_run(run: RunDir, commands: Commands) -> Learning | None:
         RunError: R101, `run.json` is damaged.
     """
     try:
-        signature = load_system_decl(run.source(SYSTEM)).signature
+        signature = load_system_decl(run.source(RunDir.SYSTEM)).signature
     except StlcError:
         signature = None
     return learning_on_record(run.record(), run.rows(), commands, clause(load_held_out(run), signature))

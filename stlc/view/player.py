@@ -19,7 +19,7 @@ from stlc.compile.semantics.tolerance import violated
 from stlc.escape import script_json
 from stlc.jsontext import dumps
 from stlc.monitor.judgement import beside
-from stlc.rundir import MOST_JSON
+from stlc.rundir import RunDir
 from stlc.view.animation import VectorAnimation, dark_colors, speed_up, still_bytes
 from stlc.view.contents import RunContents
 from stlc.view.html import Child, Html, Section, classed, el, join, table
@@ -112,7 +112,7 @@ def _still(contents: RunContents) -> Html | None:
     """
     run = contents.run
     if current(run) and run.has(STILL):
-        kind, content = "png", run.read(STILL, MOST_JSON)
+        kind, content = "png", run.read(STILL, RunDir.MOST_JSON)
     else:
         animation = animation_of(run)
         if animation is None:

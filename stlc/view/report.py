@@ -21,7 +21,8 @@ from stlc.controller.run.run import Run, folder_of
 from stlc.escape import operand, shell
 from stlc.files import write_atomic
 from stlc.foreign import driving
-from stlc.rundir import RUNS, RunDir
+from stlc.options import RUNS
+from stlc.rundir import RunDir
 from stlc.version import __version__
 from stlc.view import require_drawing
 from stlc.view.contents import RunContents, read_contents, simulation_of, untagged

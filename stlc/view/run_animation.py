@@ -17,7 +17,7 @@ import numpy as np
 from stlc.controller.stage import Stage, Staged
 from stlc.diagnostics import StlcError
 from stlc.escape import file_part, picture
-from stlc.rundir import MOST_ARRAYS, SCENE, SYSTEM, TRACE, UNGUARDED, RunDir
+from stlc.rundir import RunDir
 from stlc.source import Source
 from stlc.trace import Trace, load_trace
 from stlc.trace.formats.npz import read_arrays
@@ -100,8 +100,8 @@ def animate(run: RunDir, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_B
 def current(run: RunDir) -> bool:
     """True if the animation file in the run's folder is at least as new as the recorded closed-loop run."""
     gif = f"{animation_name(run)}.gif"
-    recorded = [run.file(name, MOST_ARRAYS) for name in (SCENE, TRACE) if run.has(name)]
-    written = run.file(gif, MOST_ARRAYS).stat().st_mtime if run.has(gif) else -math.inf
+    recorded = [run.file(name, RunDir.MOST_ARRAYS) for name in (RunDir.SCENE, RunDir.TRACE) if run.has(name)]
+    written = run.file(gif, RunDir.MOST_ARRAYS).stat().st_mtime if run.has(gif) else -math.inf
     return all(written >= record.stat().st_mtime for record in recorded)
 
 
@@ -161,12 +161,12 @@ def recorded_scene(run: RunDir, *, guarded: bool = True) -> RecordedScene | None
     from stlc.dynamics.load import load_system_decl
     from stlc.dynamics.scenario import under
 
-    trace_name, scene_name = (TRACE, SCENE) if guarded else UNGUARDED
+    trace_name, scene_name = (RunDir.TRACE, RunDir.SCENE) if guarded else RunDir.UNGUARDED
     scene = archived(run, scene_name, read_arrays)
     if not scene or not all(values.ndim and len(values) for values in scene.values()):
         return None
     try:
-        decl, scenario = load_system_decl(run.source(SYSTEM)), _scenario(run)
+        decl, scenario = load_system_decl(run.source(RunDir.SYSTEM)), _scenario(run)
         decl = decl if scenario is None else under(decl, scenario)
         if decl.test.world is None:
             return None
@@ -190,7 +190,7 @@ def _judged(run: RunDir, trace_name: str, scene: Scene) -> SceneVerdicts | None:
         return None
     if trace.traces < decisions.shape[1]:
         return None
-    return judge_agents(trace, decisions.shape[1], system=run.source(SYSTEM))
+    return judge_agents(trace, decisions.shape[1], system=run.source(RunDir.SYSTEM))
 
 
 def _scene_animation(run: RunDir, title: str) -> Animation | None:
@@ -293,14 +293,14 @@ def _trace_panels(run: RunDir) -> list[RunPanel]:
     animation = _signal_animation(run, "")
     if animation is None:
         return []
-    trace = load_trace(run.file(TRACE, MOST_ARRAYS))
+    trace = load_trace(run.file(RunDir.TRACE, RunDir.MOST_ARRAYS))
 
     def record(shown: range) -> VectorAnimation:
         from stlc.view.vector import vector_animation
 
         return vector_animation(animation, shown)
 
-    judged = readable(lambda: judge_agents(trace, trace.traces, system=run.source(SYSTEM)))
+    judged = readable(lambda: judge_agents(trace, trace.traces, system=run.source(RunDir.SYSTEM)))
     decided = decisions_of(trace)
     if decided is not None:  # one decision per step: the last one is shown at the last sample, too
         whole = decided.shape[1] == trace.samples - 1
@@ -329,10 +329,12 @@ def _scenario(run: RunDir) -> str | None:
 
 
 def _signal_animation(run: RunDir, title: str) -> Animation | None:
-    trace = archived(run, TRACE, load_trace)
+    trace = archived(run, RunDir.TRACE, load_trace)
     if trace is None:
         return None
-    region_map = readable(lambda: map_of_drives(trace, run.source(SYSTEM) if run.has(SYSTEM) else None))
+    region_map = readable(
+        lambda: map_of_drives(trace, run.source(RunDir.SYSTEM) if run.has(RunDir.SYSTEM) else None)
+    )
     return (
         signal_animation(trace, title=title) if region_map is None else map_animation(region_map, title=title)
     )

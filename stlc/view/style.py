@@ -16,18 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stlc.controller.sketch import (
-    BANK,
-    CHARGE,
-    GROUND,
-    NOTE,
-    ROAD,
-    STONE,
-    STOP_LIGHT,
-    VIOLATED,
-    WALL,
-    WATER,
-)
+from stlc.controller.sketch import SURROUNDINGS_ON_DARK, VIOLATED
 from stlc.escape import lawful
 from stlc.files import atomic_path
 from stlc.view import require_drawing
@@ -51,18 +40,7 @@ ON_DARK = {
     SKY: "#8fd0f5",
     PINK: "#e39cc2",
 }
-_SCENERY = {  # colours of worlds: ground, walls and scenery, as in `stlc.controller.sketch`
-    GROUND: "#1d2229",
-    WALL: "#5a616d",
-    STONE: "#7b828e",
-    WATER: "#15232f",
-    BANK: "#3a4334",
-    CHARGE: "#6e5a1e",
-    NOTE: "#b4bbc6",
-    ROAD: "#2b3038",
-    STOP_LIGHT: "#ff6b66",
-}
-SCENES_ON_DARK = ON_DARK | _SCENERY
+SCENES_ON_DARK = ON_DARK | SURROUNDINGS_ON_DARK
 SERIES = (BLUE, GREEN, PINK, SKY, ORANGE)  # requirements, in order; RED is kept for violations
 
 _RC: Any = {

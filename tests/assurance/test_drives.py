@@ -15,7 +15,8 @@ from stlc.assurance.campaign import BATCH, FIRST, SEED, Campaign, campaign
 from stlc.assurance.certificate import Claim, Judged, Sample, assess
 from stlc.assurance.drives import PolicyDrives, sample_of
 from stlc.compile.semantics.tolerance import TOLERANCE
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.rules import Rules, rules_of
 from stlc.controller.guard.guard import Guard

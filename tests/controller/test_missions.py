@@ -11,7 +11,8 @@ from helpers.mission_strategies import augmented
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy

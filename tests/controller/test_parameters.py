@@ -13,7 +13,7 @@ from stlc import native
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
 from stlc.compile.semantics.tolerance import satisfied
-from stlc.controller.deployment.simulator import Setting
+from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.archive import save_trace_of
 from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.problem.native import NativeJudge

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from stlc.compile.ir.nodes import Const, Predicate, Signal
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.guard.candidates import Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.margins import tightened, with_margins

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from stlc.compile.dump import dump
-from stlc.controller.deployment.simulator import Setting
+from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig

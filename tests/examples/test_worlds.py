@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from stlc.cli.framework.app import main
-from stlc.controller.deployment.simulator import Setting
+from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.archive import save_trace_of
 from stlc.controller.evaluation.deployment import deploy
 from stlc.controller.evaluation.metrics import METRICS

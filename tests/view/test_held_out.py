@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stlc.rundir import HELD_OUT, RunDir
+from stlc.rundir import RunDir
 from stlc.view.held_out import (
     HeldOut,
     draw_failures,
@@ -112,7 +112,7 @@ def test_file_round_trip(trained):
 def test_what_is_no_held_out_set_is_none(tmp_path):
     run = RunDir(tmp_path)
     assert load_held_out(run) is None
-    path = run.place(HELD_OUT)
+    path = run.place(RunDir.HELD_OUT)
     path.write_bytes(b"no archive")
     assert load_held_out(run) is None
     meta = np.array(json.dumps({"names": ["a"], "requirements": ["r"]}))

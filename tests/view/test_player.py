@@ -10,7 +10,7 @@ from html import unescape
 import numpy as np
 import pytest
 
-from stlc.rundir import UNGUARDED
+from stlc.rundir import RunDir
 from stlc.trace import load_trace, save_trace
 from stlc.view import player
 from stlc.view.contents import read_contents
@@ -47,11 +47,11 @@ def compared(deployed, recording):
     (deployed.path / "dots.py").write_text(WORLD)
     save_trace(deployed.path / "trace.npz", recording)
     first = {name: rows[:10] for name, rows in recording.data.items()}
-    save_trace(deployed.path / UNGUARDED[0], replace(recording, data=first, extras={}))
+    save_trace(deployed.path / RunDir.UNGUARDED[0], replace(recording, data=first, extras={}))
     scene = {"x": np.linspace(1, 9, 151)[:, None] + np.zeros(10)}
     decisions = np.concatenate((recording.extras["decision"][:10].T, np.zeros((1, 10))))
     np.savez(deployed.path / "scene.npz", **scene, decision=decisions.astype(np.int8))
-    np.savez(deployed.path / UNGUARDED[1], **scene, decision=np.zeros((151, 10), dtype=np.int8))
+    np.savez(deployed.path / RunDir.UNGUARDED[1], **scene, decision=np.zeros((151, 10), dtype=np.int8))
     return deployed
 
 
@@ -103,9 +103,9 @@ def test_the_page_runs_its_own_script_and_no_other_and_has_a_still_without_it(co
 def test_what_cannot_be_compared_is_shown_alone(compared, damage):
     match damage:
         case "no comparison":
-            (compared.path / UNGUARDED[1]).unlink()
+            (compared.path / RunDir.UNGUARDED[1]).unlink()
         case "another length":
-            np.savez(compared.path / UNGUARDED[1], x=np.zeros((7, 10)), decision=np.zeros((7, 10)))
+            np.savez(compared.path / RunDir.UNGUARDED[1], x=np.zeros((7, 10)), decision=np.zeros((7, 10)))
         case _:
             (compared.path / "dots.py").write_text(WORLD.replace('scene["x"][index], 0', 'scene["y"], 0'))
     (panel,) = run_panels(compared)

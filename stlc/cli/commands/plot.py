@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,14 +15,6 @@ from stlc.cli.framework.output import Answer, emit, say
 from stlc.cli.framework.program import command
 from stlc.diagnostics import usage
 from stlc.escape import visible
-
-if TYPE_CHECKING:
-    from stlc.grammar import ast
-    from stlc.monitor.verdict import Monitor
-    from stlc.signature import Column
-    from stlc.trace import Trace
-    from stlc.view.signals import Choice, Margins
-    from stlc.view.style import Picture
 
 _FORMATS = (".svg", ".png", ".pdf")
 
@@ -67,8 +59,7 @@ def plot(
     from stlc.monitor.check import load
     from stlc.rundir import recorded_trace
     from stlc.view import require_drawing
-    from stlc.view.signals import draw_signals
-    from stlc.view.verdicts import margins_of, marks_of, units_of
+    from stlc.view.plotted import plotted_places, plotted_signals, save_picture
 
     require_drawing()
     path = recorded_trace(what, reading.runs)
@@ -80,26 +71,20 @@ def plot(
         objects = f"{len(loaded.traces)} objects of different times"
         raise usage(f"`{path}` holds {objects}: choose one by --group NAME=VALUE")
     recorded, monitor, note = loaded.traces[0], loaded.monitor, loaded.note
+    wanted = reading.require or []
     if places:
-        shown = list(range(recorded.traces)) if trace is None else [trace]
         own = windows or bool(reading.spec or reading.require)
-        picture = _map(monitor, _one(recorded, trace), reading.require or [], own=own)
+        drawn = plotted_places(monitor, recorded, trace, wanted, own=own)
     else:
-        verdict = monitor.check(recorded, require=reading.require or [])
-        margins, units = margins_of(verdict), units_of(verdict)
-        choices = _choices(recorded, margins, trace, path.name)
-        drawn = _as_declared(recorded, monitor.spec)
-        marks = marks_of(verdict, drawn)
-        picture = draw_signals(drawn, margins, choices, units, marks)
-        shown = [choice.index for choice in choices]
-    _save(picture, target)
+        drawn = plotted_signals(monitor, recorded, trace, wanted, path.name)
+    save_picture(drawn.picture, target)
 
     def show() -> None:
         for remark in filter(None, (f"trace {path}", note)):
             say(remark)
         emit(visible(str(target)))
 
-    return Answer(PlottedTrace(str(path), str(target), shown), show)
+    return Answer(PlottedTrace(str(path), str(target), drawn.shown), show)
 
 
 def _target(output: Path | None, trace: Path) -> Path:
@@ -108,85 +93,3 @@ def _target(output: Path | None, trace: Path) -> Path:
         advice = (f"its suffix is one of {' '.join(_FORMATS)}",)
         raise usage(f"`{target}` is no picture", *advice)
     return target
-
-
-def _as_declared(trace: Trace, spec: ast.Spec) -> Trace:
-    """Return the trace; a column without unit and type has those that the specification declares."""
-    from stlc.grammar import ast
-    from stlc.signature import Signature
-    from stlc.units import parse_unit
-
-    def declared(column: Column) -> Column:
-        for item in spec.items:
-            if isinstance(item, ast.Signal) and (item.column or item.name) == column.name:
-                if item.unit and not column.unit.text:
-                    return replace(column, unit=parse_unit(item.unit))
-                if item.type and item.type.name == "bool":
-                    return replace(column, kind="bool")
-        return column
-
-    return replace(trace, signature=Signature(tuple(map(declared, trace.signature.columns))))
-
-
-def _one(trace: Trace, wanted: int | None) -> Trace:
-    """Return trace number `wanted` of a file with several traces; if `wanted` is None, return all traces."""
-    if wanted is None:
-        return trace
-    _require_trace(trace.traces, wanted)
-    return replace(
-        trace, data={name: rows[wanted : wanted + 1] for name, rows in trace.data.items()}, extras={}
-    )
-
-
-def _map(monitor: Monitor, trace: Trace, wanted: list[str], *, own: bool) -> Picture:
-    """Picture of paths over the regions of the requirements, such as `dock` in `[x, y] in dock`.
-
-    `wanted` are the names of the requirements; all if it is empty. With `own`, they decide which paths are
-    violated; otherwise the specification for drives does, if the trace stores one. Raises UsageError (U101)
-    if the requirements name no region.
-    """
-    from stlc.view.region_map import draw_map, map_of
-    from stlc.view.verdicts import violating
-
-    verdict = monitor.check(trace, require=wanted)
-    chart = map_of(monitor.spec, verdict, trace, None if own else violating(trace, verdict))
-    if chart is None:
-        advice = ("a place is a region of two signals: `[x, y] in circle([0, 0], 1 m)`",)
-        message = f"no requirement of `{monitor.spec.name}` names a place"
-        raise usage(message, *advice)
-    return draw_map(chart)
-
-
-def _require_trace(traces: int, wanted: int) -> None:
-    if wanted >= traces:
-        advice = (f"they go from 0 to {traces - 1}",)
-        raise usage(f"there is no trace {wanted}", *advice)
-
-
-def _choices(trace: Trace, margins: Margins, wanted: int | None, file: str) -> tuple[Choice, ...]:
-    import numpy as np
-
-    from stlc.view.signals import Choice, acted_in, choose_traces
-    from stlc.view.verdicts import trace_names
-
-    names = trace_names(trace) if trace.traces > 1 else [file]
-    if wanted is not None:
-        _require_trace(len(names), wanted)
-        return (Choice(wanted, names[wanted]),)
-    per_trace = [np.nanmin(np.where(np.isnan(rho), np.inf, rho), axis=1) for rho in margins.values()]
-    least = np.min(per_trace, axis=0) if per_trace else np.zeros(len(names))
-    return choose_traces(np.where(np.isfinite(least), least, np.nan), names, acted_in(trace))
-
-
-def _save(picture: Picture, target: Path) -> None:
-    from stlc.files import atomic_path, write_atomic
-    from stlc.view.style import picture_style
-
-    match target.suffix:
-        case ".svg":
-            write_atomic(target, picture.svg())
-        case ".png":
-            picture.save_png(target)
-        case _:
-            with picture_style(), atomic_path(target) as beside:
-                picture.figure.savefig(beside, format="pdf")

@@ -17,8 +17,8 @@ from stlc.cli.framework.output import Answer, emit, say, table
 from stlc.cli.framework.program import group, subcommand
 from stlc.diagnostics import StlcError, usage
 from stlc.escape import visible
-from stlc.options import Runs
-from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, every_run, remove_run
+from stlc.options import RUNS, Runs
+from stlc.rundir import RunDir, every_run, remove_run
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ def diff(
     """
     one, other = RunDir.open(first, runs), RunDir.open(second, runs)
     facts = differences(flattened(one.record()), flattened(other.record()))
-    texts = [name for name in (SPEC, SYSTEM) if _text(one, name) != _text(other, name)]
+    texts = [name for name in (RunDir.SPEC, RunDir.SYSTEM) if _text(one, name) != _text(other, name)]
     rows = [*facts, *((name, "differs", "differs") for name in texts)]
     text = table(rows, header=("", one.name, other.name))
     values = [DifferentFact(key, pair) for key, *pair in facts]

@@ -21,11 +21,13 @@ def run_names(context: typer.Context, incomplete: str) -> list[str]:
 
     Proposed are `latest`, the names of all runs (newest first), and the names of their specifications.
     """
-    from stlc.rundir import LATEST, every_run
+    from stlc.rundir import RunDir, every_run
 
     root = Path(str(context.params.get("runs") or "runs"))
     runs = [run.path for run in every_run(root)][::-1]
-    names = [LATEST, *(path.name for path in runs), *(path.parent.name for path in runs)] if runs else []
+    names = (
+        [RunDir.LATEST, *(path.name for path in runs), *(path.parent.name for path in runs)] if runs else []
+    )
     return _fitting(names, incomplete)
 
 

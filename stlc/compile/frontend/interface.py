@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from stlc.compile.ir.nodes import Body
+from stlc.compile.ir import nodes as ir
 from stlc.signature import Signature
 from stlc.source import Span
 from stlc.units import Unit
@@ -20,7 +20,7 @@ class InterfaceFunction(Protocol):
 
     def bound(
         self, arguments: tuple[int | None, ...], result: int | None
-    ) -> Callable[..., Sequence[Any]] | Body:
+    ) -> Callable[..., Sequence[Any]] | ir.Body:
         """Return the function in the form that the compiler calls.
 
         Args:

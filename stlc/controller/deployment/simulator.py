@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from stlc.controller.guard.guard import Guard, GuardDecision
     from stlc.controller.world import WorldType
 
-__all__ = ["DeploymentRecording", "Recorder", "Setting", "SimulationStep", "Watch", "simulate"]
 
 Frame = Mapping[str, NDArray[Any]]
 

@@ -13,13 +13,14 @@ import torch
 from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.search.plan_traces import meta_of, trace_along
 from stlc.files import atomic_path
-from stlc.rundir import TRACE, UNGUARDED
+from stlc.rundir import RunDir
 from stlc.trace import Trace, save_trace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from stlc.controller.deployment.simulator import DeploymentRecording, Setting
+    from stlc.controller.deployment.batched import Setting
+    from stlc.controller.deployment.simulator import DeploymentRecording
     from stlc.controller.evaluation.rules import Rules
     from stlc.controller.run.run import Run
 
@@ -80,7 +81,7 @@ def save_trace_of(
         MissingError: R201, a file cannot be written.
     """
     trace = trace_of(run, recording, setting, rules)
-    paths = [run.dir.place(TRACE), *([also] if also is not None else [])]
+    paths = [run.dir.place(RunDir.TRACE), *([also] if also is not None else [])]
     for path in paths:
         save_trace(path, trace)
     return paths
@@ -98,7 +99,7 @@ def save_unguarded(
     Raises:
         MissingError: R201, a file cannot be written.
     """
-    trace_path, scene_path = map(run.dir.place, UNGUARDED)
+    trace_path, scene_path = map(run.dir.place, RunDir.UNGUARDED)
     if recording is None:
         for path in (trace_path, scene_path):
             path.unlink(missing_ok=True)

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import numpy as np
 
 from stlc.compile.deadlines import unreached
+from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import (
     DeploymentRecording,
     Recorder,
-    Setting,
     SimulationStep,
     simulate,
 )

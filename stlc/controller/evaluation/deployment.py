@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from stlc.compile.semantics.tolerance import satisfied
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, Watch, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch, simulate
 from stlc.controller.evaluation.executed import Executed, judge_executed
 from stlc.controller.evaluation.metrics import measure
 from stlc.controller.evaluation.rules import Rules, RunVerdicts, judge_runs, judge_runs_by_plans

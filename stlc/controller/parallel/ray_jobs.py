@@ -19,7 +19,8 @@ from stlc.controller.parallel.jobs import Job, JobResult, start
 from stlc.controller.parallel.ray_cluster import RayWorkers
 from stlc.controller.parallel.workers import CallFiles, LostCall
 from stlc.files import RECORD, atomic_path
-from stlc.rundir import RUNS, RunDir
+from stlc.options import RUNS
+from stlc.rundir import RunDir
 
 LOST = -9
 """Exit code of a job whose worker is lost, as after SIGKILL."""

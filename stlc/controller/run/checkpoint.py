@@ -21,7 +21,7 @@ from torch import Tensor
 
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.provenance import sha256
-from stlc.rundir import MOST_ARRAYS, RunDir
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -145,7 +145,7 @@ def _read(run: RunDir) -> tuple[dict[str, Any], bytes]:
     name = facts["file"]
     if not _NAME.fullmatch(name):
         raise RunError(_damaged(run, f"`{name:.100}` is not the name of a checkpoint"))
-    data = run.read(f"{FOLDER}/{name}", MOST_ARRAYS)
+    data = run.read(f"{FOLDER}/{name}", RunDir.MOST_ARRAYS)
     if sha256(data) != facts["sha256"]:
         raise RunError(_damaged(run, f"`{name}` is not what was written"))
     return facts, data

@@ -18,10 +18,11 @@ from stlc.dynamics.scenario import scenario_constants, under
 from stlc.dynamics.system import System
 from stlc.grammar import ast
 from stlc.grammar.parser import parse
+from stlc.options import RUNS
 from stlc.plugins import variable
 from stlc.provenance import sha256
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
-from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir
+from stlc.rundir import RunDir
 from stlc.tabular import html_table
 
 if TYPE_CHECKING:
@@ -148,7 +149,7 @@ def task_of_run(
         scenario: name of a scenario of the system file to apply.
     """
     trained = folder.record().get("overrides") or {}
-    spec = replace(parse(folder.source(SPEC)), library=read_library(folder))
+    spec = replace(parse(folder.source(RunDir.SPEC)), library=read_library(folder))
     decl, changed = declaration_of_run(folder, overrides, scenario), _changes(folder, overrides, scenario)
     drawn = {item.name for item in spec.items if isinstance(item, ast.Param)} - trained.keys()
     values = {name: text for name, text in changed.items() if name in drawn}
@@ -162,13 +163,13 @@ def declaration_of_run(
     folder: RunDir, overrides: Mapping[str, str] | None = None, scenario: str | None = None
 ) -> SystemDecl:
     """Read the system in a run's folder. No code is run; the arguments are those of `task_of_run`."""
-    decl = load_system_decl(folder.source(SYSTEM), _changes(folder, overrides, scenario))
+    decl = load_system_decl(folder.source(RunDir.SYSTEM), _changes(folder, overrides, scenario))
     return decl if scenario is None else under(decl, scenario)
 
 
 def _changes(folder: RunDir, overrides: Mapping[str, str] | None, scenario: str | None) -> dict[str, str]:
     trained = folder.record().get("overrides") or {}
-    overlay = {} if scenario is None else scenario_constants(folder.source(SYSTEM), scenario, trained)
+    overlay = {} if scenario is None else scenario_constants(folder.source(RunDir.SYSTEM), scenario, trained)
     return {**trained, **overlay, **(overrides or {})}
 
 
@@ -193,12 +194,12 @@ def load_weights(folder: RunDir, module: Net, prefix: str) -> Net:
 
 def spec_hash(folder: RunDir) -> str:
     """SHA-256 of the specification in a run's folder, with its imports and the run's `--set` changes."""
-    return _hash(folder, SPEC, read_library(folder))
+    return _hash(folder, RunDir.SPEC, read_library(folder))
 
 
 def system_hash(folder: RunDir) -> str:
     """SHA-256 of the system file in a run's folder, with the run's `--set` changes."""
-    return _hash(folder, SYSTEM)
+    return _hash(folder, RunDir.SYSTEM)
 
 
 def trained_on(folder: RunDir) -> str:
@@ -213,7 +214,7 @@ def trained_on(folder: RunDir) -> str:
     then, learnt = record.get("system_hash"), record.get("learnt")
     if now == then or not isinstance(then, str) or learnt is None:
         return now
-    decl = load_system_decl(folder.source(SYSTEM), record.get("overrides") or {})
+    decl = load_system_decl(folder.source(RunDir.SYSTEM), record.get("overrides") or {})
     return then if decl.learnt == learnt else now
 
 

@@ -14,9 +14,10 @@ from stlc.controller.search.planner import prepared
 from stlc.controller.search.planner_policy import PlannerChoice, planner_of
 from stlc.controller.training.config import ENGINE_VERSION, TrainConfig, resolve_config
 from stlc.dynamics.functions import function_files
+from stlc.options import RUNS
 from stlc.provenance import git_state, hardware, sha256, versions
 from stlc.registry import METHODS, PLANNERS
-from stlc.rundir import RUNS, SPEC, SYSTEM, RunDir, now, require_name
+from stlc.rundir import RunDir, now, require_name
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -85,9 +86,9 @@ def open_folder(task: Task, config: TrainConfig, launch: Launch | None = None) -
             "hardware": hardware(),
         }
     )
-    folder.write(SPEC, task.compiled.spec.source.text)
+    folder.write(RunDir.SPEC, task.compiled.spec.source.text)
     save_library(folder, library_of(task.compiled.spec))
-    folder.write(SYSTEM, decl.source.text)
+    folder.write(RunDir.SYSTEM, decl.source.text)
     for path in {world.path for world in decl.worlds if world.path.is_file()}:
         folder.write(path.name, path.read_bytes())
     for name, path in function_files(decl).items():

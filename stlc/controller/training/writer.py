@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from stlc.controller.evaluation.held_out import Score, save_states
 from stlc.controller.run.checkpoint import save_checkpoint
 from stlc.controller.run.run import save_config, spec_hash, system_hash
-from stlc.rundir import HELD_OUT, RunDir, Status
+from stlc.rundir import RunDir, Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -67,7 +67,7 @@ class RunWriter:
     def held_out(self, task: Task, score: Score) -> None:
         """Save the held-out states and their verdicts."""
         if self.writes:
-            save_states(self.folder.place(HELD_OUT), task, score)
+            save_states(self.folder.place(RunDir.HELD_OUT), task, score)
 
     def close(self, status: Status, result: object = None) -> None:
         """Write the final status of the run and its result into `run.json`."""

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from helpers.walks import walk
 
-from stlc.cli.commands.plot import _as_declared
 from stlc.cli.framework.app import main
 from stlc.grammar.parser import parse
 from stlc.monitor.verdict import Monitor
 from stlc.source import Source
 from stlc.trace import load_trace, save_trace
+from stlc.view.plotted import _as_declared
 from stlc.view.verdicts import margins_of
 
 

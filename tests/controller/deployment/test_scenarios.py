@@ -10,7 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import Recorder, simulate
 from stlc.controller.evaluation.causes import Lost, losses
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.rules import Broken, judge_runs_by_plans

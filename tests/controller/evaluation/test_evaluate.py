@@ -11,7 +11,8 @@ import torch
 from helpers.traffic_drivers import careful
 from torch import Tensor
 
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.evaluation.archive import save_scene, save_trace_of
 from stlc.controller.evaluation.deployment import (
     InterruptedDeploymentError,

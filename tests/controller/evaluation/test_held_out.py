@@ -16,7 +16,7 @@ from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.dynamics.system import System
 from stlc.files import read_source
 from stlc.grammar.parser import parse
-from stlc.rundir import HELD_OUT, RunDir
+from stlc.rundir import RunDir
 from stlc.view.held_out import load_held_out, unsolved_text
 
 
@@ -36,7 +36,7 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
     assert bool(found.known[good].all())
     assert found.feasible == float(found.known.double().mean()) > found.accuracy
     folder = RunDir(tmp_path)
-    save_states(folder.place(HELD_OUT), car_task, found)
+    save_states(folder.place(RunDir.HELD_OUT), car_task, found)
     held = load_held_out(folder)
     assert held is not None
     failing, known = held.unsolved

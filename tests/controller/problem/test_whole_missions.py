@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, simulate
 from stlc.controller.evaluation.executed import judge_executed
 from stlc.controller.evaluation.rules import judge_runs_by_plans
 from stlc.controller.guard.guard import Guard

@@ -14,8 +14,9 @@ from stlc.files import reported
 from stlc.view.simulated import bar
 
 if TYPE_CHECKING:
+    from stlc.controller.deployment.batched import Setting
     from stlc.controller.deployment.live import LiveMonitor
-    from stlc.controller.deployment.simulator import Setting, SimulationStep, Watch
+    from stlc.controller.deployment.simulator import SimulationStep, Watch
     from stlc.controller.problem.task import Task
 
 STANDARD_OUTPUT = "-"

@@ -21,6 +21,7 @@ from stlc.controller.training.options import TrainOptions
 from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, usage
 from stlc.options import (
     NONE_GIVEN,
+    RUNS,
     Cluster,
     Jobs,
     Option,
@@ -32,7 +33,7 @@ from stlc.options import (
     parse_seeds,
 )
 from stlc.registry import METHODS
-from stlc.rundir import RUNS, RunDir
+from stlc.rundir import RunDir
 
 if TYPE_CHECKING:
     from stlc.cli.commands.train.session import Session

@@ -19,8 +19,9 @@ from stlc.controller.training.failures import FalsificationRounds
 from stlc.controller.training.final_evaluation import TrainingOutcome
 from stlc.controller.training.loop import Watch
 from stlc.diagnostics import StlcError
+from stlc.options import RUNS
 from stlc.records import from_json
-from stlc.rundir import LATEST, RUNS, RunDir, Status
+from stlc.rundir import RunDir, Status
 from stlc.stopping import age, leaving
 from stlc.view.learning import Commands, learning_of_run
 
@@ -202,7 +203,7 @@ def _commands(folder: RunDir, ranks: int = 1) -> Commands:
     The commands name the run as briefly as possible. The newest run is not named, and a run below `runs` is
     named without its path.
     """
-    newest = (RUNS / LATEST).resolve() == folder.path.resolve()
+    newest = (RUNS / RunDir.LATEST).resolve() == folder.path.resolve()
     usual = folder.path.resolve().parent.parent == RUNS.resolve()
     start = "stlc" if ranks == 1 else f"torchrun --nproc-per-node {ranks} -m stlc"
     name = folder.name if usual else folder.shown

@@ -12,8 +12,9 @@ from rich.console import Console
 from torch import Tensor
 
 from stlc.cli.commands.simulate.live import LiveView, _fitting, _shown, _signed
+from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.live import LiveMonitor
-from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.deployment.simulator import Recorder, simulate
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stlc.controller.deployment.simulator import Recorder, Setting, simulate
+from stlc.controller.deployment.batched import Setting
+from stlc.controller.deployment.simulator import Recorder, simulate
 from stlc.controller.guard.guard import Guard
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.task import Task
