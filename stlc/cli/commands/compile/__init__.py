@@ -87,7 +87,7 @@ def _trees(names: Sequence[str], show: Literal["ast", "dot"]) -> Answer[ParsedFi
     If `show` is "ast", the trees are printed as indented text. If it is "dot", they are printed as a graph
     for Graphviz. The syntax errors of all files are raised together.
     """
-    from stlc.cli.framework.tree_text import as_dot, as_tree, as_values
+    from stlc.cli.commands.compile.tree_text import as_dot, as_tree, as_values
     from stlc.diagnostics import Diagnostic, SpecError
     from stlc.files import read_source
     from stlc.grammar.parser import parse
