@@ -318,12 +318,12 @@ class Adjoint:
 
 
 class Advance:
-    """Loaded library with the compiled functions `advance` (one step) and `look` (observations of a policy).
+    """Loaded library of one step of a system, observations of a policy, and feedback along trajectories.
 
     Its C code comes from `stlc.compile.backends.c.advance`.
 
     Args:
-        library: library that contains the two functions.
+        library: library that contains the functions.
         seen: number k of inputs that the policy computes from a state.
         rewarded: whether the library computes a reward.
     """
@@ -341,7 +341,12 @@ class Advance:
             pointer,
         ]
         self._look.argtypes = [ctypes.c_int64, pointer, ctypes.c_double, pointer]
-        self._advance.restype = self._look.restype = None
+        self._riccati, self._follow = library.riccati, library.follow
+        count = ctypes.c_int64
+        self._riccati.argtypes = [count] * 3 + [pointer] * 7
+        self._follow.argtypes = [count] * 3 + [pointer] * 6 + [ctypes.c_double, count] + [pointer] * 3
+        for function in (self._advance, self._look, self._riccati, self._follow):
+            function.restype = None
         self._seen, self._rewarded = seen, rewarded
 
     def advance(
@@ -364,6 +369,51 @@ class Advance:
         where = None if reward is None else reward.ctypes.data
         self._advance(len(x), x.ctypes.data, u.ctypes.data, share, after.ctypes.data, seen.ctypes.data, where)
         return after, seen, reward
+
+    def riccati(self, *problem: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Minimise a quadratic cost of linear dynamics; `stlc.controller.search.newton.riccati` in C."""
+        by_state, by_control, *cost = (np.ascontiguousarray(part) for part in problem)
+        steps, plans, n, m = by_control.shape
+        gains = np.empty((steps, plans, m, n + 1))
+        pointers = (part.ctypes.data for part in (by_state, by_control, *cost, gains))
+        self._riccati(steps, plans, n, *pointers)
+        return gains
+
+    def follow(
+        self,
+        gains: NDArray[np.float64],
+        shares: NDArray[np.float64],
+        states: NDArray[np.float64],
+        *,
+        moving: NDArray[np.int64],
+        low: NDArray[np.float64],
+        span: NDArray[np.float64],
+        inside: float,
+        lengths: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Change plans by shares of a change, and correct them by feedback along their trajectories.
+
+        Args:
+            gains: gains of the feedback and, in the last column, the change, (T, B, m, k + 1), contiguous.
+            shares: controls of the plans as shares of their ranges, (B, T, m).
+            states: states under them, (B, T + 1, n).
+            moving: indices of the k states that the feedback reads, (k,).
+            low: least value of each control, (m,).
+            span: range of each control, (m,).
+            inside: least distance of a control from its bounds, as a share of the distance before.
+            lengths: the shares of the change, (L,).
+
+        Returns:
+            Controls, (B * L, T, m), as shares of their ranges, and states, (B * L, T + 1, n).
+        """
+        shares, states = np.ascontiguousarray(shares), np.ascontiguousarray(states)
+        batch, steps = shares.shape[:2]
+        found = np.empty((batch * len(lengths), *shares.shape[1:]))
+        path = np.empty((batch * len(lengths), *states.shape[1:]))
+        given = (part.ctypes.data for part in (moving, gains, shares, states, low, span))
+        out = (part.ctypes.data for part in (lengths, found, path))
+        self._follow(steps, batch, len(moving), *given, inside, len(lengths), *out)
+        return found, path
 
     def look(self, x: NDArray[np.float64], share: float) -> NDArray[np.float32]:
         """Return the observations of contiguous states, (B, n) -> (B, k + 1).

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 LEVELS = np.array([1.0, 0.1, 0.01])
 """Shares of the margins of the conditions, from one to the next where that much is not possible."""
-DAMPING, LEAST, MOST = 1e-4, 1e-9, 1e4
+DAMPING, LEAST, MOST = 1e-2, 1e-9, 1e4
 """The first, the least and the greatest damping."""
 EASED, RAISED, LONG = 0.3, 10.0, 0.3
 """Factors of the damping after a step of more than the length `LONG`, and after one that improved nothing."""

@@ -45,7 +45,7 @@ measured: at the top of a hill, a condition has no slope, but the distance is no
 INSIDE = 0.01
 """Least distance of a control from its bounds, at first as a share of its range; later, of the distance that
 it had before."""
-BARRIER = 0.3
+BARRIER = 0.03
 """Weight of the barrier, as a multiple of the cost for each control of the plan."""
 LENGTHS = np.array([1.0, 0.4, 0.1])
 """Shares of the changes of the controls that are tried."""
@@ -145,7 +145,7 @@ class GaussNewton:
         self._read = torch.tensor([i for i, name in enumerate(names) if name in read])
         self._scale = self.spread[self._read]
         moving = task.system.exact_step.next.keys() - timers
-        self._moving = [i for i, name in enumerate(names) if name in moving]
+        self._moving = np.array([i for i, name in enumerate(names) if name in moving], dtype=np.int64)
         self._low = task.system.control_low.double().numpy()
         self._span = np.maximum(task.system.control_high.double().numpy() - self._low, TINY)
         self._native = NativeStep.of(task.system, rewarded=False)
@@ -198,25 +198,38 @@ class GaussNewton:
         below, above = now.shares, 1.0 - now.shares
         own = weight / below**2 + weight / above**2 + (effect * damping + TINY**2)[:, None, None]
         push = weight / above - weight / below
-        change, gain = _riccati(by_state, by_control, curve, pull, own.swapaxes(0, 1), push.swapaxes(0, 1))
-        return self._followed(now, change, gain)
+        cost = curve, pull, own.swapaxes(0, 1), push.swapaxes(0, 1)
+        solve = riccati if self._native is None else self._native.compiled.riccati
+        return self._followed(now, solve(by_state, by_control, *cost))
 
-    def _followed(self, now: Linearised, change: Numbers, gain: Numbers) -> Trajectories:
-        """Apply changes of the controls, (T, B, m), with feedback gains, (T, B, m, n), in all lengths."""
+    def _followed(self, now: Linearised, gains: Numbers) -> Trajectories:
+        """Apply gains and, in the last column, changes of the controls, (T, B, m, n + 1), in all lengths."""
+        if self._native is None:
+            shares, states = self._followed_by_arrays(now, gains)
+        else:
+            bounds = {"low": self._low, "span": self._span, "inside": INSIDE}
+            shares, states = self._native.compiled.follow(
+                gains, now.shares, now.states, moving=self._moving, lengths=LENGTHS, **bounds
+            )
+        found = np.nan_to_num(states, nan=FAR, posinf=FAR, neginf=-FAR)
+        values = values_of(self.task, self._conditions, torch.from_numpy(found)).permute(2, 0, 1).numpy()
+        return Trajectories(shares, found, values / np.repeat(now.size, len(LENGTHS), 0))
+
+    def _followed_by_arrays(self, now: Linearised, gains: Numbers) -> tuple[Numbers, Numbers]:
+        """Controls as shares and states, (B * lengths, T or T + 1, m or n), where there is no compiler."""
         many = len(LENGTHS)
         about, path = (part.swapaxes(0, 1).repeat(many, 1) for part in (now.shares, now.states))
-        gains = gain.repeat(many, 1)
-        aim = about + change.repeat(many, 1) * np.tile(LENGTHS, len(now.shares))[:, None]
+        gains = gains.repeat(many, 1)
+        apart = np.empty((len(path[0]), len(self._moving) + 1, 1))
+        apart[:, -1, 0] = np.tile(LENGTHS, len(now.shares))
         low, high = INSIDE * about, 1.0 - INSIDE * (1.0 - about)
-        shares, states, x = np.empty_like(aim), path.copy(), path[0]
-        for k in range(len(aim)):
-            apart = (x - path[k])[:, self._moving, None]
-            share = np.minimum(np.maximum(aim[k] + (gains[k] @ apart)[..., 0], low[k]), high[k])
+        shares, states, x = np.empty_like(about), path.copy(), path[0]
+        for k in range(len(about)):
+            apart[:, :-1, 0] = x[:, self._moving] - path[k][:, self._moving]
+            share = np.clip(about[k] + (gains[k] @ apart)[..., 0], low[k], high[k])
             shares[k] = np.where(np.isfinite(share), share, about[k])
             x = states[k + 1] = self._stepped(x, self._low + self._span * shares[k])
-        found = np.nan_to_num(states.swapaxes(0, 1), nan=FAR, posinf=FAR, neginf=-FAR)
-        values = values_of(self.task, self._conditions, torch.from_numpy(found)).permute(2, 0, 1).numpy()
-        return Trajectories(shares.swapaxes(0, 1), found, values / np.repeat(now.size, many, 0))
+        return shares.swapaxes(0, 1), states.swapaxes(0, 1)
 
     def _jacobians(self, now: Linearised) -> tuple[Numbers, Numbers]:
         """Derivatives of each step by states and controls, (T, B, n, n) and (T, B, n, m), by differences.
@@ -256,7 +269,10 @@ class GaussNewton:
         for number in range(PROJECTIONS):
             values, slopes = self._linear(places[:, None])
             value, slope = values[index, 0, index], slopes[index, 0, :, index]
-            violated = value < 0.0 if number == 0 else violated
+            if number == 0:
+                violated = value < 0.0
+            if not bool((value < 0.0).any()):
+                break
             along = slope * self._scale**2
             share = -1.05 * value / (along * slope).sum(1).clamp(min=TINY**2)
             places[:, self._read] += torch.where(value < 0.0, share, 0.0)[:, None] * along
@@ -291,17 +307,16 @@ def barrier_weight(cost: Numbers, shares: Numbers) -> Numbers:
 
 def _mean_effect(by_state: Numbers, by_control: Numbers, curve: Numbers) -> Numbers:
     """Sum over the conditions of the squared effect that the controls before them have on them, (B,)."""
-    reach = np.zeros_like(curve[0])
-    total = np.zeros(len(reach))
-    for k, (a, b) in enumerate(zip(by_state, by_control, strict=True)):
-        reach = a @ reach @ a.swapaxes(1, 2) + b @ b.swapaxes(1, 2)
-        total += np.einsum("bij,bij->b", reach, curve[k + 1])
-    return np.nan_to_num(total, nan=1.0, posinf=1e12)
+    effects = by_control @ by_control.swapaxes(2, 3)
+    turned = by_state.swapaxes(2, 3)
+    for k in range(1, len(effects)):
+        effects[k] += by_state[k] @ effects[k - 1] @ turned[k]
+    return np.nan_to_num(np.einsum("kbij,kbij->b", effects, curve[1:]), nan=1.0, posinf=1e12)
 
 
-def _riccati(
+def riccati(
     by_state: Numbers, by_control: Numbers, curve: Numbers, pull: Numbers, own: Numbers, push: Numbers
-) -> tuple[Numbers, Numbers]:
+) -> Numbers:
     """Changes of the controls that minimise a quadratic cost of linear dynamics.
 
     Args:
@@ -313,24 +328,25 @@ def _riccati(
         push: derivatives of the cost by each control, (T, B, m).
 
     Returns:
-        The changes, (T, B, m), and the gains of the feedback, (T, B, m, n).
+        The gains of the feedback and, in the last column, the changes, (T, B, m, n + 1).
     """
-    steps, batch, states, controls = by_control.shape
-    found = np.empty((steps, batch, controls, 1 + states))
-    bend, slope, each = curve[-1], pull[-1][..., None], np.arange(controls)
-    turned, turned_control = by_state.swapaxes(2, 3), by_control.swapaxes(2, 3)
+    steps, batch, n, m = by_control.shape
+    state, control = slice(n), slice(n + 1, None)
+    motion = np.zeros((steps, batch, n + 1, n + 1 + m))  # of (states, 1) by (states, 1, controls)
+    motion[..., state, state], motion[..., state, control], motion[..., n, n] = by_state, by_control, 1.0
+    cost = np.zeros((steps + 1, batch, n + 1 + m, n + 1 + m))
+    cost[..., state, state], cost[..., state, n], cost[..., n, state] = curve, pull, pull
+    each = np.arange(n + 1, n + 1 + m)
+    cost[:-1, :, each, each], cost[:-1, :, n, control], cost[:-1, :, control, n] = own, push, push
+    found = np.empty((steps, batch, m, n + 1))
+    ahead, turned = cost[-1, :, : n + 1, : n + 1], motion.swapaxes(2, 3)
     for k in range(steps - 1, -1, -1):
-        back = turned_control[k] @ bend
-        inner = back @ by_control[k]
-        inner[:, each, each] += own[k]
-        mixed = back @ by_state[k]
-        first = turned_control[k] @ slope + push[k][..., None]
-        found[k] = -np.linalg.solve(inner, np.concatenate((first, mixed), 2))
-        cross = mixed.swapaxes(1, 2)
-        slope = pull[k][..., None] + turned[k] @ slope + cross @ found[k][..., :1]
-        bend = curve[k] + turned[k] @ bend @ by_state[k] + cross @ found[k][..., 1:]
-        bend = 0.5 * (bend + bend.swapaxes(1, 2))
-    return found[..., 0], found[..., 1:]
+        whole = turned[k] @ ahead @ motion[k] + cost[k]
+        mixed = whole[:, control, : n + 1]
+        found[k] = -np.linalg.solve(whole[:, control, control], mixed)
+        ahead = whole[:, : n + 1, : n + 1] + mixed.swapaxes(1, 2) @ found[k]
+        ahead = 0.5 * (ahead + ahead.swapaxes(1, 2))
+    return found
 
 
 def spread_of(task: Task, states: Tensor) -> Tensor:

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 import stlc
 from stlc.controller.problem.load import load_task
+from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import Task
 from stlc.controller.search.descent import Descent
-from stlc.controller.search.newton import GaussNewton, _riccati, values_of
+from stlc.controller.search.newton import GaussNewton, riccati, values_of
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.controller.search.schedules import GoalScheduler
 from stlc.dynamics.system import System
@@ -59,7 +60,7 @@ def test_the_recursion_solves_the_quadratic_problem(seed: int, n: int, m: int, s
     root = random.normal(size=(steps + 1, 1, n, n))
     curve, pull = root @ root.swapaxes(2, 3), random.normal(size=(steps + 1, 1, n))
     own, push = 0.5 + random.random((steps, 1, m)), random.normal(size=(steps, 1, m))
-    change, gain = _riccati(a, b, curve, pull, own, push)
+    gains = riccati(a, b, curve, pull, own, push)
     effect = np.zeros((steps + 1, n, steps, m))  # of each control on each state
     for k in range(steps):
         effect[k + 1] = np.einsum("ij,jkl->ikl", a[k, 0], effect[k])
@@ -69,9 +70,44 @@ def test_the_recursion_solves_the_quadratic_problem(seed: int, n: int, m: int, s
     best = -np.linalg.solve(hessian, np.einsum("tia,ti->a", flat, pull[:, 0]) + push.reshape(-1))
     x, found = np.zeros(n), []
     for k in range(steps):
-        found.append(change[k, 0] + gain[k, 0] @ x)
+        found.append(gains[k, 0, :, n] + gains[k, 0, :, :n] @ x)
         x = a[k, 0] @ x + b[k, 0] @ found[-1]
     assert np.allclose(np.concatenate(found), best, rtol=1e-6, atol=1e-8)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 5), st.integers(1, 6))
+def test_the_recursion_in_c_gives_the_same(seed: int, n: int, batch: int, steps: int) -> None:
+    random, m = np.random.default_rng(seed), 2
+    root = random.normal(size=(steps + 1, batch, n, n))
+    problem = (
+        random.normal(size=(steps, batch, n, n)),
+        random.normal(size=(steps, batch, n, m)),
+        root @ root.swapaxes(2, 3),
+        random.normal(size=(steps + 1, batch, n)),
+        0.5 + random.random((steps, batch, m)),
+        random.normal(size=(steps, batch, m)),
+    )
+    native = NativeStep.of(System.load(ROOT / "examples/planning/circles_dubins.yaml"), rewarded=False)
+    assert native is not None
+    assert np.allclose(native.compiled.riccati(*problem), riccati(*problem), rtol=1e-7, atol=1e-9)
+
+
+def test_steps_in_c_change_plans_as_those_of_arrays() -> None:
+    task = circles("eventually[20 steps, 20 steps] at_a")
+    scheduler, plans = (
+        scheduler_of(task),
+        torch.rand(5, task.horizon, 2, generator=torch.manual_seed(0)).double(),
+    )
+    newton = GaussNewton(task, scheduler.conditions, torch.ones(2, dtype=torch.float64))
+    now = newton.begin(torch.zeros(2, dtype=torch.float64), plans)
+    more = scheduler.nearest(now.distance), np.full(now.distance.shape[:2], 0.03), np.full(5, 0.01)
+    assert newton._native is not None
+    compiled = newton.step(now, *more)
+    newton._native = None
+    by_arrays = newton.step(now, *more)
+    for name in ("shares", "states", "distance"):
+        assert np.allclose(getattr(compiled, name), getattr(by_arrays, name), rtol=1e-8, atol=1e-10)
+    assert np.abs(compiled.shares - np.repeat(now.shares, 3, 0)).max() > 0.01
 
 
 def test_steps_reach_a_goal_and_places_lie_in_it() -> None:

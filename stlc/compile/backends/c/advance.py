@@ -1,24 +1,26 @@
 """C code of one step of a system, with its observation and reward, for many states at once.
 
 Conditions are evaluated exactly. Numbers are double, and `LANES` state vectors are computed at a time.
-Observations are written as float32, the type that learning methods read.
+Observations are written as float32, the type that learning methods read. `feedback.c` repeats the step along
+trajectories, with feedback gains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from stlc.compile.backends.c.emit import HEAD, Motion, place_in_step, state_index
 from stlc.compile.backends.c.numbers import NumberWriter
 from stlc.compile.ir import nodes as ir
 
+FEEDBACK = Path(__file__).with_name("feedback.c")
+
 
 def emit_advance(
     motion: Motion, *, observed: Sequence[ir.Num], reward: ir.Num | None, commands: Mapping[str, ir.Num]
 ) -> str:
-    """Return the C source of the functions `advance` (one step) and `look` (one observation).
-
-    `stlc.native.Advance` calls them.
+    """Return the C source of steps, observations and feedback along trajectories, for `stlc.native.Advance`.
 
     Args:
         motion: one step of the system.
@@ -46,6 +48,7 @@ def emit_advance(
                 _numbers(motion, [ir.Const(0.0) if reward is None else reward]),
             ),
             _DRIVER.format(states=states, controls=max(controls, 1), inputs=controls, seen=len(observed)),
+            FEEDBACK.read_text(encoding="utf-8"),
         ]
     )
 
