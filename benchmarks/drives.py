@@ -32,7 +32,7 @@ from stlc.controller.guard.kinds.paper import GUARD as PAPER
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.task import Task
 from stlc.controller.run.run import Run
-from stlc.controller.search.planner import PLANNING_VERSION, PlanBudget, planner_named
+from stlc.controller.search.planner import PlanBudget, planner_named, planning_version
 from stlc.controller.search.planner_policy import PlannerPolicy
 from stlc.diagnostics import UsageError
 from stlc.jsontext import plain
@@ -233,7 +233,8 @@ def _half(metric: Mapping[str, Any]) -> float | None:
 def is_outdated(result: Result) -> bool:
     """True if the specification, the system, the world or a version has changed since a measurement."""
     key = result["key"]
-    versions = {"planner_version": PLANNING_VERSION, "guard_version": GUARDS.get(key["guard"]).version}
+    versions = {"planner_version": planning_version(key["planner"])}
+    versions["guard_version"] = GUARDS.get(key["guard"]).version
     return has_changed(result, {**versions, **_deployed(load(key["benchmark"]))})
 
 

@@ -23,7 +23,7 @@ from benchmarks.timing import WARM, Times, one_thread
 from benchmarks.training import pack, unpack
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.problem.task import Task
-from stlc.controller.search.planner import PLANNING_VERSION, PlanBudget, PlanSearch, Solver, planner_named
+from stlc.controller.search.planner import PlanBudget, PlanSearch, Solver, planner_named, planning_version
 from stlc.diagnostics import UsageError
 from stlc.provenance import sha256
 from stlc.rundir import RunDir
@@ -68,6 +68,11 @@ class PlanCell:
         )
         return f"{self.benchmark}-{own}"
 
+    @property
+    def planner(self) -> str:
+        """Name of the planner; of the one that replays plans, for a trained policy."""
+        return self.contender.method if self.run is None else REPLAYED
+
     @cached_property
     def options(self) -> dict[str, Any]:
         """All options of the planner, including defaults; for a trained policy, the hash of its checkpoint.
@@ -99,8 +104,8 @@ class PlanCell:
             {
                 **inputs_of(load(self.benchmark)),
                 **{"benchmark": self.benchmark, "contender": self.contender.name, "label": self.label},
-                **{"planner": self.contender.method if self.run is None else REPLAYED},
-                **{"options": self.options, "planner_version": PLANNING_VERSION},
+                **{"planner": self.planner, "planner_version": planning_version(self.planner)},
+                **{"options": self.options},
                 **{"seconds": self.seconds if math.isfinite(self.seconds) else None},
                 **{"evaluations": self.evaluations, "starts": self.starts, "starts_seed": SEED, "seed": 0},
             },
@@ -225,7 +230,7 @@ class PlanRow:
 
 def is_outdated(result: Result) -> bool:
     """True if the specification, the system or the planners' version has changed since a measurement."""
-    return has_changed(result, {"planner_version": PLANNING_VERSION})
+    return has_changed(result, {"planner_version": planning_version(result["key"]["planner"])})
 
 
 @dataclass(frozen=True, slots=True)

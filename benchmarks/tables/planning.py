@@ -25,7 +25,7 @@ from benchmarks.table import Columns, Table, show
 from benchmarks.timing import one_thread
 from stlc.cli.framework.options import JsonOption
 from stlc.cli.framework.program import command
-from stlc.controller.search.planner import PlanBudget, PlanResult, plan
+from stlc.controller.search.planner import PlanBudget, PlanResult, plan, planning_version
 from stlc.diagnostics import StlcError, UsageError
 from stlc.files import find_system
 from stlc.provenance import sha256
@@ -194,7 +194,10 @@ def measured(problem: Problem, method: str, store: ResultStore) -> PlanningRow:
             inputs = inputs_of(_task(problem))
         key = Key(
             f"{problem.name}, {method}",
-            {**inputs, "steps": problem.steps, "seconds": budget, "target": str(target), "seed": SEED},
+            {
+                **{**inputs, "steps": problem.steps, "seconds": budget, "target": str(target), "seed": SEED},
+                **({"planner_version": version} if (version := planning_version(method)) > 1 else {}),
+            },
         )
         kept = store.get(
             key, lambda: _values(_drawn(problem, method) if problem.tasks else _one(problem, method))

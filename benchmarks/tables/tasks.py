@@ -19,7 +19,7 @@ from benchmarks.options import OnlyOption, Output, ResultsOption, SeedsOption, T
 from benchmarks.store import Key, Result, ResultStore
 from benchmarks.table import Columns, Table, listed, provenance, publish
 from stlc.cli.framework.program import command
-from stlc.controller.search.planner import PLANNING_VERSION
+from stlc.controller.search.planner import planning_version
 from stlc.controller.training.config import ENGINE_VERSION
 from stlc.options import parse_seeds
 from stlc.registry import GUARDS as KINDS
@@ -97,7 +97,7 @@ class TaskCell:
             "controller": ("decision", "drives"),
             "policy": ("train_seconds", "drives"),
         }[self.part]
-        versions: dict[str, Any] = {"planner_version": PLANNING_VERSION}
+        versions: dict[str, Any] = {"planner_version": planning_version("search")}
         if self.part == "policy":
             guards = [KINDS.get(name).version for name in GUARDS]
             versions |= {"engine_version": ENGINE_VERSION, "guard_versions": guards}

@@ -27,8 +27,6 @@ from stlc.registry import PLANNERS, closest
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
 
-PLANNING_VERSION = 4
-"""Version of the planners, raised with every change of the plans that they find within a budget."""
 RATE = 50_000.0
 """Judged plans that count as a second where time is not limited."""
 SECONDS = 1.0
@@ -266,6 +264,11 @@ class Planner(Protocol):
 def is_planner(found: object) -> bool:
     """True for a dataclass with the method of `Planner`."""
     return isinstance(found, type) and is_dataclass(found) and callable(getattr(found, "prepare", None))
+
+
+def planning_version(name: str) -> int:
+    """Version of the planner `name`, raised when it finds other plans within a budget; at first 1."""
+    return getattr(PLANNERS.get(name), "version", 1)
 
 
 def planner_named(name: str, **options: Any) -> Planner:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -35,8 +35,8 @@ the local search at which both are equal; see `PlanSearch.spent`."""
 ORDERS = 4.0
 """This cost where the order of jumps matters: in plans longer than a phase."""
 LEAD, LONG = 0.02, 0.1
-"""Cost of the search for phases before schedules are searched for as well; and before local search, where the
-order of jumps matters."""
+"""Cost of these searches before local search begins, where a plan is to be mended; and where the order of
+jumps matters or no round of local search comes first. Schedules begin that much before phases."""
 COSTLY = 4_000
 """Number of plans, a limit of judged plans given, that must be left for a search for phases."""
 RESTARTS = 16
@@ -55,6 +55,7 @@ class SearchPlanner:
     piecewise constant plans; plans that solve an initial state are added.
 
     Attributes:
+        version: raised with every change of the plans that are found within a budget.
         tries: number of plans tried per initial state in the first round; each later round tries twice as
             many, up to `longest`.
         longest: maximum number of plans tried per initial state and round.
@@ -63,6 +64,7 @@ class SearchPlanner:
             of jumps matters, they begin after the first round.
     """
 
+    version: ClassVar = 5
     tries: int = bounded(2_000, 1, 10**9)
     longest: int = bounded(20_000, 1, 10**9)
     library: int = bounded(2_048, 1, 10**6)
@@ -132,7 +134,7 @@ class _Orders:
                 continue
             local = float(search.spent[row] - self._own[row])
             share = ORDERS if self._ordered else min(SHARE, local / EQUAL)
-            lead = LONG if self._ordered else LEAD if self._first == 0 else 0.0
+            lead = LONG if self._ordered or not self._rounds else LEAD if self._first == 0 else 0.0
             allowed = local + max(lead, share * local)
             going, before = self._running.get(row), search.spent.clone()
             if going is None:
@@ -164,12 +166,12 @@ class _Orders:
         with search.charged(row):
             root = self._sequences.root(search.states[row][0])
         several = root is not None and self._sequences.several(root)
-        if root is not None and several:
-            searches.append(self._by_phases(row))
         motions = root is None or not (root.steps or self._jumps or self._sequences.marked(root))
         if motions:  # a schedule knows no modes and no landmarks
             searches.append(self._attempts.of(search, row))
-        spent = {each: LEAD * i for i, each in enumerate(searches)}
+        if root is not None and several:
+            searches.append(self._by_phases(row))
+        spent = {each: LONG * i for i, each in enumerate(searches)}
         while spent:
             least = min(spent, key=spent.__getitem__)
             before = float(search.spent[row])
