@@ -342,9 +342,9 @@ class Advance:
         ]
         self._look.argtypes = [ctypes.c_int64, pointer, ctypes.c_double, pointer]
         self._riccati, self._follow = library.riccati, library.follow
-        count = ctypes.c_int64
-        self._riccati.argtypes = [count] * 3 + [pointer] * 7
-        self._follow.argtypes = [count] * 3 + [pointer] * 6 + [ctypes.c_double, count] + [pointer] * 3
+        counts = [ctypes.c_int64] * 3
+        self._riccati.argtypes = [*counts, *[pointer] * 7]
+        self._follow.argtypes = [*counts, *[pointer] * 6, ctypes.c_double, ctypes.c_int64, *[pointer] * 3]
         for function in (self._advance, self._look, self._riccati, self._follow):
             function.restype = None
         self._seen, self._rewarded = seen, rewarded

@@ -311,7 +311,8 @@ def _mean_effect(by_state: Numbers, by_control: Numbers, curve: Numbers) -> Numb
     turned = by_state.swapaxes(2, 3)
     for k in range(1, len(effects)):
         effects[k] += by_state[k] @ effects[k - 1] @ turned[k]
-    return np.nan_to_num(np.einsum("kbij,kbij->b", effects, curve[1:]), nan=1.0, posinf=1e12)
+    found: Numbers = np.einsum("kbij,kbij->b", effects, curve[1:])
+    return np.nan_to_num(found, nan=1.0, posinf=1e12)
 
 
 def riccati(
