@@ -158,8 +158,8 @@ PROBES = (
     Probe(
         "until",
         "compile/backends/array/windows.py",
-        "return self.semantics.reduce(pair(held, right, other, self.ops), pick, self.ops)",
-        "return self.semantics.reduce(right, pick, self.ops)",
+        "                x = self.semantics.pair(held, x, other, self.ops)\n",
+        "                x = x[:]\n",
         (*RECORDED, "stream in C", *PLANNED, "plan by milp", "bounds"),
     ),
     Probe(
@@ -181,6 +181,13 @@ PROBES = (
         "compile/ir/discretize.py",
         "return int(lo) + 1 if excluded else int(lo)",
         "return int(lo) + 1",
+        (*RECORDED, "stream in C", *PLANNED, "plan by milp", "bounds"),
+    ),
+    Probe(
+        "last sample of a window",
+        "compile/ir/discretize.py",
+        "return ir.Window(first, last)",
+        "return ir.Window(first, first)",
         (*RECORDED, "stream in C", *PLANNED, "plan by milp", "bounds"),
     ),
     Probe(

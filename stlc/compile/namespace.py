@@ -198,18 +198,11 @@ class Ops(Protocol):
     def join(self, items: Sequence[Array], pick: Pick) -> Array:
         """Exact elementwise minimum or maximum of one or more arrays."""
 
-    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema over the sliding windows `window`: `(time, batch)` -> `(count, batch)`.
+    def windows(self, operands: Sequence[Array], pick: Pick, window: Sliding) -> Array | None:
+        """Exact extrema of one array over sliding windows, or `until` of two; see `Windows.over`.
 
-        `pick` is "max" or "min". The result is None if a combination of other operations is faster. The
-        caller then uses that combination.
-        """
-
-    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` (`pick` "max") or `release` ("min") over windows, (time, batch) -> (count, batch).
-
-        The result is None if a combination of other operations is faster. The caller then uses that
-        combination.
+        Arrays are (time, batch), the result is (count, batch), or None if a combination of other operations
+        is faster. The caller then uses that combination.
         """
 
     # constants and shapes

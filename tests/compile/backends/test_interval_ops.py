@@ -162,7 +162,7 @@ def selections(parts: list[Intervals]) -> list[Intervals]:
     padded = INTERVALS.cat([parts[1], INTERVALS.full((1, 4), math.inf, parts[1])])
     return [
         *(INTERVALS.join(parts, "min"), INTERVALS.join(parts, "max"), INTERVALS.cat(parts), padded),
-        *(INTERVALS.extrema(parts[0], "min", window), INTERVALS.until(parts[3], parts[4], "max", window)),
+        *(INTERVALS.windows(parts[:1], "min", window), INTERVALS.windows(parts[3:5], "max", window)),
         *(INTERVALS.minimum(*parts[:2]), INTERVALS.maximum(*parts[3:5]), -parts[2], parts[0][::-1]),
         *(INTERVALS.rows(np.arange(100) < 50, parts[1], math.inf), add(padded, 1.0), mul(padded, padded)),
     ]

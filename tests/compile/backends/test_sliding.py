@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stlc.compile.backends.array import kernel
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.windows import Windows
-from stlc.compile.backends.torch.extrema import small_extrema, small_until
+from stlc.compile.backends.torch.extrema import small_windows
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.namespace import Pick, Sliding
 from stlc.compile.semantics.semantics import Exact
@@ -60,11 +60,11 @@ def until_by_loops(left: torch.Tensor, right: torch.Tensor, pick: Pick, window: 
 
 
 def sliding_extrema(x: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
-    return Windows(Exact(), TORCH).extrema(x, pick, count=window.count, width=window.width)
+    return Windows(Exact(), TORCH).over([x], pick, count=window.count, width=window.width)
 
 
 def sliding_until(left: torch.Tensor, right: torch.Tensor, pick: Pick, window: Sliding) -> torch.Tensor:
-    return Windows(Exact(), TORCH).until(left, right, pick, count=window.count, width=window.width)
+    return Windows(Exact(), TORCH).over([left, right], pick, count=window.count, width=window.width)
 
 
 def gradients(value: torch.Tensor, operands: list[torch.Tensor], seed: int) -> list[torch.Tensor]:
@@ -87,13 +87,13 @@ def test_values_and_gradients_are_those_of_loops(pick: Pick, window: Sliding, se
     value, wanted = sliding_extrema(x, pick, window), extrema_by_loops(x, pick, window)
     assert torch.equal(value, wanted)
     numpy, sizes = Windows(Exact(), NUMPY), {"count": window.count, "width": window.width}
-    np.testing.assert_array_equal(numpy.extrema(x.detach().numpy(), pick, **sizes), wanted.detach())
+    np.testing.assert_array_equal(numpy.over([x.detach().numpy()], pick, **sizes), wanted.detach())
     mine, theirs = gradients(value, [x], seed), gradients(wanted, [x], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
 
     value, wanted = sliding_until(x, y, pick, window), until_by_loops(x, y, pick, window)
     assert torch.equal(value, wanted)
-    met = numpy.until(x.detach().numpy(), y.detach().numpy(), pick, **sizes)
+    met = numpy.over([x.detach().numpy(), y.detach().numpy()], pick, **sizes)
     np.testing.assert_array_equal(met, wanted.detach())
     mine, theirs = gradients(value, [x, y], seed), gradients(wanted, [x, y], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
@@ -105,8 +105,8 @@ def test_values_and_gradients_are_those_of_loops(pick: Pick, window: Sliding, se
 def test_windows_side_by_side_are_those_of_loops(pick: Pick, window: Sliding, seed: int) -> None:
     x, y = random(window, seed).requires_grad_(), random(window, seed + 1).requires_grad_()
     wanted = extrema_by_loops(x, pick, window)
-    assert torch.equal(small_extrema(x, pick, window), wanted)
-    value, wanted = small_until(x, y, pick, window), until_by_loops(x, y, pick, window)
+    assert torch.equal(small_windows([x], pick, window), wanted)
+    value, wanted = small_windows([x, y], pick, window), until_by_loops(x, y, pick, window)
     assert torch.equal(value, wanted)
     mine, theirs = gradients(value, [x, y], seed), gradients(wanted, [x, y], seed)
     torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
@@ -122,17 +122,17 @@ def test_every_size_goes_the_same_way(pick: Pick, width: int, batch: int) -> Non
     torch_windows, numpy_windows = Windows(Exact(), TORCH), Windows(Exact(), NUMPY)
     p, q = x.detach().numpy(), y.detach().numpy()
     wanted = extrema_by_loops(x, pick, window)
-    value = torch_windows.extrema(x, pick, count=70, width=width)
+    value = torch_windows.over([x], pick, count=70, width=width)
     assert torch.equal(value, wanted)
     np.testing.assert_array_equal(
-        numpy_windows.extrema(p, pick, count=70, width=width), wanted.detach().numpy()
+        numpy_windows.over([p], pick, count=70, width=width), wanted.detach().numpy()
     )
     torch.testing.assert_close(gradients(value, [x], 5), gradients(wanted, [x], 5), atol=1e-10, rtol=1e-10)
     wanted = until_by_loops(x, y, pick, window)
-    value = torch_windows.until(x, y, pick, count=70, width=width)
+    value = torch_windows.over([x, y], pick, count=70, width=width)
     assert torch.equal(value, wanted)
     np.testing.assert_array_equal(
-        numpy_windows.until(p, q, pick, count=70, width=width), wanted.detach().numpy()
+        numpy_windows.over([p, q], pick, count=70, width=width), wanted.detach().numpy()
     )
     mine, theirs = gradients(value, [x, y], 5), gradients(wanted, [x, y], 5)
     torch.testing.assert_close(mine, theirs, atol=1e-10, rtol=1e-10)

@@ -157,8 +157,8 @@ def test_without_a_compiler_torch_does_the_same(batch: int, monkeypatch: pytest.
     windows = Windows(Exact(), TORCH)
 
     def judged() -> list[Tensor]:
-        met = windows.until(x, y, "max", count=300, width=20)
-        values = [met, windows.extrema(x, "min", count=300, width=33)]
+        met = windows.over([x, y], "max", count=300, width=20)
+        values = [met, windows.over([x], "min", count=300, width=33)]
         return [*values, *torch.autograd.grad(sum(each.sum() for each in values), [x, y])]
 
     with_kernel = judged()

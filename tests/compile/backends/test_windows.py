@@ -41,8 +41,8 @@ def test_windows_are_the_definition(
     x = np.repeat(np.array(values, dtype=float)[:, None], batch, axis=1)
     y = np.repeat(rng.integers(-9, 9, (len(values), 1)).astype(float), batch, axis=1)
     windows = Windows(semantics, NUMPY)
-    extrema = windows.extrema(x, pick, count=count, width=width)
-    until = windows.until(y, x, pick, count=count, width=width)
+    extrema = windows.over([x], pick, count=count, width=width)
+    until = windows.over([y, x], pick, count=count, width=width)
     assert extrema.shape == until.shape == (count, batch)
     other: Pick = "max" if pick == "min" else "min"
     nothing = math.inf if pick == "min" else -math.inf
@@ -71,12 +71,12 @@ def test_long_traces_are_judged_in_stretches(
     x, y = np.random.default_rng(rows).normal(size=(2, rows, batch))
     windows = Windows(Exact(), NUMPY)
     whole = (
-        windows.extrema(x, pick, count=count, width=width),
-        windows.until(y, x, pick, count=count, width=width),
+        windows.over([x], pick, count=count, width=width),
+        windows.over([y, x], pick, count=count, width=width),
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "_TILE", 8)
         patch.setattr(module, "_OVERLAP", 1)
         assert len(windows._tiles(x, 100, 1)) > 10
-        np.testing.assert_array_equal(windows.extrema(x, pick, count=count, width=width), whole[0])
-        np.testing.assert_array_equal(windows.until(y, x, pick, count=count, width=width), whole[1])
+        np.testing.assert_array_equal(windows.over([x], pick, count=count, width=width), whole[0])
+        np.testing.assert_array_equal(windows.over([y, x], pick, count=count, width=width), whole[1])

@@ -294,14 +294,10 @@ class IntervalOps(FloatConstants):
     def join(self, items: Sequence[Intervals], pick: Pick) -> Intervals:
         return extremum(partial(NUMPY.join, pick=pick), items)
 
-    def extrema(self, x: Intervals, pick: Pick, window: Sliding) -> Intervals:
-        """Exact extrema over sliding windows."""
-        return x.selected(lambda end: _WINDOWS.extrema(end, pick, count=window.count, width=window.width))
-
-    def until(self, left: Intervals, right: Intervals, pick: Pick, window: Sliding) -> Intervals:
-        """Exact `until` or `release` over sliding windows."""
-        until = partial(_WINDOWS.until, pick=pick, count=window.count, width=window.width)
-        return selected_from(lambda both: until(*both), (left, right))
+    def windows(self, operands: Sequence[Intervals], pick: Pick, window: Sliding) -> Intervals:
+        """Exact extrema over sliding windows, or `until`."""
+        over = partial(_WINDOWS.over, pick=pick, count=window.count, width=window.width)
+        return selected_from(over, operands)
 
     # ------------------------------------------------------------------- constants and shapes
 

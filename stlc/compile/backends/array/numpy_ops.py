@@ -118,21 +118,27 @@ class NumpyOps(FloatConstants, ScanByRows):
             out = choose(out, item, out=out) if here else choose(out, item)
         return out
 
-    def extrema(self, x: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact extrema over sliding windows by the C kernel.
+    def windows(self, operands: Sequence[Array], pick: Pick, window: Sliding) -> Array | None:
+        """Exact extrema over sliding windows, or `until`, by the C kernel.
 
         The result is None if array operations of NumPy are faster, or if no kernel is available.
         """
-        wide = x.ndim == 2 and x.shape[1] >= _WIDE and not window.to_end
-        return _by_kernel((x,), pick, window) if wide else None
-
-    def until(self, left: Array, right: Array, pick: Pick, window: Sliding) -> Array | None:
-        """Exact `until` or `release` by the C kernel.
-
-        The result is None if array operations of NumPy are faster, or if no kernel is available.
-        """
-        wide = left.ndim == 2 and (left.shape[1] >= _WIDE or window.width >= _LONG)
-        return _by_kernel((left, right), pick, window) if wide else None
+        first = operands[0]
+        wide = first.ndim == 2 and first.shape[1] >= _WIDE
+        if len(operands) == 2:
+            wide = wide or (first.ndim == 2 and window.width >= _LONG)
+        elif window.to_end:
+            return None
+        alike = all(each.dtype == first.dtype for each in operands)
+        if not wide or first.size < _LARGE_KERNEL or not alike:
+            return None
+        kernel = window_kernel(first.dtype.name, first.shape[1], len(operands), pick, window)
+        if kernel is None:
+            return None
+        out = np.empty((window.count, first.shape[1]), first.dtype)
+        arrays = (*operands, out)
+        kernel.run([Strided(x.ctypes.data, *(stride // x.itemsize for stride in x.strides)) for x in arrays])
+        return out
 
     def softmax(self, x: Array, k: float) -> Array:
         """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) over axis 0, which is kept with length 1."""
@@ -175,19 +181,6 @@ class NumpyOps(FloatConstants, ScanByRows):
     def quiet(self) -> AbstractContextManager[object]:
         context: Any = np.errstate(all="ignore")
         return context  # type: ignore[no-any-return]
-
-
-def _by_kernel(operands: Sequence[Array], pick: Pick, window: Sliding) -> Array | None:
-    first = operands[0]
-    if first.size < _LARGE_KERNEL or any(each.dtype != first.dtype for each in operands):
-        return None
-    kernel = window_kernel(first.dtype.name, first.shape[1], len(operands), pick, window)
-    if kernel is None:
-        return None
-    out = np.empty((window.count, first.shape[1]), first.dtype)
-    arrays = (*operands, out)
-    kernel.run([Strided(x.ctypes.data, *(stride // x.itemsize for stride in x.strides)) for x in arrays])
-    return out
 
 
 for _function in FUNCTIONS.values():

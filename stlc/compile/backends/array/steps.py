@@ -300,11 +300,9 @@ class Machine:
         `window` holds the bounds of a window in steps, counted from the instant of the window. `pick` is
         "max" or "min".
         """
-        extrema, until, lo = self.windows.extrema, self.windows.until, window.lo
+        over, lo = self.windows.over, window.lo
         most = _ENDLESS if window.hi is None else window.hi - lo + 1
-        if operands == 1:
-            return lambda parts, _: extrema(parts[0], pick, count=rows, width=most)
-        return lambda parts, _: until(parts[0], parts[1], pick, count=rows, width=most, lo=lo)
+        return lambda parts, _: over(parts, pick, count=rows, width=most, lo=lo if operands == 2 else 0)
 
     def _shift(self, node: ir.Shift, run: IndexRange, operands: int) -> Kernel:
         if node.outside is not None:

@@ -1,4 +1,4 @@
-"""Extrema over time windows.
+"""Extrema over time windows, and `until` in them.
 
 The method depends on the windows: a reduction over time, the C kernel, running extrema, or merging blocks of
 1, 2, 4, … rows. All arrays are `(time, batch)`. Window `j` of `count` starts at row `j` and has `width` rows;
@@ -9,6 +9,7 @@ minimum, -inf for a maximum).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -46,27 +47,55 @@ class Windows:
         missing = self.ops.full((rows - x.shape[0], *x.shape[1:]), value, x)
         return self.ops.cat([x, missing]) if x.shape[0] else missing
 
-    def extrema(self, x: Array, pick: Pick, *, count: int, width: int) -> Array:
-        """Extrema over `count` sliding windows of `width` rows: `(time, batch)` -> `(count, batch)`.
+    def over(self, operands: Sequence[Array], pick: Pick, *, count: int, width: int, lo: int = 0) -> Array:
+        """Extrema of one operand over windows, or `until` of two in them.
 
-        `pick` is "max" or "min".
+        Of one operand, row `j` of the result is the extremum over window `j`. Of two, it is the robustness of
+        `until` (for `pick` "max"): the maximum of `min(right[t], left[j], …, left[lo + t])` over all rows `t`
+        of window `j`. For its dual `release` ("min"), minimum and maximum are exchanged.
+
+        Args:
+            operands: arrays (time, batch). Of two, the left one must hold up to and including `t`, the right
+                one at `t`; row 0 of the right one belongs to row `lo` of the left one.
+            pick: "max" or "min".
+            count: number of windows.
+            width: number of rows of a window.
+            lo: number of rows of the left operand before the window.
+
+        Returns:
+            One row per window, (count, batch).
         """
-        rows = x.shape[0]
+        *lefts, x = operands
+        rows, other = x.shape[0], dual(pick)
         width = min(width, max(rows, 1))
+        if lefts and not self.semantics.exact:
+            return self._until_by_definition(lefts[0], x, pick, (count, width, lo))
+        if lefts and lo:
+            reached = self.over((lefts[0][lo:], x), pick, count=count, width=width)
+            held = self.over(lefts, other, count=count, width=lo)
+            return self.semantics.pair(held, reached, other, self.ops)
+        if lefts and width >= rows and (tiles := self._tiles(x, min(count, rows), 1)):
+            return self.padded(self._until_by_tiles(operands, pick, tiles), count, neutral(pick))
         if tiles := self._tiles(x, count, width):
             out = self.ops.empty((count, *x.shape[1:]), x)
             for asked, seen in tiles:
-                out[asked] = self.extrema(x[seen], pick, count=asked.stop - asked.start, width=width)
+                many = asked.stop - asked.start
+                out[asked] = self.over([each[seen] for each in operands], pick, count=many, width=width)
             return out
         if count == 1 and rows:
-            return self.semantics.reduce(self.padded(x, width, neutral(pick)), pick, self.ops)
+            x = self.padded(x, width, neutral(pick))
+            if lefts:
+                left = self.padded(lefts[0], width, neutral(other))
+                held = (self.ops.cummin if pick == "max" else self.ops.cummax)(left)
+                x = self.semantics.pair(held, x, other, self.ops)
+            return self.semantics.reduce(x, pick, self.ops)
         if self.semantics.exact and rows:
-            found = self.ops.extrema(x, pick, Sliding(rows, min(count, rows), width))
+            found = self.ops.windows(operands, pick, Sliding(rows, min(count, rows), width))
             if found is not None:
                 return self.padded(found, count, neutral(pick))
-        if width >= rows > 1 and self.semantics.idempotent:
-            return self.padded(self._to_end(x, pick), count, neutral(pick))
-        return self._doubling(self.padded(x, count + width - 1, neutral(pick)), pick, width)
+        if width >= rows > 0 and (to_end := self._to_end(operands, pick, min(rows, count))) is not None:
+            return self.padded(to_end, count, neutral(pick))
+        return self._doubling(operands, pick, count, width)
 
     def _tiles(self, x: Array, count: int, width: int) -> list[tuple[slice, slice]]:
         """Divide the computation on a long trace into tiles, which are computed one after the other.
@@ -82,94 +111,82 @@ class Windows:
         asked = [slice(first, min(first + size, count)) for first in range(0, count, size)]
         return [(some, slice(some.start, some.stop + width - 1)) for some in asked]
 
-    def _to_end(self, x: Array, pick: Pick) -> Array:
-        """Extrema over windows that all extend to the last row: running extrema, backward in time."""
-        running = self.ops.cummin if pick == "min" else self.ops.cummax
-        return self.ops.flip(running(self.ops.flip(x)))
+    def _to_end(self, operands: Sequence[Array], pick: Pick, count: int) -> Array | None:
+        """The first `count` values over windows that all extend to the last row; None if doubling is faster.
 
-    def _doubling(self, x: Array, pick: Pick, width: int) -> Array:
-        """Extrema over windows of `width` rows, in about log2(width) merges of blocks of 1, 2, 4, … rows.
-
-        Every window must lie within the array.
+        An extremum runs backward in time. `until` is `u(t) = min(left(t), max(right(t), u(t + 1)))`.
         """
-        if width == 1:
-            return x
-        piece, size, done = self.semantics.lift(x, pick, self.ops), 1, 0
-        total: Parts | None = None
-        overlapping = self.semantics.idempotent
-        while True:
+        *lefts, x = operands
+        rows, pair, ops = x.shape[0], self.semantics.pair, self.ops
+        if not lefts:
+            if rows == 1 or not self.semantics.idempotent:
+                return None
+            running = ops.cummin if pick == "min" else ops.cummax
+            return ops.flip(running(ops.flip(x)))[:count]
+        if rows > _SCAN_BATCH and x[0].shape[0] < _SCAN_BATCH:
+            return None
+        left, other = lefts[0], dual(pick)
+        row = pair(left[-1:], x[-1:], other, ops)
+        out = [row]
+        for t in range(rows - 2, -1, -1):
+            row = pair(left[t : t + 1], pair(x[t : t + 1], row, pick, ops), other, ops)
+            out.append(row)
+        found = out[: -count - 1 : -1]
+        return found[0] if count == 1 else ops.cat(found)
+
+    def _doubling(self, operands: Sequence[Array], pick: Pick, count: int, width: int) -> Array:
+        """Values over windows, in about log2(width) rounds that join adjacent blocks of 1, 2, 4, … rows.
+
+        A block has partial results (`Parts`): those of the semantics for an extremum; for `until` the least
+        `left` in the block, and `until` within the block (for `release`, the greatest and `release`).
+        """
+        semantics, ops, other = self.semantics, self.ops, dual(pick)
+        sides = (other, pick)[-len(operands) :]
+        padded = [
+            self.padded(x, count + width - 1, neutral(side)) for x, side in zip(operands, sides, strict=True)
+        ]
+        if len(operands) == 1:
+            if width == 1:
+                return padded[0]
+            whole = self._joined(
+                semantics.lift(padded[0], pick, ops),
+                lambda a, b: semantics.merge(a, b, pick, ops),
+                width,
+                overlapping=semantics.idempotent,
+            )
+            return semantics.finish(whole, pick, ops)
+
+        def composed(a: Parts, b: Parts) -> Parts:
+            later = semantics.pair(a[0], b[1], other, ops)
+            return semantics.pair(a[0], b[0], other, ops), semantics.pair(a[1], later, pick, ops)
+
+        held, right = padded
+        blocks = held, semantics.pair(held, right, other, ops)
+        return self._joined(blocks, composed, width, overlapping=False)[1]
+
+    def _joined(
+        self, piece: Parts, join: Callable[[Parts, Parts], Parts], width: int, *, overlapping: bool
+    ) -> Parts:
+        """Partial results of windows of `width` rows, from those of single rows, one per row.
+
+        Every window must lie within the array. `join` joins each block with the adjacent later one; if
+        `overlapping`, also with one that begins within it.
+        """
+
+        def shifted(a: Parts, b: Parts, shift: int) -> Parts:
+            rows = min(a[0].shape[0], b[0].shape[0] - shift)
+            return join(tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b))
+
+        size, done, total = 1, 0, piece
+        while done < width:
             if overlapping and 2 * size > width:
-                total = self._merged(piece, piece, width - size, pick) if width > size else piece
-                break
+                return shifted(piece, piece, width - size) if width > size else piece
             if width & size and not overlapping:
-                total = piece if total is None else self._merged(total, piece, done, pick)
+                total = shifted(total, piece, done) if done else piece
                 done += size
-                if done == width:
-                    break
-            piece = self._merged(piece, piece, size, pick)
-            size *= 2
-        return self.semantics.finish(total, pick, self.ops)
-
-    def _merged(self, a: Parts, b: Parts, shift: int, pick: Pick) -> Parts:
-        """Join each block of rows in `a` with the block in `b` that starts `shift` rows later.
-
-        `a` and `b` contain partial results (`Parts`), from which the semantics computes an extremum. Row j is
-        the partial result of the block that starts at row j. The joined blocks are returned in the same form.
-        """
-        rows = min(a[0].shape[0], b[0].shape[0] - shift)
-        return self.semantics.merge(
-            tuple(part[:rows] for part in a), tuple(part[shift : shift + rows] for part in b), pick, self.ops
-        )
-
-    def until(self, left: Array, right: Array, pick: Pick, *, count: int, width: int, lo: int = 0) -> Array:
-        """Robustness of `until` (for `pick` "max") or of its dual `release` (for "min") over windows.
-
-        For `until`, row `j` of the result is the maximum of `min(right[t], left[j], …, left[lo + t])` over
-        all rows `t` of window `j`. For `release`, minimum and maximum are exchanged.
-
-        Args:
-            left: operand that must hold up to and including `t`; `(time, batch)`.
-            right: operand that must hold at `t`; its row 0 belongs to row `lo` of `left`.
-            pick: "max" or "min".
-            count: number of windows.
-            width: number of rows of a window.
-            lo: number of rows of `left` before the window.
-
-        Returns:
-            One row per window, `(count, batch)`.
-        """
-        rows = right.shape[0]
-        width = min(width, max(rows, 1))
-        if not self.semantics.exact:
-            return self._until_by_definition(left, right, pick, (count, width, lo))
-        if lo:
-            reached = self.until(left[lo:], right, pick, count=count, width=width)
-            held = self.extrema(left, dual(pick), count=count, width=lo)
-            return self.semantics.pair(held, reached, dual(pick), self.ops)
-        if width >= rows and (tiles := self._tiles(left, min(count, rows), 1)):
-            return self.padded(self._until_by_tiles(left, right, pick, tiles), count, neutral(pick))
-        if tiles := self._tiles(left, count, width):
-            out = self.ops.empty((count, *left.shape[1:]), left)
-            for asked, seen in tiles:
-                many = asked.stop - asked.start
-                out[asked] = self.until(left[seen], right[seen], pick, count=many, width=width)
-            return out
-        if count == 1 and rows:
-            return self._until_once(left[:width], right[:width], pick)
-        if rows:
-            found = self.ops.until(left, right, pick, Sliding(rows, min(count, rows), width))
-            if found is not None:
-                return self.padded(found, count, neutral(pick))
-        if width >= rows > 0 and (rows <= _SCAN_BATCH or left[0].shape[0] >= _SCAN_BATCH):
-            return self.padded(self._until_to_end(left, right, pick, min(rows, count)), count, neutral(pick))
-        left = self.padded(left, count + width - 1, neutral(dual(pick)))
-        right = self.padded(right, count + width - 1, neutral(pick))
-        return self._until_doubling(left, self.semantics.pair(left, right, dual(pick), self.ops), pick, width)
-
-    def _until_once(self, left: Array, right: Array, pick: Pick) -> Array:
-        pair, other = self.semantics.pair, dual(pick)
-        held = (self.ops.cummin if pick == "max" else self.ops.cummax)(left)
-        return self.semantics.reduce(pair(held, right, other, self.ops), pick, self.ops)
+            if done < width:
+                piece, size = shifted(piece, piece, size), 2 * size
+        return total
 
     def _until_by_definition(
         self, left: Array, right: Array, pick: Pick, sizes: tuple[int, int, int]
@@ -178,7 +195,7 @@ class Windows:
 
         Faster methods assume that min distributes over max, which is true of exact extrema only. A loop runs
         over the samples of the window. Each of its `lo + width` iterations works on all `count` windows at
-        once. `sizes` is (count, width, lo), as in `until`.
+        once. `sizes` is (count, width, lo), as in `over`.
         """
         semantics, ops, other = self.semantics, self.ops, dual(pick)
         count, width, lo = sizes
@@ -211,66 +228,20 @@ class Windows:
             x, size = self.ops.cat([x[:size], later]), 2 * size
         return x
 
-    def _until_to_end(self, left: Array, right: Array, pick: Pick, count: int) -> Array:
-        """Unbounded `until`, by the recursion `u(t) = min(left(t), max(right(t), u(t + 1)))`."""
-        pair, other = self.semantics.pair, dual(pick)
-        row = pair(left[-1:], right[-1:], other, self.ops)
-        out = [row]
-        for t in range(left.shape[0] - 2, -1, -1):
-            reached = pair(right[t : t + 1], row, pick, self.ops)
-            row = pair(left[t : t + 1], reached, other, self.ops)
-            out.append(row)
-        rows = out[: -count - 1 : -1]
-        return rows[0] if count == 1 else self.ops.cat(rows)
-
     def _until_by_tiles(
-        self, left: Array, right: Array, pick: Pick, tiles: list[tuple[slice, slice]]
+        self, operands: Sequence[Array], pick: Pick, tiles: list[tuple[slice, slice]]
     ) -> Array:
         """Unbounded `until` on a long recorded trace, tile by tile backward in time.
 
         `tiles` contains consecutive ranges of rows, in the form of `_tiles`.
         """
-        out = self.ops.empty((tiles[-1][0].stop, *left.shape[1:]), left)
-        later = self.until(left[len(out) :], right[len(out) :], pick, count=1, width=len(left))
+        pair, ops, length = self.semantics.pair, self.ops, len(operands[0])
+        out = ops.empty((tiles[-1][0].stop, *operands[0].shape[1:]), operands[0])
+        later = self.over([each[len(out) :] for each in operands], pick, count=1, width=length)
         for rows, _ in reversed(tiles):
-            size = rows.stop - rows.start
-            held = self._to_end(left[rows], dual(pick))
-            met = self.until(left[rows], right[rows], pick, count=size, width=size)
-            out[rows] = self.semantics.pair(
-                met, self.semantics.pair(held, later, dual(pick), self.ops), pick, self.ops
-            )
+            size, (left, right) = rows.stop - rows.start, [each[rows] for each in operands]
+            held = self.over((left,), dual(pick), count=size, width=size)
+            met = self.over((left, right), pick, count=size, width=size)
+            out[rows] = pair(met, pair(held, later, dual(pick), ops), pick, ops)
             later = out[rows.start : rows.start + 1]
         return out
-
-    def _until_doubling(self, held: Array, met: Array, pick: Pick, width: int) -> Array:
-        """`until` over windows of `width` rows, by about log2(width) rounds that join adjacent blocks.
-
-        Every window must lie within the array. A block has two values: the least `left` in the block
-        (`held`), and `until` within the block (`met`). The arguments contain blocks of one row each.
-        """
-        # Row j of `held` and `met` belongs to the block of `size` rows that starts at row j. Row j of `total`
-        # belongs to the first `done` rows of window j.
-        size, done = 1, 0
-        total: tuple[Array, Array] | None = None
-        while True:
-            if width & size:
-                part = (held[done:], met[done:])
-                total = part if total is None else self._composed(total, part, pick)
-                done += size
-                if done == width:
-                    return total[1]
-            held, met = self._composed((held, met), (held[size:], met[size:]), pick)
-            size *= 2
-
-    def _composed(self, a: tuple[Array, Array], b: tuple[Array, Array], pick: Pick) -> tuple[Array, Array]:
-        """Join each block of rows in `a` with the adjacent later block in `b`.
-
-        A block has two values: the least `left` over its rows, and `until` within the block. For `pick`
-        "min", the values are the greatest `left`, and `release` within the block. The joined blocks are
-        returned in the same form.
-        """
-        rows = min(a[0].shape[0], b[0].shape[0])
-        pair, other = self.semantics.pair, dual(pick)
-        later = pair(a[0][:rows], b[1][:rows], other, self.ops)
-        met = pair(a[1][:rows], later, pick, self.ops)
-        return pair(a[0][:rows], b[0][:rows], other, self.ops), met

@@ -28,7 +28,7 @@ from stlc.compile.backends.milp.model import (
     constant,
     junction,
 )
-from stlc.compile.backends.schedule import End
+from stlc.compile.backends.schedule import PICKS, End, TraceDomain, earliest, latest, operands, spanning
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.text import show_number
@@ -281,17 +281,8 @@ class Encoding:
                 return junction(op, (self._tree(item, k, margin) for item in items))
             case ir.AtStart(body):
                 return self._tree(body, 0, margin)
-            case ir.Temporal(op, window, body):
-                samples = self._samples(window, k)
-                return junction(
-                    "and" if op == "always" else "or", [self._tree(body, j, margin) for j in samples]
-                )
-            case ir.PastTemporal(op, window, body):
-                last, first = k - window.lo, 0 if window.hi is None else max(0, k - window.hi)
-                past = [self._tree(body, j, margin) for j in range(first, last + 1)]
-                return junction("and" if op == "historically" else "or", past)
-            case ir.Until(op, window, left, right):
-                return self._until(op == "until", k, self._samples(window, k), left, right, margin)
+            case ir.Temporal() | ir.PastTemporal() | ir.Until() | ir.Since():
+                return self._windowed(node, k, margin)
             case ir.Shift(steps, body, outside):
                 inside = 0 <= k + steps < len(self.rows)
                 if not inside and outside is None:
@@ -299,32 +290,25 @@ class Encoding:
                 return self._tree(body, k + steps, margin) if inside else bool(outside)
         raise UnencodableError(f"`{type(node).__name__.lower()}`")
 
-    def _until(
-        self, strong: bool, k: int, samples: range, left: ir.Formula, right: ir.Formula, margin: Demand
+    def _windowed(
+        self, node: ir.Temporal | ir.PastTemporal | ir.Until | ir.Since, k: int, margin: Demand
     ) -> Tree:
-        """Condition under which `until` holds at sample `k`; if `strong` is False, `release` instead.
+        """Condition under which a temporal operator holds at sample `k`.
 
-        Args:
-            strong: True for `until`; False for its dual `release`, in which conjunctions and disjunctions are
-                exchanged.
-            k: sample at which the formula is evaluated.
-            samples: samples of the window, at one of which `right` must hold.
-            left: left operand.
-            right: right operand.
-            margin: requirement that contains the formula; it gives the least robustness of each predicate.
+        The left operand of `until` (and of its dual and counterparts of the past) is read at all samples
+        between `k` and the one of the window, both included.
         """
-        inner, outer = ("and", "or") if strong else ("or", "and")
-        found = []
-        for j in samples:
-            kept = [self._tree(left, i, margin) for i in range(k, j + 1)]
-            found.append(junction(inner, [*kept, self._tree(right, j, margin)]))  # type: ignore[arg-type]
-        return junction(outer, found)  # type: ignore[arg-type]
-
-    def _samples(self, window: ir.Window, k: int) -> range:
-        last = len(self.rows) - 1 if window.hi is None else k + window.hi
-        if last >= len(self.rows) and self._end == "strict":
+        end, samples = node.window_offsets.last, len(self.rows)
+        if end is not None and k + end >= samples and self._end == "strict":
             raise UnencodableError("a window beyond the horizon")
-        return range(k + window.lo, min(last + 1, len(self.rows)))
+        *lefts, (right, window) = operands(node, spanning(k, 1), TraceDomain(samples, self._end))
+        least = PICKS[node.op] == "min"
+        found = []
+        for j in range(earliest(window.start), latest(window.last) + 1):
+            held = range(min(j, k), max(j, k) + 1)
+            kept = [self._tree(left, i, margin) for left, _ in lefts for i in held]
+            found.append(junction("or" if least else "and", [*kept, self._tree(right, j, margin)]))
+        return junction("and" if least else "or", found)
 
     def _predicate(self, node: ir.Predicate, k: int, margin: Affine) -> Tree:
         value = self._number(node.num, k).times(float(node.sign))

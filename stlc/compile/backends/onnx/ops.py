@@ -199,11 +199,8 @@ class OnnxOps(FloatConstants, ScanByRows):
         outputs = graph.emit("Scan", (*carry, *timed), shapes, carry[0].kind, facts)
         return [[each.reshaped(count, *each.shape[2:])] for each in outputs[len(later) :]]
 
-    def extrema(self, x: Value, pick: Pick, window: Sliding) -> None:
+    def windows(self, operands: Sequence[Value], pick: Pick, window: Sliding) -> None:
         """Return None: there is no special method for windows."""
-
-    def until(self, left: Value, right: Value, pick: Pick, window: Sliding) -> None:
-        """Return None: there is no special method for `until`."""
 
     # ------------------------------------------------------ constants and shapes
 

@@ -189,30 +189,26 @@ def _like(x: Tensor, rows: int) -> Tensor:
 # ------------------------------------------------------------------ windows over few numbers
 
 
-def is_small(x: Tensor, window: Sliding) -> bool:
-    """True if `x` is small enough to copy all windows into one array.
+def small_windows(operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor | None:
+    """Exact extrema over sliding windows, or `until`: (time, batch) -> (count, batch).
 
-    This array takes `window.width` times the memory of `x`.
+    The result is None unless the arrays are small enough to copy all windows into one array, which takes
+    `window.width` times their memory.
     """
-    return x.numel() * window.width <= _SMALL
-
-
-def small_extrema(x: Tensor, pick: Pick, window: Sliding) -> Tensor:
-    """Exact extrema over sliding windows: `(time, batch)` -> `(count, batch)`."""
-    if window.to_end:
-        turned = x.flip(0)
-        running = torch.cummin(turned, 0) if pick == "min" else torch.cummax(turned, 0)
-        return _first(running.values.flip(0), window.count)
-    windows = _gathered(x, neutral(pick), window)
-    return windows.amin(dim=-1) if pick == "min" else windows.amax(dim=-1)
-
-
-def small_until(left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor:
-    """Exact `until` (`pick` "max") or `release` ("min") over windows: (time, batch) -> (count, batch)."""
-    held, then = _gathered(left, neutral(dual(pick)), window), _gathered(right, neutral(pick), window)
-    if pick == "max":
-        return torch.minimum(torch.cummin(held, -1).values, then).amax(dim=-1)
-    return torch.maximum(torch.cummax(held, -1).values, then).amin(dim=-1)
+    *lefts, x = operands
+    if x.numel() * window.width > _SMALL:
+        return None
+    running = torch.cummin if pick == "min" else torch.cummax
+    if window.to_end and not lefts:
+        return _first(running(x.flip(0), 0).values.flip(0), window.count)
+    found = _gathered(x, neutral(pick), window)
+    if lefts:
+        held = _gathered(lefts[0], neutral(dual(pick)), window)
+        if pick == "max":
+            found = torch.minimum(torch.cummin(held, -1).values, found)
+        else:
+            found = torch.maximum(torch.cummax(held, -1).values, found)
+    return found.amin(dim=-1) if pick == "min" else found.amax(dim=-1)
 
 
 def _gathered(x: Tensor, fill: float, window: Sliding) -> Tensor:

@@ -17,10 +17,8 @@ from torch import Tensor
 from stlc.compile.backends.torch.extrema import (
     by_kernel,
     choice,
-    is_small,
     reduction,
-    small_extrema,
-    small_until,
+    small_windows,
 )
 from stlc.compile.backends.torch.guarded import lerp, sifted
 from stlc.compile.ir.functions import FUNCTIONS
@@ -262,27 +260,17 @@ class TorchOps(ScanByRows):
             return reduce(torch.minimum if pick == "min" else torch.maximum, items)
         return choice(items, pick)
 
-    def extrema(self, x: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact extrema over sliding windows; None if the caller must use other torch operations.
-
-        If several rows are equal, one of them may get the whole gradient.
-        """
-        if x.ndim != 2 or torch.compiler.is_exporting():
-            return None
-        if is_small(x, window):
-            return small_extrema(x, pick, window)
-        return by_kernel((x,), pick, window)
-
-    def until(self, left: Tensor, right: Tensor, pick: Pick, window: Sliding) -> Tensor | None:
-        """Exact `until` or `release` over windows; None if the caller must use other torch operations.
+    def windows(self, operands: Sequence[Tensor], pick: Pick, window: Sliding) -> Tensor | None:
+        """Exact extrema over sliding windows, or `until`; None if the caller must use other operations.
 
         If several values are equal, one of them may get the whole gradient.
         """
-        if left.ndim != 2 or left.is_cuda or torch.compiler.is_exporting():
+        first = operands[0]
+        on_gpu = len(operands) == 2 and first.is_cuda
+        if first.ndim != 2 or on_gpu or torch.compiler.is_exporting():
             return None
-        if is_small(left, window):
-            return small_until(left, right, pick, window)
-        return by_kernel((left, right), pick, window)
+        found = small_windows(operands, pick, window)
+        return by_kernel(operands, pick, window) if found is None else found
 
     def softmax(self, x: Tensor, k: float) -> Tensor:
         """Smooth maximum (`k` > 0) or smooth minimum (`k` < 0) over axis 0, which is kept with length 1."""

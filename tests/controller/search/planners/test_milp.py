@@ -66,6 +66,7 @@ def _grown(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
         | st.builds("not {}".format, inner)
         | st.builds("always[0 s, 3 s] (eventually[0 s, 2 s] {})".format, short)
         | st.builds("eventually[0 s, 5 s] (once[0 s, 1 s] {})".format, short)
+        | st.builds("eventually[1 s, 5 s] ({} since[0 s, 2 s] {})".format, short, short)
     )
 
 
