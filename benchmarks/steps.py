@@ -141,7 +141,7 @@ def _parts(trainer: Trainer, x0: Tensor) -> Sequence[Callable[[], object]]:
 
     def optimise() -> None:
         torch.nn.utils.clip_grad_norm_(network.parameters(), trainer.config.clip)
-        trainer.optimizer.step()
+        trainer.optimizer.step(trainer.rate)
         with torch.no_grad():
             for averaged, current in zip(trainer.average.parameters(), network.parameters(), strict=True):
                 averaged.lerp_(current, 0.01)

@@ -28,6 +28,7 @@ from stlc.controller.run.run import load_weights
 from stlc.controller.search.feasibility import safety_task
 from stlc.controller.search.local_search import TAILS, THOROUGH, Search, Searcher, SearchResult, remainders
 from stlc.controller.search.planner import PlanBudget, plan
+from stlc.controller.training.adam import Adam
 from stlc.controller.training.diagnose import TrainingStep, diagnose
 from stlc.controller.training.failures import FailureStates
 from stlc.controller.training.method import Learner, Method, Validation
@@ -126,7 +127,7 @@ class Trainer(Learner):
             FixedSet(self.supply, config.samples, self.generator) if config.samples else self.supply
         )
         self.average.load_state_dict(self.network.state_dict())
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.lr, fused=True)
+        self.optimizer = Adam(self.network.parameters())
         self.buffer = ReplayBuffer.empty(
             len(task.system.names), task.horizon, len(task.system.control_names), device
         )
@@ -150,8 +151,6 @@ class Trainer(Learner):
 
         If the loss or its gradient is not finite, the weights stay as they are and NaN is returned.
         """
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.rate
         value = self._loss()
         self.optimizer.zero_grad()
         value.backward()  # type: ignore[no-untyped-call]
@@ -159,7 +158,7 @@ class Trainer(Learner):
         length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
         if not bool(torch.isfinite(value + length)):
             return math.nan
-        self.optimizer.step()
+        self.optimizer.step(self.rate)
         self.step += 1
         decay = min(self.config.average, self.step / (self.step + 10.0))
         with torch.no_grad():
@@ -494,8 +493,7 @@ class Trainer(Learner):
             found.update({f"rank{index}.{name}": value for name, value in theirs.items()})
         for prefix, module in (("network", self.network), ("average", self.average)):
             found.update({f"{prefix}.{name}": value for name, value in module.state_dict().items()})
-        for index, state in self.optimizer.state_dict()["state"].items():
-            found.update({f"adam.{index}.{name}": value for name, value in state.items()})
+        found.update({f"adam.{name}": value for name, value in self.optimizer.tensors().items()})
         return found
 
     def _own(self) -> dict[str, Tensor]:
@@ -539,12 +537,7 @@ class Trainer(Learner):
         self.searcher = self._searcher(TARGET_SHARE * self.margin)
         for prefix, module in (("network", self.network), ("average", self.average)):
             module.load_state_dict(below(tensors, prefix))
-        layout = self.optimizer.state_dict()
-        adam = below(tensors, "adam")
-        for key, value in adam.items():
-            index, name = key.split(".")
-            layout["state"].setdefault(int(index), {})[name] = value
-        self.optimizer.load_state_dict(layout)
+        self.optimizer.restore(below(tensors, "adam"))
         count = tensors["buffer.states"].shape[0]
         self.buffer.states[:count] = tensors["buffer.states"]
         self.buffer.plans[:count] = tensors["buffer.plans"]

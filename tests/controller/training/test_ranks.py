@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import subprocess
@@ -46,9 +45,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch, car_task: Task) -> Task:
     decided = module.resolve_config
     monkeypatch.setattr(module, "resolve_config", lambda task, config: replace(decided(task, config), **TINY))
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 8)
-    # what takes long is done before the ranks are forked
-    importlib.import_module("torch._dynamo")
-    assert car_task.gradient is not None
+    assert car_task.gradient is not None  # what takes long is done before the ranks are forked
     return car_task
 
 
