@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, TypeAlias, final
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    pass
 
 Array: TypeAlias = Any
 """A NumPy array or a torch tensor."""
@@ -242,11 +241,8 @@ class Ops(Protocol):
     def flip(self, x: Array) -> Array:
         """Reverse `x` along axis 0."""
 
-    def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        """Copy of `x` with `value` in the rows where `keep` is False.
-
-        `keep` contains one truth value for each row (axis 0).
-        """
+    def rows(self, where: Sequence[range], x: Array, value: float) -> Array:
+        """Copy of `x` with `value` in the rows `where`, ranges of axis 0; `x` itself if there are none."""
 
     def columns(self, x: Array) -> Sequence[Array]:
         """Split trajectories `(batch, time, dim)` into one array `(time, batch)` per state."""

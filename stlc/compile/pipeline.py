@@ -367,9 +367,9 @@ def _leaves_plan(rule: CompiledRequirement, grid: Grid) -> bool:
     """True if a requirement, at the first sample of a plan, reads samples outside of the plan."""
     if grid.steps is None:
         return False
-    from stlc.compile.ir.defined import defined
+    from stlc.compile.ir.defined import defined_at
 
-    return not defined(rule.formula, grid.steps + 1)[0]
+    return not defined_at(rule.formula, grid.steps + 1, range(1))
 
 
 def _too_far(rule: CompiledRequirement, grid: Grid) -> Diagnostic:

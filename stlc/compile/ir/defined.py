@@ -5,10 +5,10 @@ A formula is undefined at a sample if it needs values from outside the trace the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from typing import NamedTuple, TypeAlias, final
+from functools import lru_cache
+from typing import TypeAlias, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,90 +16,83 @@ from numpy.typing import NDArray
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import Analysis, fold, reach_of
 
-Defined: TypeAlias = NDArray[np.bool_]
-_Instants: TypeAlias = NDArray[np.int_]
+Undefined: TypeAlias = tuple[range, ...]
+"""Samples at which something is undefined, in order: disjoint ranges, none of them empty."""
+
+_EVER = 1 << 60
+"""More samples than any trace has."""
 
 
-def defined(formula: ir.Formula, samples: int) -> Defined:
-    """Return a mask `(samples,)` that is True at the samples of a trace at which `formula` is defined.
+def defined(formula: ir.Formula, samples: int) -> NDArray[np.bool_]:
+    """Return a mask `(samples,)` that is True at the samples of a trace at which `formula` is defined."""
+    found = np.ones(samples, dtype=bool)
+    for each in undefined(formula, samples):
+        found[each.start : each.stop] = False
+    return found
+
+
+def defined_at(formula: ir.Formula, samples: int, instants: range) -> bool:
+    """True if `formula` is defined at all of the consecutive `instants` of a trace."""
+    missing = undefined(formula, samples)
+    return not any(each.start < instants.stop and instants.start < each.stop for each in missing if instants)
+
+
+@lru_cache(maxsize=512)
+def undefined(formula: ir.Formula, samples: int) -> Undefined:
+    """Return the samples of a trace at which `formula` is undefined.
 
     Future windows are not cut: a formula is undefined if its window extends beyond the last sample. `prev`,
     `next` and `shift` are undefined if they read a sample outside the trace. A window "to the end" is defined
     if it contains a sample.
     """
-    return fold(formula, _Definedness(samples))
+    return fold(formula, _Undefinedness(samples))
 
 
 @final
 @dataclass(frozen=True, slots=True)
-class _Definedness(Analysis[Defined]):
+class _Undefinedness(Analysis[Undefined]):
     samples: int
 
-    def predicate(self, num: ir.Num) -> Defined:
-        around, now = reach_of(num), np.arange(self.samples)
-        return np.asarray((now >= around.past) & (now < self.samples - around.future))
+    def predicate(self, num: ir.Num) -> Undefined:
+        around = reach_of(num)
+        return self._merged([range(around.past), range(self.samples - around.future, self.samples)])
 
-    def constant(self) -> Defined:
-        return np.ones(self.samples, dtype=bool)
+    def constant(self) -> Undefined:
+        return ()
 
-    def over(self, parts: Sequence[Defined], offsets: Sequence[ir.Offsets]) -> Defined:
-        """Return a mask `(samples,)` that is True where all operands of an operator are defined.
+    def over(self, parts: Sequence[Undefined], offsets: Sequence[ir.Offsets]) -> Undefined:
+        """Return the samples at which an operator reads an operand where that is undefined.
 
-        An operand must be defined at every instant at which the operator reads it. `parts` are the masks of
-        the operands; operand i is read at `offsets[i]`. If the window of the operator is empty, no operand is
-        read, and the result is True.
+        Operand i is undefined at `parts[i]`, and is read at `offsets[i]`, which begin with the trace and end
+        with it at the latest if they are None, and begin with the trace if they would begin before. If the
+        window of the operator is empty, no operand is read.
         """
-        if all(each == ir.NOW for each in offsets):
-            return reduce(np.logical_and, parts)
-        if len(parts) == 1:
-            return _throughout(parts[0], *self._instants(*offsets[0]))
-        ranges, now = [self._instants(*each) for each in offsets], np.arange(self.samples)
-        unread = ranges[-1].last < ranges[-1].first
-        return reduce(
-            np.logical_and,
-            (
-                _throughout(part, np.where(unread, now + 1, read.first), np.where(unread, now, read.last))
-                for part, read in zip(parts[:-1], ranges[:-1], strict=True)
-            ),
-            _throughout(parts[-1], *ranges[-1]),
-        )
+        nonempty, found = -(offsets[-1].last or 0), []
+        for part, (first, last) in zip(parts, offsets, strict=True):
+            for each in (*part, range(self.samples, _EVER)):
+                if last is not None:
+                    begin = each.start - last
+                else:
+                    begin = 0 if each.start < self.samples else each.start - (first or 0)
+                found.append(range(max(begin, nonempty), _EVER if first is None else each.stop - first))
+        return self._merged(found)
 
-    def shift(self, body: Defined, node: ir.Shift) -> Defined:
-        there = np.arange(self.samples) + node.steps
-        within = (there >= 0) & (there < self.samples)
-        return np.where(within, body[np.clip(there, 0, self.samples - 1)], node.outside is not None)
+    def shift(self, body: Undefined, node: ir.Shift) -> Undefined:
+        steps, moved = node.steps, [range(each.start - node.steps, each.stop - node.steps) for each in body]
+        if node.outside is None:
+            moved += [range(-steps), range(self.samples - steps, self.samples)]
+        return self._merged(moved)
 
-    def at_start(self, body: Defined) -> Defined:
-        return np.full(self.samples, body[0])
+    def at_start(self, body: Undefined) -> Undefined:
+        return self._merged([range(self.samples)]) if body and not body[0].start else ()
 
-    def _instants(self, first: int | None, last: int | None) -> _Ranges:
-        """Return the first and last instant of a window at each sample, as two arrays `(samples,)`.
-
-        `first` and `last` are offsets from the sample. If `first` is None, the window begins at the start of
-        the trace; if `last` is None, it ends at the end of the trace. Windows that begin before the start of
-        the trace are cut there.
-        """
-        now = np.arange(self.samples)
-        start = np.zeros_like(now) if first is None else np.maximum(now + first, 0)
-        end = np.where(start < self.samples, self.samples - 1, self.samples) if last is None else now + last
-        return _Ranges(start, end)
-
-
-class _Ranges(NamedTuple):
-    first: _Instants
-    last: _Instants
-
-
-def _throughout(inside: Defined, first: _Instants, last: _Instants) -> Defined:
-    """Return, per sample, whether all instants `first`..`last` are in the trace and defined.
-
-    All arrays have the shape `(samples,)`. An empty range of instants gives True.
-    """
-    samples = len(inside)
-    known = int(np.argmin(inside)) if not inside.all() else samples
-    if not inside[known:].any():  # a formula without past operators is defined up to some sample
-        return np.asarray(((last < known) | (last < first)) & (last < samples))
-    missing = np.concatenate([[0], np.cumsum(~inside)])
-    low, high = np.clip(first, 0, samples), np.clip(last + 1, 0, samples)
-    whole = missing[np.maximum(high, low)] == missing[low]
-    return np.asarray(whole & (last < samples))
+    def _merged(self, parts: Iterable[range]) -> Undefined:
+        """Samples of the trace in any of the ranges."""
+        found: list[range] = []
+        for each in sorted(parts, key=lambda part: part.start):
+            start, stop = max(each.start, 0), min(each.stop, self.samples)
+            if start < stop and found and start <= found[-1].stop:
+                found[-1] = range(found[-1].start, max(found[-1].stop, stop))
+            elif start < stop:
+                found.append(range(start, stop))
+        return tuple(found)

@@ -7,31 +7,50 @@ common sub-expressions are found by equality.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 from stlc.source import Span
 
+
+class Node:
+    """Base of numbers and formulas. The hash of a node, which is that of its whole tree, is computed once."""
+
+    __slots__ = ("_hash",)
+    _hash: int
+
+    def __init_subclass__(cls) -> None:
+        cls.__hash__ = Node.__hash__  # type: ignore[method-assign] # else `dataclass` would make one
+
+    def __hash__(self) -> int:
+        try:
+            return self._hash
+        except AttributeError:
+            found = hash(tuple(getattr(self, part.name) for part in fields(self) if part.compare))  # type: ignore[arg-type]
+            object.__setattr__(self, "_hash", found)
+            return found
+
+
 # ---------------------------------------------------------------------- numbers
 
 
 @dataclass(frozen=True, slots=True)
-class Const:
+class Const(Node):
     """Constant in SI units."""
 
     value: float
 
 
 @dataclass(frozen=True, slots=True)
-class Signal:
+class Signal(Node):
     """Value of a signal at the current sample: a state, a control, the time `t`, or a recorded signal."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class ShiftedSignal:
+class ShiftedSignal(Node):
     """Value of a signal `steps` samples later (negative: earlier).
 
     Outside the trace, the value is undefined, and so is every predicate that reads it. A `clamped` signal has
@@ -44,14 +63,14 @@ class ShiftedSignal:
 
 
 @dataclass(frozen=True, slots=True)
-class FrozenVar:
+class FrozenVar(Node):
     """Value that an enclosing `Freeze` has stored under this name, which is unique in the specification."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class Op:
+class Op(Node):
     """Application of a function in `stlc.compile.ir.functions.FUNCTIONS`, e.g. `add`, `clip`, `norm`."""
 
     name: str
@@ -59,7 +78,7 @@ class Op:
 
 
 @dataclass(frozen=True, slots=True)
-class Indicator:
+class Indicator(Node):
     """Number that is 1 where a state formula holds, else 0.
 
     In training, the number is smoothed to `(1 + tanh(w rho)) / 2` (Meng and Fan 2023, Eq. 6). Here rho is the
@@ -72,7 +91,7 @@ class Indicator:
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
+class Where(Node):
     """Number that is `yes` where a state formula holds, else `no`."""
 
     cond: Formula
@@ -81,7 +100,7 @@ class Where:
 
 
 @dataclass(frozen=True, slots=True)
-class Extern:
+class Extern(Node):
     """One component of the result of a function that the system provides.
 
     `output` is the index of the component. `function` is a callable that maps arrays to all components, or
@@ -95,7 +114,7 @@ class Extern:
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class Body(Node):
     """Body of a function as straight-line code.
 
     Attributes:
@@ -144,7 +163,7 @@ class Offsets(NamedTuple):
 NOW = Offsets(0, 0)
 
 
-class Operator:
+class Operator(Node):
     """Base of formulas whose value follows from the values of their operands at instants relative to now.
 
     Attributes:
@@ -201,7 +220,7 @@ class Windowed(Operator):
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
+class Truth(Node):
     """Formula `true` or `false`, with robustness +inf or -inf.
 
     `stlc.compile.ir.simplify` removes such constants where they are operands of other operators.
@@ -212,7 +231,7 @@ class Truth:
 
 
 @dataclass(frozen=True, slots=True)
-class Predicate:
+class Predicate(Node):
     """Predicate with robustness `sign * num`; true iff the robustness is > 0 (`strict`) or >= 0.
 
     Negation flips `sign` and `strict`, and leaves `num` as it is. A `guard` is a predicate on clocks and
@@ -340,7 +359,7 @@ class Shift(Operator):
 
 
 @dataclass(frozen=True, slots=True)
-class Freeze:
+class Freeze(Node):
     """`freeze p0 = p in body`: in `body`, `p0` is the value of `p` at the instant of the `freeze` itself.
 
     This value is the same at all instants at which `body` is evaluated. If the value is undefined, the
@@ -358,7 +377,7 @@ class Freeze:
 
 
 @dataclass(frozen=True, slots=True)
-class AtStart:
+class AtStart(Node):
     """Value of `body` at the first sample.
 
     The node is used for operators such as `always@[a, b]`, whose interval counts from the start of the

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from stlc.compile.backends.array.graph import evaluate_parts
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
-from stlc.compile.ir.defined import defined
+from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.holes import KNOWN
 from stlc.compile.ir.lower import lower
@@ -471,8 +471,9 @@ class CauseFinder:
             num = substitute_frozen(written, outer)
             value: ir.Num = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)
             given = columns_in(num) <= self.record.env.keys()
-            if given and sample <= last and defined(ir.Predicate(num), last + 1)[sample]:
-                low, high = bounds(ir.Predicate(num), self.record, range(sample, sample + 1), "open")
+            here = range(sample, sample + 1)
+            if given and sample <= last and defined_at(ir.Predicate(num), last + 1, here):
+                low, high = bounds(ir.Predicate(num), self.record, here, "open")
                 if low[0, 0] == high[0, 0]:
                     value = ir.Const(float(low[0, 0]))
             values[key] = FrozenValue(key.partition("#")[0], value, unit, sample)

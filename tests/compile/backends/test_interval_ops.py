@@ -164,7 +164,7 @@ def selections(parts: list[Intervals]) -> list[Intervals]:
         *(INTERVALS.join(parts, "min"), INTERVALS.join(parts, "max"), INTERVALS.cat(parts), padded),
         *(INTERVALS.windows(parts[:1], "min", window), INTERVALS.windows(parts[3:5], "max", window)),
         *(INTERVALS.minimum(*parts[:2]), INTERVALS.maximum(*parts[3:5]), -parts[2], parts[0][::-1]),
-        *(INTERVALS.rows(np.arange(100) < 50, parts[1], math.inf), add(padded, 1.0), mul(padded, padded)),
+        *(INTERVALS.rows([range(50, 100)], parts[1], math.inf), add(padded, 1.0), mul(padded, padded)),
     ]
 
 

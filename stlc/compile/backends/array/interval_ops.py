@@ -321,8 +321,8 @@ class IntervalOps(FloatConstants):
     def flip(self, x: Intervals) -> Intervals:
         return x[::-1]
 
-    def rows(self, keep: Bools, x: Intervals, value: float) -> Intervals:
-        return x.each(lambda end: NUMPY.rows(keep, end, value))
+    def rows(self, where: Sequence[range], x: Intervals, value: float) -> Intervals:
+        return x.each(lambda end: NUMPY.rows(where, end, value))
 
     def columns(self, x: Intervals) -> Sequence[Intervals]:
         return [x.selected(partial(_column, index=index)) for index in range(x.shape[-1])]

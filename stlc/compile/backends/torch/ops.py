@@ -6,12 +6,9 @@ import operator
 from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache, reduce
-from itertools import pairwise
 from typing import Any, cast, final
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.compile.backends.torch.extrema import (
@@ -28,20 +25,20 @@ from stlc.compile.namespace import Mask, Ops, Pick, ScanByRows, Sliding
 class _MaskedRows(torch.autograd.Function):
     """Autograd function: copy of an array in which some rows are replaced by a constant.
 
-    `runs` are ranges of rows, in order, and whether they stay. The replaced rows have no gradient.
+    `where` are ranges of these rows, which have no gradient.
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, runs: list[tuple[slice, bool]], value: float) -> Tensor:
-        ctx.runs = runs
-        out = torch.empty_like(x)
-        for rows, stay in runs:
-            out[rows] = x[rows] if stay else value
+    def forward(ctx: Any, x: Tensor, where: Sequence[range], value: float) -> Tensor:
+        ctx.where = where
+        out = x.clone()
+        for rows in where:
+            out[rows.start : rows.stop] = value
         return out
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return _MaskedRows.apply(grad, ctx.runs, 0.0), None, None  # type: ignore[no-untyped-call]
+        return _MaskedRows.apply(grad, ctx.where, 0.0), None, None  # type: ignore[no-untyped-call]
 
 
 class _SmoothMax(torch.autograd.Function):
@@ -313,15 +310,11 @@ class TorchOps(ScanByRows):
     def flip(self, x: Tensor) -> Tensor:
         return x.flip(0)
 
-    def rows(self, keep: NDArray[np.bool_], x: Tensor, value: float) -> Tensor:
-        if keep.all():
-            return x
-        if torch.compiler.is_exporting():
-            mask = torch.from_numpy(keep).view(-1, *(1,) * (x.ndim - 1))
-            return torch.where(mask, x, value)
-        edges = (0, *(np.flatnonzero(np.diff(keep)) + 1).tolist(), len(keep))
-        runs = [(slice(a, b), bool(keep[a])) for a, b in pairwise(edges)]
-        out: Tensor = _MaskedRows.apply(x, runs, value)  # type: ignore[no-untyped-call]
+    def rows(self, where: Sequence[range], x: Tensor, value: float) -> Tensor:
+        if where and torch.compiler.is_exporting():
+            mask = torch.tensor([any(row in each for each in where) for row in range(len(x))])
+            return torch.where(mask.view(-1, *(1,) * (x.ndim - 1)), value, x)
+        out: Tensor = _MaskedRows.apply(x, where, value) if where else x  # type: ignore[no-untyped-call]
         return out
 
     def columns(self, x: Tensor) -> Sequence[Tensor]:
