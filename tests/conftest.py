@@ -100,4 +100,4 @@ def _kernels_are_asked_for_again(request):
     yield
     module = sys.modules.get("stlc.compile.backends.array.kernel")
     if module is not None and "monkeypatch" in request.fixturenames:
-        module._library.cache_clear()
+        module.kernel_library.cache_clear()

@@ -44,7 +44,7 @@ def hanging(monkeypatch, tmp_path):
         "stlc.controller.training.config.TrainConfig", functools.partial(TrainConfig, held_out=64)
     )
     monkeypatch.setattr("stlc.controller.training.learner.MARGIN_STATES", 16)
-    caches = (trace_cells._library, window_kernel._library)
+    caches = (trace_cells._library, window_kernel.kernel_library)
     for each in caches:
         each.cache_clear()
     yield tmp_path / "cc.asked"

@@ -25,14 +25,13 @@ BOTH = pytest.mark.parametrize("pick", ["min", "max"])
 def _method(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """By the C kernel, a few windows at a time, or without one."""
     monkeypatch.setattr(kernel, "_CHUNK", 4)
-    monkeypatch.setattr("stlc.compile.backends.array.numpy_ops._LARGE_KERNEL", 1)
-    monkeypatch.setattr("stlc.compile.backends.array.numpy_ops._WIDE", 1)
+    monkeypatch.setattr("stlc.compile.backends.array.numpy_ops._MANY", 1)
     monkeypatch.setattr("stlc.compile.backends.torch.extrema._SMALL", 0)
-    kernel._library.cache_clear()
+    kernel.kernel_library.cache_clear()
     if request.param != "kernel":
         monkeypatch.setattr(kernel.native, "load", lambda _: None)
     yield
-    kernel._library.cache_clear()
+    kernel.kernel_library.cache_clear()
 
 
 @st.composite

@@ -162,11 +162,11 @@ def test_without_a_compiler_torch_does_the_same(batch: int, monkeypatch: pytest.
         return [*values, *torch.autograd.grad(sum(each.sum() for each in values), [x, y])]
 
     with_kernel = judged()
-    kernel._library.cache_clear()
+    kernel.kernel_library.cache_clear()
     monkeypatch.setattr(native, "load", lambda _: None)
     try:
         assert by_kernel([x], "min", Sliding(300, 300, 20)) is None
         without = judged()
     finally:
-        kernel._library.cache_clear()
+        kernel.kernel_library.cache_clear()
     torch.testing.assert_close(with_kernel, without)

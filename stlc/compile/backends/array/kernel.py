@@ -104,20 +104,27 @@ def window_kernel(dtype: str, traces: int, operands: int, pick: Pick, window: Sl
     if dtype not in _TYPES:
         return None
     size = _TYPES[dtype][2]
-    vector = _NARROW if traces * size <= _FEW_BYTES else _WIDE
+    few = traces * size <= _FEW_BYTES
+    vector = _NARROW if few else _WIDE
     width = min(window.width, window.rows)
     chunk = min(window.count, max(8 * width, _CHUNK))
     rows = min(window.rows, chunk + width)
     room = vector * (2 * operands * (rows + width) + chunk)
     if room > max(_ROOM, window.rows * traces * size):
         return None
-    library = _library(dtype, vector)
+    library = kernel_library(dtype, few=few)
     return None if library is None else WindowKernel(library, operands, pick, window, traces)
 
 
 @cache
-def _library(dtype: str, vector: int) -> ctypes.CDLL | None:
-    """Return the compiled library for a dtype and a vector width in bytes; None if it is unavailable."""
+def kernel_library(dtype: str, *, few: bool = True) -> ctypes.CDLL | None:
+    """Return the compiled library for a dtype, and for few traces or for many; None if it is unavailable."""
+    if dtype not in _TYPES:
+        return None
     real, index, _ = _TYPES[dtype]
+    vector = _NARROW if few else _WIDE
     defined = f"#define REAL {real}\n#define INDEX {index}\n#define BYTES {vector}\n#define CHUNK {_CHUNK}\n"
-    return native.load(defined + _SOURCE.read_text(encoding="utf-8"))
+    library = native.load(defined + _SOURCE.read_text(encoding="utf-8"))
+    if library is not None:
+        library.double_all.argtypes = [*[ctypes.c_void_p] * 2, *[ctypes.c_int64] * 4, ctypes.c_int]
+    return library

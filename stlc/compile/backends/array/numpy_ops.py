@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import operator
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -9,20 +10,19 @@ from functools import reduce
 from typing import Any, cast, final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stlc.compile.backends.array.kernel import Strided, window_kernel
+from stlc.compile.backends.array.kernel import Strided, kernel_library, window_kernel
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.namespace import Array, FloatConstants, Mask, Ops, Pick, ScanByRows, Sliding
 
-_WIDE = 8
-"""Columns from which the C kernel beats pairwise doubling."""
+_MANY = 1 << 16
+"""Elements of all arrays so far from which building the C kernel pays off."""
 
-_LONG = 20_000
-"""Rows of a window from which it does so for `until`."""
+_BYTE = ctypes.c_char * 1
+_NAMES = {"f": "float32", "d": "float64"}
 
-_LARGE_KERNEL = 1 << 16
-"""Elements from which building the kernel pays off."""
+_NARROW = 1 << 11
+"""Elements of a window up to which joining blocks beats prefixes and suffixes of blocks."""
 
 
 @final
@@ -30,6 +30,7 @@ class NumpyOps(FloatConstants, ScanByRows):
     """Implementation of `stlc.compile.namespace.Ops` for NumPy arrays, without gradients."""
 
     name = "numpy"
+    _seen = 0
 
     add = staticmethod(operator.add)
     sub = staticmethod(operator.sub)
@@ -85,10 +86,10 @@ class NumpyOps(FloatConstants, ScanByRows):
         return self.number(rho > 0 if strict else rho >= 0, rho)
 
     def amin(self, x: Array) -> Array:
-        return x.min(axis=0, keepdims=True)
+        return np.minimum.reduce(x, axis=0, keepdims=True)
 
     def amax(self, x: Array) -> Array:
-        return x.max(axis=0, keepdims=True)
+        return np.maximum.reduce(x, axis=0, keepdims=True)
 
     def sum(self, x: Array) -> Array:
         return x.sum(axis=0, keepdims=True)
@@ -124,18 +125,25 @@ class NumpyOps(FloatConstants, ScanByRows):
         The result is None if array operations of NumPy are faster, or if no kernel is available.
         """
         first = operands[0]
-        wide = first.ndim == 2 and first.shape[1] >= _WIDE
-        if len(operands) == 2:
-            wide = wide or (first.ndim == 2 and window.width >= _LONG)
-        elif window.to_end:
+        self._seen += first.size
+        if first.ndim != 2 or self._seen < _MANY or any(each.dtype != first.dtype for each in operands):
             return None
-        alike = all(each.dtype == first.dtype for each in operands)
-        if not wide or first.size < _LARGE_KERNEL or not alike:
-            return None
-        kernel = window_kernel(first.dtype.name, first.shape[1], len(operands), pick, window)
+        name, traces, flags = _NAMES.get(first.dtype.char, ""), first.shape[1], first.flags
+        if len(operands) == 1:
+            if window.to_end:
+                return None
+            if window.width * traces <= _NARROW and (library := kernel_library(name)) is not None:
+                x = first if flags.c_contiguous and flags.writeable else first.copy()
+                out = np.empty((window.count, traces), x.dtype)
+                places = _BYTE.from_buffer(x.data), _BYTE.from_buffer(out.data)
+                sizes = window.rows, window.count, window.width, traces
+                if library.double_all(*places, *sizes, pick == "max"):
+                    raise MemoryError
+                return out
+        kernel = window_kernel(name, traces, len(operands), pick, window)
         if kernel is None:
             return None
-        out = np.empty((window.count, first.shape[1]), first.dtype)
+        out = np.empty((window.count, traces), first.dtype)
         arrays = (*operands, out)
         kernel.run([Strided(x.ctypes.data, *(stride // x.itemsize for stride in x.strides)) for x in arrays])
         return out
@@ -172,8 +180,11 @@ class NumpyOps(FloatConstants, ScanByRows):
     def flip(self, x: Array) -> Array:
         return x[::-1]
 
-    def rows(self, keep: NDArray[np.bool_], x: Array, value: float) -> Array:
-        return np.where(keep.reshape(-1, *(1,) * (x.ndim - 1)), x, np.asarray(value, dtype=x.dtype))
+    def rows(self, where: Sequence[range], x: Array, value: float) -> Array:
+        out = x.copy() if where else x
+        for each in where:
+            out[each.start : each.stop] = value
+        return out
 
     def columns(self, x: Array) -> Sequence[Array]:
         return list(np.ascontiguousarray(x.transpose(2, 1, 0)))

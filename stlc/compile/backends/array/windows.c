@@ -13,6 +13,16 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* A vector that the processor does not have would be taken apart into numbers. */
+#if BYTES > 32 && !defined(__AVX512F__)
+#undef BYTES
+#define BYTES 32
+#endif
+#if BYTES > 16 && !defined(__AVX2__)
+#undef BYTES
+#define BYTES 16
+#endif
+
 #define LANES ((int64_t)(BYTES / sizeof(REAL)))
 #define AHEAD 16 /* rows that memory is asked for before they are needed */
 #ifndef CHUNK
@@ -218,6 +228,39 @@ judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int
     return 0;
 }
 
+/* Extrema of rows that lie beside each other, values alone: blocks of 1, 2, 4, … rows are joined, some windows at a
+   time, so that they stay in the cache. */
+static inline __attribute__((always_inline)) int
+doubled(const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t width, int64_t traces, int max)
+{
+    int64_t some = least(count, 4 * width > CHUNK / 2 / traces ? 4 * width : CHUNK / 2 / traces + 1);
+    int64_t room = (some + width) * traces;
+    REAL *memory = malloc((size_t)(2 * room) * sizeof(REAL));
+    if (!memory)
+        return 1;
+    for (int64_t begin = 0; begin < count; begin += some) {
+        int64_t windows = least(some, count - begin) * traces, cells = windows + (width - 1) * traces;
+        int64_t there = least(cells, (rows - begin) * traces);
+        REAL *from = memory, *to = memory + room;
+        memcpy(from, x + begin * traces, (size_t)there * sizeof(REAL));
+        for (int64_t i = there; i < cells; i++)
+            from[i] = (REAL)(max ? -INFINITY : INFINITY);
+        for (int64_t size = 1, next; size < width; size += next) {
+            next = least(size, width - size);
+            cells -= next * traces;
+            const REAL *restrict a = from, *restrict b = from + next * traces;
+            REAL *restrict both = to;
+            for (int64_t i = 0; i < cells; i++)
+                both[i] = ((max ? b[i] > a[i] : b[i] < a[i]) | (b[i] != b[i])) ? b[i] : a[i];
+            to = from;
+            from = both;
+        }
+        memcpy(out + begin * traces, from, (size_t)windows * sizeof(REAL));
+    }
+    free(memory);
+    return 0;
+}
+
 #define JUDGED(OPERANDS, WALK, HOW) \
     (max ? judge(arrays, shape, OPERANDS, WALK, 1, HOW) : judge(arrays, shape, OPERANDS, WALK, 0, HOW))
 
@@ -226,6 +269,11 @@ judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int
 int slide_all(REAL **arrays, const int64_t *shape, int max, int how)
 {
     return how == VALUES ? JUDGED(1, slide, VALUES) : how == PULL ? JUDGED(1, slide, PULL) : JUDGED(1, slide, PUSH);
+}
+
+int double_all(const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t width, int64_t traces, int max)
+{
+    return max ? doubled(x, out, rows, count, width, traces, 1) : doubled(x, out, rows, count, width, traces, 0);
 }
 
 int until_all(REAL **arrays, const int64_t *shape, int max, int how)
