@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
+from itertools import filterfalse
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,7 +21,7 @@ Given: TypeAlias = Mapping[str, Any]
 """Signal -> array (time,) or (…, time); a vector is (…, time, k)."""
 
 UNNAMED = "the signals"
-_CLOCKS = ("time", "t")
+CLOCKS = ("time", "t")
 """Keys that hold the times, unless a requirement reads them."""
 
 
@@ -55,16 +56,22 @@ def plain(given: Given, reading: Reading) -> tuple[dict[str, Any], float | None]
             of words that the signal does not have.
     """
     found: dict[str, Any] = {}
-    unread = {n for n in given if reading.read and n not in _CLOCKS and not reading.wanted.reads(n)}
+    read = reading.read or {}
+    others = [name for name in given if name not in read and name not in CLOCKS] if read else []
+    unread = set(filterfalse(reading.wanted.reads, others)) if others else ()
     for name, values in given.items():
-        with suppress(TraceError) if name in unread else nullcontext():
+        try:
             made = values if hasattr(values, "requires_grad") else _flat(name, values)
-            found[name] = made.reshape(-1) if made.ndim == 2 and made.shape[1] == 1 < made.shape[0] else made
-    clock = next((key for key in _CLOCKS if key in found and key not in (reading.read or ())), None)
+        except TraceError:
+            if name not in unread:
+                raise
+            continue
+        if name in unread and isinstance(made, np.ndarray) and made.dtype.kind in "UcMm":
+            continue
+        found[name] = made.reshape(-1) if made.ndim == 2 and made.shape[1] == 1 < made.shape[0] else made
+    clock = next((key for key in CLOCKS if key in found and key not in read), None)
     step = None if clock is None else _step(clock, found.pop(clock))
     texts = {name: x for name, x in found.items() if isinstance(x, np.ndarray) and x.dtype.kind in "UcMm"}
-    for name in unread & texts.keys():
-        del found[name], texts[name]
     if texts:
         known: dict[str, Words] = {name: (reading.words or {}).get(name, {}) for name in texts}
         found |= in_numbers(Recording(UNNAMED, (ClockGroup(texts, None),)), known).groups[0].arrays

@@ -20,7 +20,7 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined
+from stlc.compile.ir.defined import defined, defined_at
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import earliest
 from stlc.compile.namespace import Array
@@ -137,7 +137,7 @@ def rule_known(
     window = window_of(rule, horizon)
     if window is None:
         return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)
-    whole = bool(defined(rule.formula, window + 1)[0])
+    whole = defined_at(rule.formula, window + 1, range(1))
     return np.array([whole and start + window < samples for start in starts], dtype=bool)
 
 
@@ -192,18 +192,17 @@ def rules_at(
         known = [each for rule, pair in zip(rules, sides, strict=True) for each in pair or (rule,)]
         rows = iter(rules_at(known, record.sure, at, horizon, end))
         return [_agreed(next(rows), next(rows), record, end) if pair else next(rows) for pair in sides]
-    starts = [starts_of(rule, record.samples, horizon, 0 if rule.absolute else at).start for rule in rules]
-    together = [
-        rule.under(record.semantics)
-        for rule, start in zip(rules, starts, strict=True)
+    starts = [0 if rule.absolute else starts_of(rule, record.samples, horizon, at).start for rule in rules]
+    together = {
+        i: rule.under(record.semantics)
+        for i, (rule, start) in enumerate(zip(rules, starts, strict=True))
         if start == at and window_of(rule, horizon) is None and _has_value(rule, record, at, end)
-    ]
-    here = range(at, at + 1)
-    values = dict(zip(together, record.values(together, here, end), strict=True)) if together else {}
-    found = [values.get(rule.under(record.semantics)) for rule in rules]
+    }
+    values = record.values([*together.values()], range(at, at + 1), end) if together else []
+    found = dict(zip(together, values, strict=True))
     return [
-        _alone(rule, record, start, horizon, end) if row is None else row
-        for rule, start, row in zip(rules, starts, found, strict=True)
+        found[i] if i in found else _alone(rule, record, start, horizon, end)
+        for i, (rule, start) in enumerate(zip(rules, starts, strict=True))
     ]
 
 
@@ -222,7 +221,7 @@ def _agreed(least: Array, most: Array, record: Record, end: Boundary) -> Array:
 
 
 def _has_value(rule: CompiledRequirement, record: Record, at: int, end: Boundary) -> bool:
-    return end != "strict" or bool(defined(rule.formula, record.samples)[at])
+    return end != "strict" or defined_at(rule.formula, record.samples, range(at, at + 1))
 
 
 def _alone(rule: CompiledRequirement, record: Record, at: int, horizon: int | None, end: Boundary) -> Array:
@@ -241,7 +240,7 @@ def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: G
     """Return finding E306 if the robustness at `starts` needs more samples than the trace has, else None."""
     window = window_of(rule, grid.horizon) or 0
     fits = starts.stop - 1 + window < samples
-    if fits and defined(rule.formula, samples)[starts.start : starts.stop].all():
+    if fits and defined_at(rule.formula, samples, starts):
         return None
     unit, step = ("samples", 1.0) if grid.dt is None else ("s", float(grid.dt))
     needed, length = (starts.stop - 1 + max(rule.reach, window)) * step, (samples - 1) * step

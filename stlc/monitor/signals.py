@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import islice
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from stlc.diagnostics import Diagnostic, TraceError, UsageError
 from stlc.escape import shell, visible
 from stlc.grammar import ast
 from stlc.monitor.cells import Cells
-from stlc.monitor.given import UNNAMED, Given
+from stlc.monitor.given import CLOCKS, UNNAMED, Given
 from stlc.registry import closest
 from stlc.signature import Column, Kind
 from stlc.source import Span
@@ -185,6 +185,7 @@ class Signals:
         spans: signal -> time in which it was seen, if the signals were resampled.
         times: time of each sample in seconds, where that differs from the grid; None if it does not.
         trace: the recording that the signals are of; None for signals of a Python program.
+        first: index of the first sample, where only those that an instant reads were kept.
     """
 
     env: Mapping[str, Array]
@@ -198,6 +199,7 @@ class Signals:
     spans: Mapping[str, TimeRange] = field(default_factory=dict)
     times: NDArray[np.float64] | None = None
     trace: Trace | None = None
+    first: int = 0
 
     @property
     def batch(self) -> int:
@@ -231,10 +233,43 @@ class Signals:
         return flat if self.shape or self.ops is not NUMPY else np.float64(flat)
 
 
+class Excerpt(NamedTuple):
+    """Samples from `first` to `stop` (exclusive) of a trace that has the sample `at`, or else all."""
+
+    first: int
+    at: int
+    stop: int
+
+
+_FLOAT64 = np.dtype(np.float64)
+WHOLE = Excerpt(0, 0, 1 << 60)
+
+
+def plain_columns(given: Given, needs: Sequence[Need], excerpt: Excerpt) -> Signals | None:
+    """Return signals as `arrange` does if they need no conversion, else None.
+
+    They need none if they are vectors (time,) in float64, and no times are given with them.
+    """
+    env, samples, (first, at, stop) = {}, 0, excerpt
+    for need in needs:
+        name = need.column.name
+        x = given.get(name)
+        if type(x) is not np.ndarray or x.ndim != 1 or x.dtype != _FLOAT64:
+            return None
+        if (count := len(x)) != (samples or count):
+            return None
+        samples = count
+        env[name] = np.ascontiguousarray(x[first:stop, None] if at < count else x[:, None])
+    if not samples or not given.keys().isdisjoint(CLOCKS):
+        return None
+    cut = at < samples
+    return Signals(env, (), min(stop, samples) - first if cut else samples, NUMPY, first=first if cut else 0)
+
+
 def arrange(
-    given: Given | Trace, needs: Sequence[Need], *, plain: bool = False, stop: int | None = None
+    given: Given | Trace, needs: Sequence[Need], *, plain: bool = False, excerpt: Excerpt = WHOLE
 ) -> Signals:
-    """Convert the signals that requirements need to arrays (time, batch), or their first `stop` samples.
+    """Convert the signals that requirements need to arrays (time, batch), or an excerpt of them.
 
     NaN is an unknown value. NumPy arrays and lists become float64. Torch tensors keep dtype, device and
     gradients; if `plain`, they become NumPy arrays.
@@ -247,10 +282,9 @@ def arrange(
     name = UNNAMED if trace is None else trace.name
     data: Given = given if not isinstance(given, Trace) else {CLOCK: given.times, **given.data}
     found = {need.column.name: _find(data, need.column.name) for need in needs}
-    there = data if trace is None else {**dict.fromkeys(trace.others), **data, **trace.extras}
-    missing = [_missing(need, there, name) for need in needs if found[need.column.name] is None]
-    if missing:
-        raise TraceError(*missing)
+    if lacking := [need for need in needs if found[need.column.name] is None]:
+        there = data if trace is None else {**dict.fromkeys(trace.others), **data, **trace.extras}
+        raise TraceError(*(_missing(need, there, name) for need in lacking))
     if not found:  # the numbers of traces and samples are those of any signal, preferably not of a vector
         any_one = min(data, key=lambda key: (key == CLOCK, np.ndim(data[key])), default=None)
         found = {} if any_one is None else {any_one: _find(data, any_one)}
@@ -260,18 +294,26 @@ def arrange(
         found |= {key: found[key].detach().cpu().numpy() for key in tensors}
         tensors = []
     shape, samples = _common_shape(found, name)
-    if stop is not None and stop < samples:
-        found, samples = {key: x[..., :stop] if x.ndim else x for key, x in found.items()}, stop
+    first, at, stop = excerpt if trace is None else WHOLE
+    if at >= samples:
+        first = 0
+    elif first or stop < samples:
+        found = {key: x[..., first:stop] if x.ndim else x for key, x in found.items()}
+        samples = min(stop, samples) - first
     if tensors:
         from stlc.compile.backends.torch.ops import TORCH
 
         given_tensors = [found[key] for key in tensors]
-        return Signals(_torch_columns(found, given_tensors, (*shape, samples)), shape, samples, TORCH, name)
-    arrays = (np.broadcast_to(np.asarray(x, dtype=np.float64), (*shape, samples)) for x in found.values())
-    flat = (np.ascontiguousarray(array.reshape(-1, samples).T) for array in arrays)
-    columns = dict(zip(found, flat, strict=True))
+        columns = _torch_columns(found, given_tensors, (*shape, samples))
+        return Signals(columns, shape, samples, TORCH, name, first=first)
+    columns = {}
+    for key, x in found.items():
+        array = np.asarray(x, dtype=np.float64)
+        if array.shape != (*shape, samples):
+            array = np.broadcast_to(array, (*shape, samples))
+        columns[key] = np.ascontiguousarray(array.reshape(-1, samples).T)
     if trace is None:
-        return Signals(columns, shape, samples, NUMPY, name)
+        return Signals(columns, shape, samples, NUMPY, name, first=first)
     changes = _conversions(needs, trace)
     columns = {key: changes[key](values) if key in changes else values for key, values in columns.items()}
     cells = None if trace.moments is None else _cells(trace.moments, columns, changes)
@@ -326,8 +368,9 @@ def _common_shape(arrays: Mapping[str, Any], name: str) -> tuple[tuple[int, ...]
             raise unfit(f"`{key}` has {length} samples, `{first}` has {samples}")
     if not samples:
         raise unfit("the signals hold no samples")
+    leading = {tuple(values.shape[:-1]) for values in arrays.values() if values.ndim}
     try:
-        shape = np.broadcast_shapes(*(tuple(values.shape[:-1]) for values in arrays.values()))
+        shape = leading.pop() if len(leading) == 1 else np.broadcast_shapes(*leading)
     except ValueError:
         shapes = ", ".join(f"{key} {tuple(values.shape)}" for key, values in arrays.items())
         raise unfit(f"the arrays do not fit together: {shapes}") from None

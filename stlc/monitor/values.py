@@ -14,7 +14,7 @@ from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined
+from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.holes import holes_in, partial, unsure, without_holes
 from stlc.compile.ir.support import columns_in, history
 from stlc.compile.ir.traverse import map_children, nodes, subexpressions
@@ -54,11 +54,16 @@ class Record:
     loose: bool = False
 
     @staticmethod
-    def of(env: Mapping[str, Array], ops: Ops, cells: Cells | None = None) -> Record:
+    def of(
+        env: Mapping[str, Array],
+        ops: Ops,
+        cells: Cells | None = None,
+        semantics: Semantics | None = None,
+    ) -> Record:
         """Return a record of the signals `env`; in NumPy arrays, NaN is an unknown value."""
         holes = holes_in(env) if ops is NUMPY else frozenset[str]()
         filled = without_holes(env, holes) if holes else env
-        return Record(filled, ops, holes=holes, computed=ops is NUMPY, cells=cells)
+        return Record(filled, ops, semantics or Exact(), holes, computed=ops is NUMPY, cells=cells)
 
     @property
     def sure(self) -> Record:
@@ -138,7 +143,7 @@ def bounds(
         end = "truncate"
     elif stop is None or stop <= record.samples:
         stop = None
-        end = "strict" if defined(formula, record.samples)[starts.start : starts.stop].all() else None
+        end = "strict" if defined_at(formula, record.samples, starts) else None
     if end is None:
         (low,) = record.values([least], starts, "lower", stop)
         (high,) = record.values([most], starts, "upper", stop)

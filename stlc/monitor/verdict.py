@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from stlc.compile.backends.schedule import Boundary
+from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid, lacks
-from stlc.compile.ir.support import columns_in, farthest
-from stlc.compile.ir.traverse import numbers
+from stlc.compile.ir.support import Reach, columns_in, farthest, history
+from stlc.compile.ir.traverse import leaves, numbers
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.semantics.semantics import Semantics, semantics_of
@@ -39,12 +40,13 @@ from stlc.monitor.instants import (
     window_of,
 )
 from stlc.monitor.judgement import About, Bools, RequirementVerdict, Verdict, chosen
+from stlc.monitor.prefix_bounds import FAR
 from stlc.monitor.prepared import Part, Prepared
-from stlc.monitor.signals import Need, arrange, needs_of, reading_of
+from stlc.monitor.signals import WHOLE, Excerpt, Need, arrange, needs_of, plain_columns, reading_of
 from stlc.monitor.uncertain import Uncertainties, outer, outer_of, uncertain_record
 from stlc.monitor.values import Ends, Record, decisive
 from stlc.source import Source
-from stlc.trace import Trace, load_trace
+from stlc.trace import Reading, Trace, load_trace
 
 if TYPE_CHECKING:
     from stlc.monitor.online.online import How, Online
@@ -98,8 +100,8 @@ class Monitor:
             self._system, self._interface = system_of(found, self.spec, self._overrides)
         self.resolved = resolve_for(self.spec, self._interface, self._overrides, "check")
         self._compiled: dict[Grid, Compiled] = {}
-        self._reads: dict[tuple[str, ...], frozenset[str]] = {}
-        self._needs: dict[tuple[Grid, tuple[str, ...], bool], tuple[Need, ...]] = {}
+        self._readings: dict[tuple[str, ...], Reading] = {}
+        self._selected: dict[tuple[Times, tuple[str, ...], bool], _Selection] = {}
         known = self._given.or_else(self._system)
         if not self._lacks(known):  # else the first trace may give the time step
             self._compile(known)
@@ -111,13 +113,10 @@ class Monitor:
 
     def reads(self, require: Sequence[str] = ()) -> frozenset[str]:
         """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
-        key = tuple(require)
-        if key not in self._reads:
-            rules = chosen(self.resolved.requirements, require)
-            formulas = [each.formula for each in (*rules, *self.resolved.assumptions)]
-            read = (columns_in(num) for formula in formulas for num in numbers(formula))
-            self._reads[key] = frozenset[str]().union(*read)
-        return self._reads[key]
+        rules = chosen(self.resolved.requirements, require)
+        formulas = [each.formula for each in (*rules, *self.resolved.assumptions)]
+        read = (columns_in(num) for formula in formulas for num in numbers(formula))
+        return frozenset[str]().union(*read)
 
     @property
     def compiled(self) -> Compiled:
@@ -211,7 +210,7 @@ class Monitor:
         Returns:
             An array of the shape of the signals; with `at`, of that shape without the time axis.
         """
-        return _least(self._prepare(signals, (), at=at).under(semantics_of(semantics, smoothing)), end, at)
+        return _least(self._prepare(signals, at=at, semantics=semantics_of(semantics, smoothing)), end, at)
 
     def requirement_robustness(
         self,
@@ -222,12 +221,12 @@ class Monitor:
         semantics: str | Semantics = "exact",
     ) -> dict[str, Array]:
         """Robustness of each requirement by name, without weight and scale; arguments as of `robustness`."""
-        ready = self._prepare(signals, (), at=at).under(semantics_of(semantics))
+        ready = self._prepare(signals, at=at, semantics=semantics_of(semantics))
         return robustness_signals(ready, end, at)
 
     def bounds(self, signals: Subject, *, at: int | None = None) -> tuple[Array, Array]:
         """Least and greatest `robustness` over all continuations of the signals, in the same shape."""
-        ready = self._prepare(signals, (), at=at)
+        ready = self._prepare(signals, at=at)
         return _least(ready, "lower", at), _least(ready, "upper", at)
 
     def online(
@@ -258,11 +257,37 @@ class Monitor:
         return Online(compiled, _chosen(compiled, require), how)
 
     def _prepare(
-        self, subject: Subject, require: Sequence[str], *, plain: bool = False, at: int | None = None
+        self,
+        subject: Subject,
+        require: Sequence[str] = (),
+        *,
+        plain: bool = False,
+        at: int | None = None,
+        semantics: Semantics | None = None,
     ) -> Prepared:
-        given, recorded = subject, Times()
+        key, signals = (_UNKNOWN, tuple(require), plain), None
+        selected = self._selected.get(key)
+        if selected is not None and type(subject) is dict:
+            signals = plain_columns(subject, selected.needs, selected.excerpt(at))
+        if selected is None or signals is None:
+            given, recorded = self._read(subject, key[1])
+            key = (recorded, *key[1:])
+            if key not in self._selected:
+                self._selected[key] = _selection(self._ready(recorded), *key[1:])
+            selected = self._selected[key]
+            if isinstance(given, Trace):
+                require_windows(given, selected.rules)
+            signals = arrange(given, selected.needs, plain=plain, excerpt=selected.excerpt(at))
+        record = Record.of(signals.env, signals.ops, signals.cells, semantics)
+        return Prepared(selected.compiled, selected.rules, signals, record, cause_of, facts_of)
+
+    def _read(self, given: Subject, names: tuple[str, ...]) -> tuple[Given | Trace, Times]:
+        """Return the signals that requirements read (`names` empty: all), and times given with them."""
+        recorded = _UNKNOWN
         if not isinstance(given, Trace):
-            reading = reading_of(self.spec, read=self.reads(require))
+            if names not in self._readings:
+                self._readings[names] = reading_of(self.spec, read=self.reads(names))
+            reading = self._readings[names]
             if isinstance(given, (str, Path)):
                 given = load_trace(given, reading)
             elif is_frame(given):
@@ -270,22 +295,11 @@ class Monitor:
                 given = trace_of_frame(given, replace(reading, dt=step))
             else:
                 given, found = plain_signals(given, reading)
-                recorded = Times() if found is None else agreed_times(UNNAMED, found, None, self._given)
+                if found is not None:
+                    recorded = agreed_times(UNNAMED, found, None, self._given)
         if isinstance(given, Trace):
             recorded = agreed_times(given.name, given.dt, given.meta.horizon, self._given)
-        compiled = self._ready(recorded)
-        rules = _chosen(compiled, require)
-        if isinstance(given, Trace):
-            require_windows(given, rules)
-        key = (compiled.grid, tuple(rule.name for rule in rules), plain)
-        if key not in self._needs:
-            self._needs[key] = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
-        stop = (
-            None if at is None or isinstance(given, Trace) else _read_until(rules, at, compiled.grid.horizon)
-        )
-        signals = arrange(given, self._needs[key], plain=plain, stop=stop)
-        record = Record.of(signals.env, signals.ops, signals.cells)
-        return Prepared(compiled, rules, signals, record, cause_of, facts_of)
+        return given, recorded
 
     def _ready(self, recorded: Times) -> Compiled:
         """Return the specification compiled for the time step and horizon that are known.
@@ -323,12 +337,44 @@ class Monitor:
         return self._compiled[grid]
 
 
-def _read_until(rules: Sequence[CompiledRequirement], at: int, horizon: int | None) -> int | None:
-    """Number of samples that decide the value of requirements at sample `at`; None if all of them may."""
-    if at < 0 or any(rule.uses_end and window_of(rule, horizon) is None for rule in rules):
-        return None
-    later = [farthest(num).future for rule in rules for num in numbers(rule.formula)]
-    return at + 1 + max(rule.reach for rule in rules) + max(later, default=0) + (horizon or 0)
+_UNKNOWN = Times()
+
+
+@dataclass(frozen=True, slots=True)
+class _Selection:
+    """Requirements that are evaluated together.
+
+    Attributes:
+        compiled: the specification.
+        rules: the requirements.
+        needs: signals that they read.
+        reach: samples before and after an instant that their values there may depend on.
+    """
+
+    compiled: Compiled
+    rules: tuple[CompiledRequirement, ...]
+    needs: tuple[Need, ...]
+    reach: Reach
+
+    def excerpt(self, at: int | None) -> Excerpt:
+        """Samples that values at sample `at` may depend on; all for None."""
+        if at is None or at < 0:
+            return WHOLE
+        return Excerpt(max(at - self.reach.past, 0), at, at + self.reach.future + 1)
+
+
+def _selection(compiled: Compiled, names: Sequence[str], plain: bool) -> _Selection:
+    rules, horizon = _chosen(compiled, names), compiled.grid.horizon
+    needs = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
+    past, future = 0, 0
+    for rule in rules:
+        nums = list(numbers(rule.formula))
+        counted = any(leaf == ir.Signal(ir.ELAPSED) for num in nums for leaf in leaves(num))
+        past = max(past, FAR if rule.absolute or counted else history(rule.formula))
+        lasting = rule.uses_end and window_of(rule, horizon) is None
+        later = max((farthest(num).future for num in nums), default=0) + (horizon or 0)
+        future = max(future, FAR if lasting else rule.reach + later)
+    return _Selection(compiled, rules, needs, Reach(past, future))
 
 
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
@@ -347,15 +393,18 @@ def robustness_signals(ready: Prepared, end: Boundary = "strict", at: int | None
 
 def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
     """Robustness of every requirement, (samples, batch), or (1, batch) at the one sample `at`."""
-    if at is not None and ready.record.cells is None:
-        return rules_at(ready.rules, ready.record, at, ready.horizon, end)
+    record, horizon = ready.record, ready.horizon
+    if record.cells is None:
+        if at is None:
+            return [rule_signal(rule, record, horizon, end) for rule in ready.rules]
+        return rules_at(ready.rules, record, at - ready.signals.first, horizon, end)
     rows = []
     for rule in ready.rules:  # a formula may need a record of its own
         record = record_of(rule, ready, Part(0, ready.record.samples))
         if at is None:
-            rows.append(rule_signal(rule, record, ready.horizon, end))
+            rows.append(rule_signal(rule, record, horizon, end))
         else:
-            rows += rules_at([rule], record, at, ready.horizon, end)
+            rows += rules_at([rule], record, at, horizon, end)
     return [outer_of(row, end) for row in rows]
 
 

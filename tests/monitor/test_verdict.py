@@ -537,14 +537,31 @@ def test_no_continuation_leaves_the_bounds(formula: str, semantics: str) -> None
 
 @pytest.mark.parametrize(
     "formula",
-    ["always[0, 5 s] x > 0", "next(x > 0)", "always (x > -9)", "once x > 2", "always@[2 s, 9 s] x > -1"],
+    [
+        *("always[0, 5 s] x > 0", "next(x > 0)", "always (x > -9)", "once x > 2", "always@[2 s, 9 s] x > -1"),
+        *("historically[1 s, 4 s] x < y", "always[0 s, 3 s] prev(x) > y", "x > 0 since[2 s, 3 s] y > 0"),
+        *("once[2 s, 3 s] eventually[0 s, 9 s] x > 2", "freeze p = x in eventually[1 s, 4 s] x > p + y"),
+        "rise(x > 0) -> eventually[0 s, 2 s] y > 0",
+    ],
 )
-@pytest.mark.parametrize("at", [0, 20, 38])
+@pytest.mark.parametrize("at", [0, 3, 20, 38])
 def test_a_value_at_one_sample_is_that_of_the_whole_signal(formula: str, at: int) -> None:
-    monitor = Monitor(f"signal x\nrequire r: {formula}", dt=1.0)
-    signals = {"x": np.random.default_rng(0).normal(size=40)}
+    monitor = Monitor(f"signal x\nsignal y\nrequire r: {formula}", dt=1.0)
+    x, y, *_ = np.random.default_rng(0).normal(size=(3, 40))
+    y[31] = np.nan
+    others = ({"y": y.tolist(), "x": x}, {"x": x[:, None], "y": np.repeat(y, 2)[::2]}, {"x": [x], "y": [y]})
     for end in ("strict", "truncate"):
-        whole = monitor.robustness(signals, end=end)
-        np.testing.assert_array_equal(monitor.robustness(signals, end=end, at=at), whole[at])
-    low, high = monitor.bounds(signals)
-    assert monitor.bounds(signals, at=at) == (low[at], high[at])
+        whole = monitor.robustness({"x": x, "y": y}, end=end)
+        found = [monitor.robustness(signals, end=end, at=at) for signals in ({"x": x, "y": y}, *others)]
+        assert {np.ndim(value) for value in found} == {0, 1}
+        np.testing.assert_array_equal(np.concatenate([np.ravel(value) for value in found]), whole[at])
+    low, high = monitor.bounds({"x": x, "y": y})
+    assert monitor.bounds({"x": x, "y": y}, at=at) == (low[at], high[at])
+
+
+def test_a_value_at_one_sample_reads_only_what_it_needs() -> None:
+    monitor = Monitor("signal x\nrequire r: once[0 s, 2 s] always[0 s, 5 s] x > 0", dt=1.0)
+    ready = monitor._prepare({"x": np.zeros(1000)}, at=500)
+    assert (ready.signals.first, ready.signals.samples) == (498, 8)
+    with pytest.raises(StlcError, match=r"U101.*no sample 1000: the trace has 1000"):
+        monitor.robustness({"x": np.zeros(1000)}, at=1000)

@@ -97,4 +97,4 @@ def overall(each: Sequence[Array], factors: Iterable[float], ops: Ops, semantics
         semantics: definition of the minimum.
     """
     rows = [weighed(row, factor, ops) for row, factor in zip(each, factors, strict=True)]
-    return semantics.join(rows, "min", ops)
+    return semantics.join(rows, "min", ops) if len(rows) > 1 else rows[0]

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from stlc.compile.backends.array.graph import RobustnessGraph, evaluate, planned, robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.backends.schedule import TraceDomain, spanning
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
@@ -272,8 +271,9 @@ def test_gradients_are_never_nan(formula: typed.Formula, env: Env, k: float | No
 def test_predicates_are_read_only_where_they_are_needed() -> None:
     x, y = ir.Signal("x"), ir.Signal("y")
     node = ir.BoolOp("or", (ir.Predicate(x), ir.Temporal("always", ir.Window(0, 25), ir.Predicate(y))))
-    plan = planned((node,), spanning(0, 1), TraceDomain(51))
-    assert sorted(source.inside.count for source in plan.predicates.values()) == [1, 26]
+    plan = planned((node,), 51, range(1))
+    steps = [step for step in plan.schedule.steps if isinstance(step.node, ir.Predicate)]
+    assert sorted(step.run.count for step in steps) == [1, 26]
     assert not plan.batches
 
 
@@ -287,14 +287,14 @@ def test_predicates_over_one_stretch_share_a_program() -> None:
             ir.Temporal("always", ir.Window(0, 25), ir.BoolOp("and", (ir.Predicate(twice), more))),
         ),
     )
-    plan = planned((node,), spanning(0, 1), TraceDomain(51))
+    plan = planned((node,), 51, range(1))
     assert sorted(batch.run.count for batch in plan.batches) == [1, 26]
 
 
 def test_equal_parts_are_computed_once() -> None:
     p = ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x")))
     twin = ir.Temporal("always", ir.Window(0, 3), ir.Predicate(ir.Signal("x")))
-    plan = planned((p, ir.BoolOp("or", (twin, ir.Predicate(ir.Signal("y"))))), spanning(0, 1), TraceDomain(5))
+    plan = planned((p, ir.BoolOp("or", (twin, ir.Predicate(ir.Signal("y"))))), 5, range(1))
     assert sum(isinstance(step.node, ir.Temporal) for step in plan.schedule.steps) == 1
 
 

@@ -11,9 +11,8 @@ from stlc.compile.backends import schedule
 from stlc.compile.backends.array.graph import evaluate, planned
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.array.steps import MAX_BEYOND
-from stlc.compile.backends.schedule import TraceDomain, spanning
 from stlc.compile.ir import nodes as ir
-from stlc.compile.semantics.semantics import SEMANTICS, semantics_of
+from stlc.compile.semantics.semantics import SEMANTICS, LogSumExp, semantics_of
 from stlc.diagnostics import StlcError
 
 Env = dict[str, np.ndarray]
@@ -77,14 +76,14 @@ def nested(window: ir.Window, *ops: str) -> ir.Formula:
 
 def test_a_window_of_days_takes_no_time() -> None:
     node = nested(ir.Window(0, 8_640_000), *["always", "eventually"] * 20)
-    assert planned((node,), spanning(0, 1), TraceDomain(3, "lower")).beyond < 100
+    assert planned((node,), 3, range(1), "lower").beyond < 100
     low, high = (evaluate([node], COLUMN, ops=NUMPY, end=end)[0] for end in ("lower", "upper"))
     assert (low.item(), high.item()) == (-np.inf, np.inf)
 
 
 def test_a_mean_counts_every_instant() -> None:
     node = nested(ir.Window(0, 5000), "always")
-    assert planned((node,), spanning(0, 1), TraceDomain(3, "lower", counted=True)).beyond == 4998
+    assert planned((node,), 3, range(1), "lower", None, LogSumExp(1.0)).beyond == 4998
     for name in SEMANTICS.names:
         (found,) = evaluate([node], COLUMN, ops=NUMPY, semantics=semantics_of(name), end="upper")
         padded = {"x": np.concatenate([COLUMN["x"], np.full((4998, 1), np.inf)])}
@@ -100,7 +99,7 @@ def test_what_is_decided_is_decided_before_a_far_deadline() -> None:
 
 def test_what_looks_too_far_is_refused() -> None:
     node = nested(ir.Window(0, 10**9), "always", "once", "always")
-    assert planned((node,), spanning(0, 1), TraceDomain(3, "lower")).beyond > MAX_BEYOND
+    assert planned((node,), 3, range(1), "lower").beyond > MAX_BEYOND
     with pytest.raises(StlcError) as caught:
         evaluate([node], COLUMN, ops=NUMPY, end="lower")
     (finding,) = caught.value.diagnostics

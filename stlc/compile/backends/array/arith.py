@@ -31,6 +31,8 @@ ExternFunction: TypeAlias = Callable[..., Sequence[Array]]
 _TAKES_FLOATS = frozenset({"pow"})
 """Kernels that take a constant as a Python float."""
 
+_HARD = Hard()
+
 _ROOM = 1 << 24
 """Numbers in all registers of a program beyond which a recording is computed in blocks of samples."""
 
@@ -69,6 +71,7 @@ class ArrayProgram:
             leaf for num in outputs.values() for leaf in leaves(num) if isinstance(leaf, ir.ShiftedSignal)
         )
         self.shifted = {key_of(leaf): leaf for leaf in shifted}
+        self.unshifted = bool(self.columns) and not self.shifted and ir.ELAPSED not in self.columns
 
     def __call__(self, env: Mapping[str, Array], ops: Ops, switch: Switch | None = None) -> dict[str, Array]:
         """Return the value of each output, by name, computed from the arrays `env`.
@@ -76,18 +79,17 @@ class ArrayProgram:
         `switch` converts a condition to a number from 0 (false) to 1 (true). If `switch` is None, the number
         is exactly 0 or 1.
         """
-        switch = switch or Hard()
-        like = _first(env)
-        key = (ops.name, switch, ops.kind(like))
+        switch = switch or _HARD
+        like, library = _first(env), ops.name
+        key = (library, switch, ops.kind(like))
         bound = self._bound.get(key)
         if bound is None:
             bound = self._bound[key] = self._bind(ops, switch, like)
         with ops.quiet():
-            if ops.name in ("numpy", "intervals"):  # shapes of exported torch programs are symbols
-                arrays = (env[name] for name, _ in bound.inputs)
-                shapes = {tuple(array.shape) for array in arrays if not isinstance(array, (int, float))}
-                if len(shapes) == 1:
-                    return bound.run_in_blocks(env, ops, *shapes)
+            if library in ("numpy", "intervals"):  # shapes of exported torch programs are symbols
+                numbers = math.prod(like.shape) * len(bound.code)
+                if numbers > _ROOM:
+                    return bound.run_in_blocks(env, ops, max(len(like) * _ROOM // numbers, 1))
             return bound.run(env, ops)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -174,14 +176,13 @@ class _Bound:
     arrays: dict[str, int]
     numbers: dict[str, float]
 
-    def run_in_blocks(self, env: Mapping[str, Array], ops: Ops, shape: tuple[int, ...]) -> dict[str, Array]:
-        """Run on arrays that all have the shape `shape`, in blocks along axis 0 if they are large."""
-        numbers = math.prod(shape) * len(self.code)
-        if numbers <= _ROOM or not shape:
-            return self.run(env, ops)
-        size = max(shape[0] * _ROOM // numbers, 1)
+    def run_in_blocks(self, env: Mapping[str, Array], ops: Ops, size: int) -> dict[str, Array]:
+        """Run on blocks of `size` rows along axis 0, if all arrays have the same shape."""
         whole = {name: value for name, value in env.items() if isinstance(value, (int, float))}
         arrays = {name: env[name] for name, _ in self.inputs if name not in whole}
+        shapes = {tuple(array.shape) for array in arrays.values()}
+        if len(shapes) != 1 or not (shape := shapes.pop()):
+            return self.run(env, ops)
         parts = [
             self.run(whole | {name: value[first : first + size] for name, value in arrays.items()}, ops)
             for first in range(0, shape[0], size)
@@ -205,7 +206,10 @@ class _Bound:
 
 
 def _first(env: Mapping[str, Array]) -> Array:
-    return next(value for value in env.values() if not isinstance(value, (int, float)))
+    for value in env.values():
+        if not isinstance(value, (int, float)):
+            return value
+    raise ValueError("no array is given")
 
 
 def _needed(tape: GradientTape, outputs: Any) -> list[int]:
@@ -339,7 +343,7 @@ def _strictness(cond: ir.Formula) -> set[bool]:
 # ------------------------------------------------------------------------- inputs
 
 
-def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> dict[str, Array]:
+def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops: Ops) -> Mapping[str, Array]:
     """Return the arrays that `program` reads at the instants `run`: name -> array `(run.count, batch)`.
 
     If the program reads no signal, the result contains an arbitrary signal, since the constant outputs of the
@@ -351,6 +355,8 @@ def inputs(program: ArrayProgram, env: Mapping[str, Array], run: IndexRange, ops
         run: instants within the trace. Every sample that `program` needs at these instants must exist.
         ops: the array library of `env`.
     """
+    if run.start == 0 and program.unshifted and all(len(env[name]) == run.count for name in program.columns):
+        return env
 
     def read(name: str) -> Array:
         if name == ir.ELAPSED:

@@ -15,11 +15,11 @@ from typing import Protocol
 import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.backends.array.steps import ArrayPlan, all_values, array_plan
+from stlc.compile.backends.array.steps import ArrayPlan, array_plan
 from stlc.compile.backends.array.windows import Windows
-from stlc.compile.backends.schedule import Boundary, End, IndexRange, TraceDomain, spanning
+from stlc.compile.backends.schedule import Boundary, End, TraceDomain, spanning
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined
+from stlc.compile.ir.defined import defined_at, undefined
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import overall
@@ -58,9 +58,7 @@ def evaluate(
         TraceError: E306, a lower or upper bound on the robustness needs values at too many instants beyond
             the trace.
     """
-    windows = Windows(semantics or Exact(), ops)
-    domain = _domain(env, end, windows, stop)
-    return execute(planned(tuple(formulas), spanning(start, count), domain), env, windows)
+    return _plan(formulas, env, range(start, start + count), end, stop, semantics or _EXACT, ops).roots(env)
 
 
 def evaluate_parts(
@@ -81,38 +79,56 @@ def evaluate_parts(
         Tuples (formula, instants, values), with values of the shape `(instants, batch)`. Operands come before
         the formula that reads them. Sub-formulas inside a `freeze` are left out.
     """
-    windows = Windows(Exact(), ops)
-    plan = planned((formula,), spanning(instants.start, len(instants)), _domain(env, end, windows, stop))
-    for step, values in zip(plan.schedule.steps, all_values(plan, env, windows), strict=True):
+    plan = _plan((formula,), env, instants, end, stop, _EXACT, ops)
+    for step, values in zip(plan.schedule.steps, plan.values(env), strict=True):
         yield step.node, range(step.run.start, step.run.last + 1), values
 
 
-def _domain(
-    env: Mapping[str, Array], end: Boundary, windows: Windows, stop: int | None = None
-) -> TraceDomain:
+_EXACT = Exact()
+
+
+def _plan(
+    formulas: Sequence[ir.Formula],
+    env: Mapping[str, Array],
+    instants: range,
+    end: Boundary,
+    stop: int | None,
+    semantics: Semantics,
+    ops: Ops,
+) -> ArrayPlan:
     samples = len(next(iter(env.values())))
-    return TraceDomain(samples, end, stop, counted=not windows.semantics.idempotent)
+    return planned(tuple(formulas), samples, instants, end, stop, semantics, ops)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=512)
-def planned(formulas: tuple[ir.Formula, ...], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    """Return the evaluation plan of `formulas` at the instants `run`; plans are cached.
+def planned(
+    formulas: tuple[ir.Formula, ...],
+    samples: int,
+    instants: range,
+    end: Boundary = "strict",
+    stop: int | None = None,
+    semantics: Semantics = _EXACT,
+    ops: Ops = NUMPY,
+) -> ArrayPlan:
+    """Return the evaluation plan of `formulas` at `instants`; plans are cached.
 
-    A plan lists the values to compute, and the programs that compute them. It applies to every trace of the
-    length in `domain`.
+    A plan lists the values to compute, and the programs that compute them. It applies to every trace of
+    `samples` samples; the other arguments are those of `evaluate`.
 
     Raises:
-        ValueError: an instant lies outside the trace; or `domain.end` is "strict", and a window extends
-            beyond the trace.
+        ValueError: an instant lies outside the trace; or `end` is "strict", and a window extends beyond the
+            trace.
     """
-    samples = domain.samples
-    if run.start < 0 or (run.last >= samples and not domain.open):
-        raise ValueError(f"instants {run.start}..{run.last} of a trace with {samples} samples")
-    if domain.end == "strict":
+    domain = TraceDomain(samples, end, stop, counted=not semantics.idempotent)
+    if instants.start < 0 or (instants.stop > samples and not domain.open):
+        first, last = instants.start, instants.stop - 1
+        raise ValueError(f"instants {first}..{last} of a trace with {samples} samples")
+    if end == "strict":
         for formula in formulas:
-            if not defined(formula, samples)[run.start : run.last + 1].all():
+            if not defined_at(formula, samples, instants):
                 raise ValueError(f"the formula looks beyond the end of a trace of {samples} samples")
-    return array_plan(formulas, run, domain)
+    run = spanning(instants.start, len(instants))
+    return array_plan(formulas, run, domain, Windows(semantics, ops))
 
 
 def robustness_signal(
@@ -127,29 +143,9 @@ def robustness_signal(
 
     If `end` is "strict", the robustness is NaN at samples where the formula needs samples beyond the trace.
     """
-    windows = Windows(semantics or Exact(), ops)
-    domain = _domain(env, "truncate" if end == "strict" else end, windows)
-    samples = domain.samples
-    (signal,) = execute(planned((formula,), spanning(0, samples), domain), env, windows)
-    if end != "strict":
-        return signal
-    return ops.rows(defined(formula, samples), signal, math.nan)
-
-
-def execute(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Execute an evaluation plan; return the robustness of its formulas, `(count, batch)` each.
-
-    Args:
-        plan: list of the values to compute, and the programs that compute them.
-        env: signal name -> array `(time, batch)`.
-        windows: algorithms for extrema over windows, for a given semantics and array library.
-
-    Raises:
-        TraceError: E306, a lower or upper bound on the robustness needs values at too many instants beyond
-            the trace.
-    """
-    values = all_values(plan, env, windows)
-    return [values[root] for root in plan.schedule.roots]
+    samples, cut = len(next(iter(env.values()))), "truncate" if end == "strict" else end
+    (signal,) = _plan((formula,), env, range(samples), cut, None, semantics or _EXACT, ops).roots(env)
+    return signal if end != "strict" else ops.rows(undefined(formula, samples), signal, math.nan)
 
 
 class Weighed(Protocol):

@@ -8,8 +8,8 @@ own function. The functions are built once for each semantics and array library,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, TypeAlias, assert_never, final
 
@@ -31,7 +31,7 @@ from stlc.compile.backends.schedule import (
     within,
 )
 from stlc.compile.ir import nodes as ir
-from stlc.compile.namespace import Array, Pick
+from stlc.compile.namespace import Array, Ops, Pick
 from stlc.diagnostics import Diagnostic, TraceError
 
 Kernel: TypeAlias = Callable[[Sequence[Array], Array], Array]
@@ -88,29 +88,54 @@ class ArrayPlan:
     Attributes:
         schedule: the steps; a step is a sub-formula at a range of instants.
         batches: programs of the predicates.
-        predicates: step number of a predicate -> source of its values. If the predicate is undefined at all
-            instants of the step, there is no entry.
+        runners: functions of the steps, in order.
         beyond: number of instants beyond the last sample, summed over all steps.
-        runners: (semantics, array library) -> functions of the steps, in order; they are built on first use.
+        ops: the array library.
     """
 
     schedule: Schedule
     batches: tuple[Batch, ...]
-    predicates: dict[int, StepSource]
-    beyond: int = 0
-    runners: dict[Hashable, tuple[Runner, ...]] = field(default_factory=dict, compare=False, repr=False)
+    runners: tuple[Runner, ...]
+    beyond: int
+    ops: Ops
+
+    def values(self, env: Mapping[str, Array]) -> list[Array]:
+        """Return the values of all steps, `(count, batch)` each; `env`: signal name -> array `(time, batch)`.
+
+        Raises:
+            TraceError: E306, more than `MAX_BEYOND` instants or more than `MAX_VALUES` values lie beyond the
+                trace.
+        """
+        like = next(iter(env.values()))
+        if self.beyond and (self.beyond > MAX_BEYOND or self.beyond * math.prod(like.shape[1:]) > MAX_VALUES):
+            raise TraceError(_too_far(self.schedule))
+        outputs = [
+            batch.program(inputs(batch.program, env, batch.run, self.ops), self.ops) for batch in self.batches
+        ]
+        values: list[Array] = []
+        for runner in self.runners:
+            values.append(runner(values, outputs, env, like))
+        return values
+
+    def roots(self, env: Mapping[str, Array]) -> list[Array]:
+        """Return the values of the formulas, as `values` does."""
+        values = self.values(env)
+        return [values[root] for root in self.schedule.roots]
 
 
-def array_plan(formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain) -> ArrayPlan:
+def array_plan(
+    formulas: Sequence[ir.Formula], run: IndexRange, domain: TraceDomain, windows: Windows
+) -> ArrayPlan:
     """Return the evaluation plan of `formulas` at the instants `run`: the steps and their programs.
 
     A step is one sub-formula at a range of instants. `domain` contains the length of the trace, and the
     treatment of instants beyond its last sample.
     """
-    found = schedule(formulas, run, domain)
+    found, machine = schedule(formulas, run, domain), Machine(domain, windows)
     batches, predicates = _batches(found.steps, domain)
     stops = ((step.run.last - domain.samples + 1, step.run.count) for step in found.steps)
-    return ArrayPlan(found, batches, predicates, sum(max(min(stop), 0) for stop in stops))
+    runners = tuple(_runner(step, machine, predicates.get(step.number), batches) for step in found.steps)
+    return ArrayPlan(found, batches, runners, sum(max(min(stop), 0) for stop in stops), windows.ops)
 
 
 def _batches(
@@ -330,36 +355,12 @@ class Machine:
 # ------------------------------------------------------------------------------ running
 
 
-def all_values(plan: ArrayPlan, env: Mapping[str, Array], windows: Windows) -> list[Array]:
-    """Return the values of all steps of an evaluation plan, `(count, batch)` each.
-
-    A step is one sub-formula at a range of instants. `env` maps a signal name to an array `(time, batch)`.
-
-    Raises:
-        TraceError: E306, more than `MAX_BEYOND` instants or more than `MAX_VALUES` values lie beyond the
-            trace.
-    """
-    ops, like = windows.ops, next(iter(env.values()))
-    if plan.beyond > MAX_BEYOND or (plan.beyond and plan.beyond * math.prod(like.shape[1:]) > MAX_VALUES):
-        raise TraceError(_too_far(plan))
-    runners = plan.runners.get(windows)
-    if runners is None:
-        machine = Machine(plan.schedule.domain, windows)
-        runners = tuple(_runner(plan, step, machine) for step in plan.schedule.steps)
-        plan.runners[windows] = runners
-    outputs = [batch.program(inputs(batch.program, env, batch.run, ops), ops) for batch in plan.batches]
-    values: list[Array] = []
-    for runner in runners:
-        values.append(runner(values, outputs, env, like))
-    return values
-
-
-def _too_far(plan: ArrayPlan) -> Diagnostic:
+def _too_far(schedule: Schedule) -> Diagnostic:
     """Return finding E306: a formula needs values at too many instants beyond the trace."""
-    step = max(plan.schedule.steps, key=lambda step: step.run.last)
+    step = max(schedule.steps, key=lambda step: step.run.last)
     return Diagnostic(
         "E306",
-        f"this looks {step.run.last - plan.schedule.domain.samples + 1:,} samples beyond the last one",
+        f"this looks {step.run.last - schedule.domain.samples + 1:,} samples beyond the last one",
         step.node.span,
         help=(
             "record more, or shorten the intervals: a trace that ends so early says nothing certain here",
@@ -368,11 +369,14 @@ def _too_far(plan: ArrayPlan) -> Diagnostic:
     )
 
 
-def _runner(plan: ArrayPlan, step: ScheduleStep, machine: Machine) -> Runner:
+def _runner(
+    step: ScheduleStep, machine: Machine, source: StepSource | None, batches: Sequence[Batch]
+) -> Runner:
+    """Return the function that computes the values of a step; `source`: that of the margin of a predicate."""
     if isinstance(step.node, ir.Freeze):
         return _frozen(step.node, step.run, machine)
     if isinstance(step.node, ir.Predicate):
-        return _predicate(plan, step, machine)
+        return _predicate(step, machine, source, batches)
     kernel, parts = machine.bind(step), step.operands
     if len(parts) == 1:
         (only,) = parts
@@ -380,24 +384,26 @@ def _runner(plan: ArrayPlan, step: ScheduleStep, machine: Machine) -> Runner:
     return lambda values, _, __, like: kernel([values[part] for part in parts], like)
 
 
-def _predicate(plan: ArrayPlan, step: ScheduleStep, machine: Machine) -> Runner:
+def _predicate(
+    step: ScheduleStep, machine: Machine, source: StepSource | None, batches: Sequence[Batch]
+) -> Runner:
     """Return the function that computes the values of `step`, whose formula is a predicate.
 
-    The function reads the margin of the predicate from an output of a program, or directly from a signal.
+    The function reads the margin of the predicate from an output of a program, or directly from a signal. If
+    the predicate is undefined at all instants of the step, there is no `source`.
     """
-    source, domain = plan.predicates.get(step.number), plan.schedule.domain
     if source is None:
         kernel = machine.predicate(step.node, step.run, spanning(step.run.start, 0))
         return lambda _, __, ___, like: kernel((), like)
     number, name, inside = source.batch, source.name, source.inside
     kernel = machine.predicate(step.node, step.run, inside)
     if number is None:
-        if inside.count == domain.samples:
+        if inside.count == machine.domain.samples:
             return lambda _, __, env, like: kernel((env[name],), like)
         first, stop = inside.start, inside.last + 1
         return lambda _, __, env, like: kernel((env[name][first:stop],), like)
-    offset = inside.start - plan.batches[number].run.start
-    if offset == 0 and plan.batches[number].run.count == inside.count:
+    offset = inside.start - batches[number].run.start
+    if offset == 0 and batches[number].run.count == inside.count:
         return lambda _, outputs, __, like: kernel((outputs[number][name],), like)
     rows = slice(offset, offset + inside.count)
     return lambda _, outputs, __, like: kernel((outputs[number][name][rows],), like)
@@ -413,10 +419,9 @@ def _judge(
     formula: ir.Formula, env: Mapping[str, Array], run: IndexRange, domain: TraceDomain, *, windows: Windows
 ) -> Array:
     """Robustness `(count, batch)` of one formula at the instants `run`, which may lie beyond the trace."""
-    plan = _scheduled(formula, run, domain)
-    return all_values(plan, env, windows)[plan.schedule.roots[0]]
+    return _scheduled(formula, run, domain, windows).roots(env)[0]
 
 
 @lru_cache(maxsize=512)
-def _scheduled(formula: ir.Formula, run: IndexRange, domain: TraceDomain) -> ArrayPlan:
-    return array_plan((formula,), run, domain)
+def _scheduled(formula: ir.Formula, run: IndexRange, domain: TraceDomain, windows: Windows) -> ArrayPlan:
+    return array_plan((formula,), run, domain, windows)
