@@ -19,6 +19,7 @@ from stlc.compile.backends.numbers import Untranslatable
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.escape import c_comment, c_string
 from stlc.files import place, write_atomic
+from stlc.monitor.online.kernel import streamed_rule
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
 
@@ -73,7 +74,7 @@ def export_monitor(monitor: Monitor, folder: Path, *, single: bool = False) -> E
         UsageError: U101, a requirement has no transducers.
     """
     online = monitor.online(How())
-    rules = [each.streamed(online.signals) for each in online.asked]
+    rules = [streamed_rule(each, online.signals) for each in online.asked]
     for asked, rule in zip(online.asked, rules, strict=True):
         if rule is None:
             why = "it has a `freeze`, or a window to an end inside of another"

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ SEEN = "@seen"
 """A column that is 1 at every sample."""
 
 
+@lru_cache(maxsize=512)
 def prefix_bound(formula: ir.Formula, end: Literal["lower", "upper"], *, cut: bool) -> ir.Formula:
     """Return a formula whose value is a bound on `formula` while the trace is still growing.
 

@@ -20,6 +20,7 @@ from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.diagnostics import UsageError
 from stlc.export.monitor import _texts, export_monitor
+from stlc.monitor.online.kernel import streamed_rule
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
 from stlc.toolchain import compiler
@@ -93,7 +94,7 @@ def test_random_formulas_under_sanitizers(written, trace) -> None:
     forms = [simplify(lower(each, random_formulas.GRID, [])) for each in written]
     rules = [replace(random_formulas.a_rule(form), name=f"r{i}") for i, form in enumerate(forms)]
     asked = Online(compiled, rules, How()).asked
-    rules = [each.rule for each in asked if each.streamed(("x", "y", "z"))]
+    rules = [each.rule for each in asked if streamed_rule(each, ("x", "y", "z"))]
     if not rules:
         return
     online = Online(compiled, rules, How())
@@ -101,7 +102,9 @@ def test_random_formulas_under_sanitizers(written, trace) -> None:
         online.signals,
         np.concatenate([trace[name] for name in online.signals] or [trace["x"]], axis=1),
     )
-    program = streams_of([rule for each in online.asked if (rule := each.streamed(names))], names, cut=False)
+    program = streams_of(
+        [rule for each in online.asked if (rule := streamed_rule(each, names))], names, cut=False
+    )
     with tempfile.TemporaryDirectory() as folder:
         for name, text in _texts(online, program, single=False)[0].items():
             (Path(folder) / name).write_text(text, encoding="utf-8")

@@ -11,7 +11,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.online.margins import Margins
-from stlc.monitor.online.recompute import RecomputeTracker
+from stlc.monitor.online.recompute import GrowingBounds
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 
@@ -69,9 +69,8 @@ def anew(judge: Monitor, rule, data):  # type: ignore[no-untyped-def]
         starts = range(max(last - max(horizon, rule.reach), 0), last + 1)
     ends = []
     for trace in range(TRACES):
-        whole = RecomputeTracker(rule, horizon, "open")
-        whole.grow({"x": data[:, 0, trace, None], "y": data[:, 1, trace, None]}, 0, len(data))
-        ends.append(whole.live(starts))
+        columns = {"x": data[:, 0, trace, None], "y": data[:, 1, trace, None]}
+        ends.append(GrowingBounds(rule, horizon, "open").live(columns, starts))
     return [low.min() for low, _ in ends], [high.min() for _, high in ends]
 
 

@@ -1,4 +1,4 @@
-"""Storage of growing time series (columns): rows are added or replaced at the end, dropped at the front."""
+"""Storage of growing time series (columns): rows are added at the end, dropped at the front."""
 
 from __future__ import annotations
 
@@ -25,29 +25,27 @@ class ColumnHistory:
     """
 
     def __init__(self) -> None:
-        self.first = self.samples = 0
-        self._rows: dict[str, Floats] = {}
-        self._origin = self._room = 0
+        self.first = self.samples = self._origin = 0
+        self._names: tuple[str, ...] = ()
+        self._values = np.zeros((1, 0, 1))
 
-    def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Append `count` samples to all series; `columns` maps their names to arrays (count, width)."""
-        start, stop = self.samples - self._origin, self.samples - self._origin + count
-        if stop > self._room:
+    def take(self, columns: Mapping[str, Floats]) -> None:
+        """Append samples to all series; `columns` maps their names to arrays (count, width)."""
+        block, start = np.stack([*columns.values()]), self.samples - self._origin
+        signals, count, width = block.shape
+        if start + count > self._values.shape[1]:
             kept = self.samples - self.first
-            self._room = 2 * (kept + count) + _SPARE
-            moved = {name: np.zeros((self._room, rows.shape[1])) for name, rows in columns.items()}
-            for name, old in self._rows.items():
-                moved[name][:kept] = old[start - kept : start]
-            self._rows, self._origin, start, stop = moved, self.first, kept, kept + count
-        for name, rows in self._rows.items():
-            rows[start:stop] = columns[name]
+            moved = np.zeros((signals, 2 * (kept + count) + _SPARE, width))
+            moved[:, :kept] = self._values[:, start - kept : start]
+            self._names, self._values, self._origin, start = tuple(columns), moved, self.first, kept
+        self._values[:, start : start + count] = block
         self.samples += count
 
-    def columns(self, first: int | None = None, stop: int | None = None) -> dict[str, Floats]:
+    def columns(self, first: int = 0, stop: int | None = None) -> dict[str, Floats]:
         """Return views of the stored rows of all series, from sample `first` to `stop` (exclusive)."""
-        low = max(self.first if first is None else first, self.first) - self._origin
+        low = max(first, self.first) - self._origin
         high = (self.samples if stop is None else min(stop, self.samples)) - self._origin
-        return {name: rows[low:high] for name, rows in self._rows.items()}
+        return dict(zip(self._names, self._values[:, low:high], strict=True)) if self._names else {}
 
     def forget(self, before: int) -> None:
         """Drop the samples before sample `before`; their memory is freed at the next copy of the arrays."""

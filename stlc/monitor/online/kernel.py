@@ -4,50 +4,32 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, final
 
 import numpy as np
 
 from stlc import native
 from stlc.compile.backends.c.streams import TABLES, Rule, Streams, runtime, streams_of
+from stlc.compile.backends.numbers import Untranslatable
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir.support import endless, reach, uses_end
+from stlc.compile.ir.traverse import map_children
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status
+from stlc.monitor.instants import beyond, window_of
 from stlc.monitor.online.history import Floats
-from stlc.monitor.online.tally import JudgedInstants, RequirementSummary
+from stlc.monitor.online.tally import Asked, JudgedInstants, RequirementSummary
 from stlc.monitor.signals import Gap
 
-After = Literal["open", "growing", "ended", "clipped"]
+_OPEN, _GROWING, _ENDED, _CLIPPED = 1, 2, 3, 4
 """Continuation after the samples: others, where the end may cut windows to it, or all windows; or nothing."""
-
-_STEPS: dict[After, int] = {"open": 1, "growing": 2, "ended": 3, "clipped": 4}
 
 _HEAD = "#define REAL double\n#define API\n"
 
 _MOST = 1 << 32
 """Greatest size of the state in bytes."""
-
-
-class Starts(NamedTuple):
-    """Instants at which a requirement is judged: from `begin` on, or only there."""
-
-    begin: int
-    everywhere: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Watching:
-    """Settings of a monitor of streams.
-
-    Attributes:
-        starts: instants of each requirement.
-        tolerance: a requirement is satisfied if its robustness is at least minus this value.
-        cut: whether the end of the trace cuts all windows.
-    """
-
-    starts: Sequence[Starts]
-    tolerance: float
-    cut: bool
 
 
 class _Tables(ctypes.Structure):
@@ -86,49 +68,50 @@ class StreamKernel:
         library: the transducers.
         program: tables of the monitor.
         predicates: library of its predicates.
-        watching: settings.
+        asked: the requirements.
     """
 
     def __init__(
-        self, library: ctypes.CDLL, program: Streams, predicates: ctypes.CDLL, watching: Watching
+        self, library: ctypes.CDLL, program: Streams, predicates: ctypes.CDLL, asked: Sequence[Asked]
     ) -> None:
-        self._library, self._watching, self._predicates = library, watching, predicates
+        self.library, self._predicates = library, predicates
         self._arrays = {name: np.array(_flat(rows) or [0], np.int32) for name, rows in program.tables.items()}
         places = {name: array.ctypes.data for name, array in self._arrays.items()}
         function = ctypes.cast(predicates.predicates, ctypes.c_void_p)
         self._tables = _Tables(**places, predicates=function, **program.sizes)
-        self._program = ctypes.addressof(self._tables)
-        size = library.stlc_size(self._program)
+        self.program = ctypes.addressof(self._tables)
+        size = library.stlc_size(self.program)
         if size > _MOST:
             raise MemoryError
-        self._state = np.zeros(size // 8 + 1)
-        self._at = self._state.ctypes.data
-        library.stlc_place(self._at, self._program)
+        self.state = np.zeros(size // 8 + 1)
+        self.at = self.state.ctypes.data
+        library.stlc_place(self.at, self.program)
         self._row = (ctypes.c_double * program.sizes["signals"])()
         self._step = library.stlc_step
-        self._arguments = (ctypes.c_void_p(self._at), ctypes.cast(self._row, ctypes.c_void_p))
-        for rule, start in enumerate(watching.starts):
-            library.stlc_init(self._at, rule, *start, watching.cut, watching.tolerance)
+        self._arguments = (ctypes.c_void_p(self.at), ctypes.cast(self._row, ctypes.c_void_p))
+        for rule, each in enumerate(asked):
+            cut = each.ending == "truncate"
+            library.stlc_init(self.at, rule, each.begin, each.everywhere, cut, each.tolerance)
 
     @property
     def samples(self) -> int:
         """Number of samples received."""
-        return int(self._state[1:2].view(np.int64)[0])  # `s.known`, after a pointer
+        return int(self.state[1:2].view(np.int64)[0])  # `s.known`, after a pointer
 
     @staticmethod
-    def of(rules: Sequence[Rule], signals: Sequence[str], watching: Watching) -> StreamKernel | None:
+    def of(asked: Sequence[Asked], rules: Sequence[Rule], signals: Sequence[str]) -> StreamKernel | None:
         """Return a kernel; None without a compiler, or if its state takes more than 4 GiB.
 
         Raises:
             Untranslatable: a requirement has no transducers.
         """
-        program = streams_of(rules, signals, cut=watching.cut)
+        program = streams_of(rules, signals, cut=any(each.ending == "truncate" for each in asked))
         library = _transducers()
         predicates = None if library is None else native.load(f"{_HEAD}{runtime()[0]}{program.predicates}")
         if library is None or predicates is None:
             return None
         try:
-            return StreamKernel(library, program, predicates, watching)
+            return StreamKernel(library, program, predicates, asked)
         except MemoryError:
             return None
 
@@ -145,49 +128,107 @@ class StreamKernel:
         """
         rows, taken = np.ascontiguousarray(rows, dtype=np.float64), ctypes.c_int64()
         place = ctypes.addressof(taken)
-        decided = self._library.stlc_block(self._at, rows.ctypes.data, len(rows), pause, place)
-        return decided, taken.value
-
-    def news(self, rule: int) -> dict[int, Status]:
-        """Starts of a requirement that the latest sample decided, in order, and their verdicts."""
-        count = self._library.stlc_news(self._at, rule, None, None)
-        starts, truths = np.zeros((2, count), dtype=np.int64)
-        self._library.stlc_news(self._at, rule, starts.ctypes.data, truths.ctypes.data)
-        found = sorted(zip(starts.tolist(), truths.tolist(), strict=True))
-        return {start: "satisfied" if truth == 2 else "violated" for start, truth in found}
-
-    def tally(self, rule: int) -> RequirementSummary:
-        """Summary of the instants of a requirement that are counted."""
-        (instants, holds, fails, low_at, high_at), (low, high, *_) = self._tally(rule)
-        first = self._watching.starts[rule].begin
-        return RequirementSummary(instants, holds, fails, low, high, low_at, high_at, first)
-
-    def last(self, rule: int) -> JudgedInstants:
-        """Bounds and verdict at the instant of a requirement that was counted last."""
-        return JudgedInstants.of(np.array([self._tally(rule)[1][2:]]), self._watching.tolerance)
-
-    def _tally(self, rule: int) -> tuple[list[int], list[float]]:
-        counts, bounds = np.zeros(5, dtype=np.int64), np.zeros(6)
-        self._library.stlc_tally(self._at, rule, counts.ctypes.data, bounds.ctypes.data)
-        return counts.tolist(), bounds.tolist()
+        return self.library.stlc_block(self.at, rows.ctypes.data, len(rows), pause, place), taken.value
 
     def gap(self, signal: int) -> Gap:
         """Samples at which a signal is unknown."""
         out = np.zeros(3, dtype=np.int64)
-        self._library.stlc_gap(self._at, signal, out.ctypes.data)
+        self.library.stlc_gap(self.at, signal, out.ctypes.data)
         return Gap(*out.tolist())
-
-    def look(self, rule: int, starts: range, after: After) -> JudgedInstants:
-        """Bounds and verdicts at consecutive instants that are not counted, over all that may follow."""
-        out = np.zeros((len(starts), 4))
-        if starts:
-            copy = self._state.copy()
-            place, where = copy.ctypes.data, out.ctypes.data
-            self._library.stlc_place(place, self._program)
-            clip = after == "clipped"
-            self._library.stlc_look(place, rule, _STEPS[after], clip, starts.start, len(starts), where)
-        return JudgedInstants.of(out, self._watching.tolerance)
 
 
 def _flat(row: Any) -> list[int]:
     return [number for each in row for number in (_flat(each) if isinstance(each, tuple) else (each,))]
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Streamed:
+    """A requirement in a kernel, with its number there."""
+
+    asked: Asked
+    kernel: StreamKernel
+    number: int
+
+    @property
+    def tally(self) -> RequirementSummary:
+        """Summary of the counted starts."""
+        (instants, holds, fails, low_at, high_at), (low, high, *_) = self._counted()
+        return RequirementSummary(instants, holds, fails, low, high, low_at, high_at, self.asked.begin)
+
+    def _counted(self) -> tuple[list[int], list[float]]:
+        """Counts, the least bounds, and bounds at the start that was counted last."""
+        counts, bounds = np.zeros(5, dtype=np.int64), np.zeros(6)
+        kernel = self.kernel
+        kernel.library.stlc_tally(kernel.at, self.number, counts.ctypes.data, bounds.ctypes.data)
+        return counts.tolist(), bounds.tolist()
+
+    @property
+    def news(self) -> dict[int, Status]:
+        """Starts that the latest sample decided, in order, and their verdicts."""
+        call, at = self.kernel.library.stlc_news, self.kernel.at
+        starts, truths = np.zeros((2, call(at, self.number, None, None)), dtype=np.int64)
+        call(at, self.number, starts.ctypes.data, truths.ctypes.data)
+        found = sorted(zip(starts.tolist(), truths.tolist(), strict=True))
+        return {start: "satisfied" if truth == 2 else "violated" for start, truth in found}
+
+    def live(self, starts: range) -> JudgedInstants:
+        """Bounds and verdicts at starts while the trace continues; at most the first of them is counted."""
+        counted = starts.start < self.tally.next
+        out = self._look(starts[counted:], _GROWING if self.asked.ending == "truncate" else _OPEN)
+        return self.asked.judged(np.concatenate([[self._counted()[1][2:]], out]) if counted else out)
+
+    def ended(self, starts: range) -> JudgedInstants:
+        """Bounds and verdicts at starts that are not counted, once the trace has ended."""
+        asked, cut = self.asked, self.asked.ending == "truncate"
+        out = self._look(starts, _CLIPPED if cut else _ENDED)
+        if cut and (outside := beyond(asked.rule, starts, self.kernel.samples, asked.horizon)).any():
+            other = self._look(starts, _GROWING)[outside]
+            out[outside, ::2] = np.minimum(out[outside, ::2], other[:, ::2])
+            out[outside, 1::2] = np.maximum(out[outside, 1::2], other[:, 1::2])
+        return asked.judged(out)
+
+    def _look(self, starts: range, after: int) -> Floats:
+        """Bounds at consecutive instants that are not counted, over all that may follow, (instants, 4)."""
+        out, kernel = np.zeros((len(starts), 4)), self.kernel
+        if starts:
+            copy = kernel.state.copy()
+            place, where, clip = copy.ctypes.data, out.ctypes.data, after == _CLIPPED
+            kernel.library.stlc_place(place, kernel.program)
+            kernel.library.stlc_look(place, self.number, after, clip, starts.start, len(starts), where)
+        return out
+
+
+def streamed_rule(asked: Asked, signals: Sequence[str]) -> Rule | None:
+    """Return the requirement of a kernel; None if it has no transducers."""
+    values, deciding = (_in_windows(each, asked) for each in (asked.rule, asked.deciding))
+    if values is None or deciding is None or (asked.everywhere and endless(values)):
+        return None
+    rule = Rule(values, deciding, asked.lag)
+    try:
+        streams_of([rule], signals, cut=False)
+    except Untranslatable:
+        return None
+    return rule
+
+
+def _in_windows(rule: CompiledRequirement, asked: Asked) -> ir.Formula | None:
+    """Formula that has the value of a requirement at its starts, without windows to a moving end.
+
+    `end` is that of the planning window, some samples after each instant. None is returned where the formula
+    would have another value: `end` occurs inside another temporal operator or in `sweep` (motion between
+    samples), or a bounded window extends beyond `end`.
+    """
+    window = window_of(rule, asked.horizon)
+
+    def moved(part: ir.Formula) -> ir.Formula:
+        if isinstance(part, ir.BoolOp):
+            return map_children(part, formulas=moved)
+        if window is None:
+            return part.body if isinstance(part, ir.AtStart) and not asked.begin else part
+        if isinstance(part, (ir.Temporal, ir.Until)) and part.window.hi is None and part.window.lo <= window:
+            return replace(part, window=ir.Window(part.window.lo, window))
+        return part
+
+    found = moved(rule.formula)
+    return None if window is not None and (uses_end(found) or reach(found).future > window) else found

@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from stlc.compile.backends.c.streams import Rule, streams_of
-from stlc.compile.backends.numbers import Untranslatable
-from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import endless
-from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE, Status
 from stlc.diagnostics import Diagnostic, TraceError, usage
 from stlc.monitor.explain.report import Cause
-from stlc.monitor.instants import At, beyond, check_length, starts_of, window_of
+from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import unknown_requirement
 from stlc.monitor.online.history import ColumnHistory, Floats
-from stlc.monitor.online.kernel import After, Starts, StreamKernel, Watching
-from stlc.monitor.online.recompute import RecomputeTracker, require_bounded, without_end
-from stlc.monitor.online.tally import Flags, JudgedInstants, RequirementSummary
-from stlc.monitor.online.trace_buffer import TraceBuffer, Worst
-from stlc.monitor.signals import Gap, Need, arrange, needs_of
+from stlc.monitor.online.kernel import Streamed, StreamKernel, streamed_rule
+from stlc.monitor.online.recompute import Recomputed
+from stlc.monitor.online.tally import Asked, RequirementSummary
+from stlc.monitor.online.trace_buffer import TraceBuffer
+from stlc.monitor.signals import Gap, arrange, needs_of
 from stlc.monitor.values import Ends, decisive
 from stlc.trace import Trace
 
@@ -81,186 +77,6 @@ class How:
     reasons: bool = False
 
 
-@final
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """Requirement to watch.
-
-    Attributes:
-        rule: the requirement.
-        deciding: the requirement whose robustness decides the verdict; mostly `rule`.
-        begin: the first start.
-        everywhere: whether every later sample is a start, too.
-        horizon: length of a planning window in steps; None if unknown.
-        ending: whether the end of the trace cuts windows.
-        tolerance: as in `How`.
-    """
-
-    rule: CompiledRequirement
-    deciding: CompiledRequirement
-    begin: int
-    everywhere: bool
-    horizon: int | None
-    ending: Ends
-    tolerance: float
-
-    @property
-    def lag(self) -> int:
-        """Samples after a start until its windows are complete."""
-        if not self.everywhere:
-            return 0
-        return (self.horizon or 0) if self.rule.windowed else self.rule.reach
-
-    def streamed(self, signals: Sequence[str]) -> Rule | None:
-        """The requirement of a kernel; None if it has no transducers."""
-        values, deciding = (
-            _in_windows(each, self.horizon, self.begin) for each in (self.rule, self.deciding)
-        )
-        if values is None or deciding is None or (self.everywhere and endless(values)):
-            return None
-        rule = Rule(values, deciding, self.lag)
-        try:
-            streams_of([rule], signals, cut=False)
-        except Untranslatable:
-            return None
-        return rule
-
-
-def _in_windows(rule: CompiledRequirement, horizon: int | None, begin: int) -> ir.Formula | None:
-    """Formula that has the value of a requirement at its starts, without windows to a moving end."""
-    formula, window = rule.formula, window_of(rule, horizon)
-    if window is not None:
-        return without_end(formula, window)
-
-    def first(part: ir.Formula) -> ir.Formula:
-        if isinstance(part, ir.AtStart):
-            return part.body
-        return map_children(part, formulas=first) if isinstance(part, ir.BoolOp) else part
-
-    return formula if begin else first(formula)
-
-
-@final
-@dataclass(frozen=True, slots=True)
-class Streamed:
-    """A requirement in a kernel, with its number there."""
-
-    asked: Asked
-    kernel: StreamKernel
-    number: int
-
-    @property
-    def tally(self) -> RequirementSummary:
-        """Summary of the counted starts."""
-        return self.kernel.tally(self.number)
-
-    @property
-    def news(self) -> dict[int, Status]:
-        """Starts that the latest sample decided, in order, and their verdicts."""
-        return self.kernel.news(self.number)
-
-    def live(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at starts while the trace continues; at most the first of them is counted."""
-        counted = starts.start < self.tally.next
-        rest = starts[1:] if counted else starts
-        found = self._look(rest, "growing" if self.asked.ending == "truncate" else "open")
-        return self.kernel.last(self.number).followed_by(found) if counted else found
-
-    def ended(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at starts that are not counted, once the trace has ended."""
-        if self.asked.ending != "truncate":
-            return self._look(starts, "ended")
-        found = self._look(starts, "clipped")
-        outside = beyond(self.asked.rule, starts, self.kernel.samples, self.asked.horizon)
-        return found.widened(outside, self._look(starts, "growing")) if outside.any() else found
-
-    def _look(self, starts: range, after: After) -> JudgedInstants:
-        return self.kernel.look(self.number, starts, after)
-
-
-@final
-@dataclass(slots=True)
-class Recomputed:
-    """A requirement that is evaluated anew after each sample.
-
-    Attributes:
-        asked: the requirement.
-        tally: as of `Streamed`.
-        news: as of `Streamed`.
-    """
-
-    asked: Asked
-    tally: RequirementSummary
-    news: dict[int, Status] = field(default_factory=dict)
-    _values: RecomputeTracker = field(init=False)
-    _truths: RecomputeTracker | None = None
-    _decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-
-    def __post_init__(self) -> None:
-        asked = self.asked
-        require_bounded(asked.rule, window_of(asked.rule, asked.horizon), everywhere=asked.everywhere)
-        self._values = RecomputeTracker(asked.rule, asked.horizon, asked.ending)
-        if asked.deciding is not asked.rule:
-            self._truths = RecomputeTracker(asked.deciding, asked.horizon, asked.ending)
-
-    @property
-    def over(self) -> bool:
-        """True if the requirement is evaluated only once, and its verdict is final."""
-        return not self.asked.everywhere and self.tally.instants > 0
-
-    def take(self, history: ColumnHistory) -> None:
-        """Take new samples: decide starts, and count those whose windows are complete."""
-        self.news = {}
-        if not self.over and self._values.due(history.samples):
-            self.grow(history)
-            starts = self.pending
-            judged = self.live(starts)
-            known = judged.holds | judged.fails
-            new = known.copy()
-            new[: len(self._decided)] &= ~self._decided
-            for i in np.flatnonzero(new).tolist():
-                self.news[starts[i]] = "violated" if judged.fails[i] else "satisfied"
-            settled = min(self._values.settled, self._values.samples - self.asked.lag)
-            count = min(max(settled - starts.start, 0), len(starts))
-            self.tally.add(judged, count)
-            self._decided = known[count:]
-
-    def grow(self, history: ColumnHistory) -> None:
-        """Take new samples without a look at the starts."""
-        for tracker in filter(None, (self._values, self._truths)):
-            tracker.grow(history.columns(), history.first, history.samples)
-
-    @property
-    def pending(self) -> range:
-        """Starts that are not counted."""
-        samples = self._values.samples
-        return range(
-            self.tally.next, samples if self.asked.everywhere else min(self.tally.first + 1, samples)
-        )
-
-    @property
-    def needs(self) -> int:
-        """The first sample that is still read, by the verdicts of the latest sample, too."""
-        starts = [*self.news] if self.over else [self.tally.next, *self.news]
-        return min(map(self._values.needs, starts), default=self._values.samples)
-
-    def live(self, starts: range) -> JudgedInstants:
-        """Return what `Streamed.live` does."""
-        return self._judged(starts, RecomputeTracker.live)
-
-    def ended(self, starts: range) -> JudgedInstants:
-        """Return what `Streamed.ended` does."""
-        return self._judged(starts, RecomputeTracker.ended)
-
-    def _judged(
-        self, starts: range, bounds: Callable[[RecomputeTracker, range], tuple[Floats, Floats]]
-    ) -> JudgedInstants:
-        if not starts:
-            return JudgedInstants.of(np.zeros((0, 4)), 0.0)
-        parts = [*bounds(self._values, starts), *bounds(self._truths or self._values, starts)]
-        return JudgedInstants.of(np.concatenate(parts, axis=1), self.asked.tolerance)
-
-
 Watched: TypeAlias = Streamed | Recomputed
 """A requirement and its running verdict.
 
@@ -287,11 +103,11 @@ class Online:
         """Names of the signals, in the order of a row."""
         self.asked = [self._ask(rule) for rule in rules]
         """The requirements, and where they are evaluated."""
+        self._history = ColumnHistory()
         asked = self.asked + [self._ask(rule, once=True) for rule in compiled.assumptions]
         self._kernel, watched = self._watch(asked)
         self._watched, self._scope = watched[: len(rules)], watched[len(rules) :]
         self._recomputed = [each for each in watched if isinstance(each, Recomputed)]
-        self._history = ColumnHistory()
         self._gaps: dict[str, Gap] = {}
         self._buffer = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
         self._plain = self._kernel is not None and not self._recomputed and self._buffer is None
@@ -310,18 +126,13 @@ class Online:
 
     def _watch(self, asked: Sequence[Asked]) -> tuple[StreamKernel | None, list[Watched]]:
         """Kernel of all requirements that have transducers, and what watches each requirement."""
-        streamed = {
-            i: rule for i, each in enumerate(asked) if (rule := each.streamed(self.signals)) is not None
-        }
-        starts = [Starts(asked[i].begin, asked[i].everywhere) for i in streamed]
-        watching = Watching(starts, self.how.tolerance, self.how.end == "truncate")
-        kernel = StreamKernel.of(list(streamed.values()), self.signals, watching) if streamed else None
-        numbers = {i: number for number, i in enumerate(streamed)} if kernel is not None else {}
+        rules = [streamed_rule(each, self.signals) for each in asked]
+        streamed = [each for each, rule in zip(asked, rules, strict=True) if rule]
+        kernel = StreamKernel.of(streamed, [*filter(None, rules)], self.signals) if streamed else None
+        numbers = count()
         return kernel, [
-            Streamed(each, kernel, numbers[i])
-            if kernel is not None and i in numbers
-            else Recomputed(each, RequirementSummary(low_at=each.begin, high_at=each.begin, first=each.begin))
-            for i, each in enumerate(asked)
+            Streamed(each, kernel, next(numbers)) if kernel and rule else Recomputed(each, self._history)
+            for each, rule in zip(asked, rules, strict=True)
         ]
 
     def push(self, sample: Sequence[float] | Sample) -> int:
@@ -340,9 +151,19 @@ class Online:
             return self._kernel.push(row) if self._plain else self.push_block([row])[0]  # type: ignore[union-attr]
         except (KeyError, TypeError, ValueError, OverflowError):
             pass
-        if isinstance(sample, Mapping):
-            return self.push_block([[_number(sample, need) for need in self._needs]])[0]
-        raise self._no_row() from None
+        if not isinstance(sample, Mapping):
+            raise self._no_row() from None
+        huge = (k for k, each in sample.items() if isinstance(each, int) and abs(each) >= _BEYOND_FLOATS)
+        given = {name: [each] for name, each in {**sample, **dict.fromkeys(huge, math.inf)}.items()}
+        numbers = []
+        for need in self._needs:
+            laid = arrange(given, [need], plain=True)
+            if laid.samples != 1 or laid.shape:
+                message = f"`{need.column.name}` is one number of a sample, and several are given"
+                note = (f"needed by: {', '.join(need.by)}",)
+                raise TraceError(Diagnostic("E605", message, need.span, note=note))
+            numbers.append(laid.env[need.column.name][0, 0])
+        return self.push_block([numbers])[0]
 
     def _no_row(self) -> TraceError:
         message = f"a sample is one number for each of {', '.join(self.signals)}"
@@ -365,14 +186,20 @@ class Online:
         decided, taken = 0, len(rows)
         if self._kernel is not None:
             decided, taken = self._kernel.push_block(rows, pause=pause)
+        columns = {name: rows[:taken, i : i + 1] for i, name in enumerate(self.signals)}
+        columns = columns or {"": np.zeros((taken, 1))}
         if self._recomputed:
-            self._store(rows)
+            if self._kernel is None:
+                for name in self.signals:
+                    unknown = np.isnan(columns[name])
+                    self._gaps[name] = self._gaps.get(name, Gap()).with_more(unknown, self._history.samples)
+            self._history.take(columns)
             for each in self._recomputed:
-                each.take(self._history)
+                each.take()
                 decided += len(each.news)
             self._history.forget(min(each.needs for each in self._recomputed))
         if self._buffer is not None:
-            self._buffer.take(self._columns(rows[:taken]), taken)
+            self._buffer.take(columns)
             if self._buffer.full:
                 found = [(watched.asked.rule, self._worst(watched)) for watched in self._watched]
                 self._buffer.forget([(rule, worst) for rule, worst in found if worst is not None])
@@ -393,19 +220,6 @@ class Online:
         laid = arrange(signals, self._needs, plain=True)
         columns = [np.asarray(laid.env[name]).reshape(-1) for name in self.signals]
         return np.stack(columns, axis=1) if columns else np.zeros((laid.samples, 0))
-
-    def _store(self, rows: Floats) -> None:
-        """Store samples, (count, signals), for requirements that are evaluated anew."""
-        columns = self._columns(rows)
-        if self._kernel is None:
-            for name in self.signals:
-                unknown = np.isnan(columns[name])
-                self._gaps[name] = self._gaps.get(name, Gap()).with_more(unknown, self._history.samples)
-        self._history.take(columns, len(rows))
-
-    def _columns(self, rows: Floats) -> dict[str, Floats]:
-        found = {name: rows[:, i : i + 1] for i, name in enumerate(self.signals)}
-        return found or {"": np.zeros((len(rows), 1))}
 
     def verdicts(self) -> tuple[Decision, ...]:
         """Verdicts that the latest sample decided, in the order of the requirements."""
@@ -460,7 +274,7 @@ class Online:
         There is one triple (sample, least robustness, greatest robustness) for each such sample.
         """
         watched = self._find(name)
-        starts = self._pending(watched)
+        starts = watched.asked.starts(watched.tally.next, self.samples)
         judged = watched.live(starts)
         return list(zip(starts, judged.low.tolist(), judged.high.tolist(), strict=True))
 
@@ -474,12 +288,6 @@ class Online:
             raise usage(f"`{name}` is not open at sample {start}")
         return found[start]
 
-    def _pending(self, watched: Watched) -> range:
-        if isinstance(watched, Recomputed):
-            watched.grow(self._history)
-        first, begin = watched.tally.next, watched.asked.begin
-        return range(first, self.samples if watched.asked.everywhere else min(begin + 1, self.samples))
-
     def standing(self, name: str) -> RequirementSummary:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.
 
@@ -488,8 +296,9 @@ class Online:
         return self._standing(self._find(name))
 
     def _standing(self, watched: Watched) -> RequirementSummary:
-        starts = self._pending(watched)
-        return watched.tally.with_more(watched.live(starts)) if starts else watched.tally
+        tally = watched.tally
+        starts = watched.asked.starts(tally.next, self.samples)
+        return tally.with_more(watched.live(starts)) if starts else tally
 
     @property
     def in_scope(self) -> bool | None:
@@ -521,18 +330,16 @@ class Online:
 
     def _ended(self, watched: Watched) -> RequirementSummary:
         """Summary of a requirement if the trace ends now."""
-        if isinstance(watched, Recomputed):
-            watched.grow(self._history)
         starts, tally = self._starts(watched), watched.tally
         rest = range(min(tally.next, starts.stop), starts.stop)
         return tally.with_more(watched.ended(rest)) if rest else tally
 
-    def _worst(self, watched: Watched) -> Worst | None:
-        """Worst violation of a requirement if the trace ended now; None if it would not be violated."""
+    def _worst(self, watched: Watched) -> RequirementSummary | None:
+        """Summary of a requirement if the trace ended now; None if it would not be violated."""
         if not self.samples or (isinstance(self.how.at, int) and self.how.at >= self.samples):
             return None
         tally = self._ended(watched)
-        return Worst(tally.high_at, tally.high) if tally.fails else None
+        return tally if tally.fails else None
 
     def cause(self, name: str) -> Cause | None:
         """Return the cause of the worst violation of a requirement up to now.
@@ -552,17 +359,3 @@ class Online:
             if watched.asked.rule.name == name:
                 return watched
         raise unknown_requirement(name, list(self.requirements))
-
-
-def _number(sample: Sample, need: Need) -> float:
-    """Return the value of a signal in a sample; `q[0]` is the first component of a vector `q`."""
-    value = sample.get(need.column.name)
-    if isinstance(value, float):
-        return value
-    if isinstance(value, int):
-        return float(value) if abs(value) < _BEYOND_FLOATS else math.inf
-    laid = arrange({name: [each] for name, each in sample.items()}, [need], plain=True)
-    if laid.samples != 1 or laid.shape:
-        message = f"`{need.column.name}` is one number of a sample, and several are given"
-        raise TraceError(Diagnostic("E605", message, need.span, note=(f"needed by: {', '.join(need.by)}",)))
-    return float(laid.env[need.column.name][0, 0])

@@ -7,19 +7,22 @@ whose end moves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias, final
 
 import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import endless, farthest, history, reach, uses_end
-from stlc.compile.ir.traverse import map_children, numbers, operands
+from stlc.compile.ir.support import endless, farthest, history
+from stlc.compile.ir.traverse import numbers, operands
 from stlc.compile.pipeline import CompiledRequirement
+from stlc.compile.semantics.tolerance import Status
 from stlc.diagnostics import Diagnostic, UsageError
 from stlc.monitor.instants import cut_bounds, growing_bounds, rule_bounds, window_of
-from stlc.monitor.online.history import Floats
+from stlc.monitor.online.history import ColumnHistory, Floats
+from stlc.monitor.online.tally import Asked, Flags, JudgedInstants, RequirementSummary
 from stlc.monitor.prefix_bounds import own_span, prefix_bound, with_seen
 from stlc.monitor.values import Ends, Record
 
@@ -32,86 +35,149 @@ _FROZEN = 500
 _NARROW = 1 << 13
 """Samples that are evaluated anew after each new one; more of them when an eighth is new."""
 
+Columns: TypeAlias = Mapping[str, Floats]
+"""Signal -> its stored samples, (samples, traces)."""
 
-@dataclass(slots=True)
-class RecomputeTracker:
-    """Bounds on a requirement at instants of a growing trace, from all samples that it reads.
+
+@final
+@dataclass(frozen=True, slots=True)
+class GrowingBounds:
+    """Bounds on a requirement at instants of a growing trace, from samples that include all that it reads.
 
     Attributes:
         rule: the requirement.
         horizon: length of a planning window in steps; None if unknown.
         ending: whether the end of the trace cuts windows.
-        samples: number of samples received.
     """
 
     rule: CompiledRequirement
     horizon: int | None
     ending: Ends
-    samples: int = 0
-    window: int | None = field(init=False)
-    _first: int = 0
-    _signals: Mapping[str, Floats] = field(default_factory=dict)
-    _bounds: tuple[ir.Formula, ir.Formula] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.window, cut = window_of(self.rule, self.horizon), self.ending == "truncate"
-        formula = self.rule.formula
-        self._bounds = formula, formula
-        if self.window is None or cut:
-            self._bounds = prefix_bound(formula, "lower", cut=cut), prefix_bound(formula, "upper", cut=cut)
 
     @property
-    def settled(self) -> int:
-        """The first instant at which a later sample may change the value."""
-        if self.window is None and endless(self.rule.formula):
-            return 0
-        ahead = self.rule.reach if self.window is None else self.window
+    def _window(self) -> int | None:
+        return window_of(self.rule, self.horizon)
+
+    @property
+    def _lasting(self) -> bool:
+        return self._window is None and endless(self.rule.formula)
+
+    def settled(self, samples: int) -> int:
+        """The first instant at which a sample after `samples` of them may change the value."""
+        ahead = self.rule.reach if self._window is None else self._window
         later = max((farthest(num).future for num in numbers(self.rule.formula)), default=0)
-        return max(self.samples - ahead - later, 0)
+        return 0 if self._lasting else max(samples - ahead - later, 0)
 
     def needs(self, start: int) -> int:
         """The first sample that instants from `start` on read."""
-        lasting = self.rule.absolute or (self.window is None and endless(self.rule.formula))
-        return 0 if lasting else max(start - history(self.rule.formula), 0)
+        return 0 if self.rule.absolute or self._lasting else max(start - history(self.rule.formula), 0)
 
-    def due(self, samples: int) -> bool:
-        """True if the requirement is to be evaluated now that `samples` samples were received."""
-        return samples - self._first <= _NARROW or samples >= self.samples + (samples - self._first) // 8
-
-    def grow(self, signals: Mapping[str, Floats], first: int, samples: int) -> None:
-        """Take the samples from `first` on, (stored, traces) each; there are `samples` now."""
-        self._signals, self._first, self.samples = signals, first, samples
-
-    def live(self, starts: range) -> tuple[Floats, Floats]:
+    def live(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
         """Least and greatest robustness over all continuations, (instants, traces) each."""
-        middle = starts.start if self.ending == "open" else min(max(self.settled, starts.start), starts.stop)
-        known, rest, parts = range(starts.start, middle), range(middle, starts.stop), []
-        if known:
-            record = Record.of(self._signals, NUMPY)
-            parts.append(cut_bounds(self.rule, record, self._shifted(known), self.horizon, "truncate"))
-        if rest:
-            record = Record.of(with_seen(self._signals), NUMPY)
-            parts.append(growing_bounds(*self._bounds, record, self._shifted(rest), self.window))
+        window, cut, formula, parts = self._window, self.ending == "truncate", self.rule.formula, []
+        record = Record.of(with_seen(signals), NUMPY)
+        middle = min(max(self.settled(record.samples), starts.start), starts.stop) if cut else starts.start
+        if known := range(starts.start, middle):
+            parts.append(cut_bounds(self.rule, record, known, self.horizon, "truncate"))
+        if rest := range(middle, starts.stop):
+            lower = upper = formula
+            if window is None or cut:
+                lower, upper = (prefix_bound(formula, end, cut=cut) for end in ("lower", "upper"))
+            parts.append(growing_bounds(lower, upper, record, rest, window))
         low, high = (np.concatenate(ends) for ends in zip(*parts, strict=True))
         return low, high
 
-    def ended(self, starts: range) -> tuple[Floats, Floats]:
+    def ended(self, signals: Columns, starts: range) -> tuple[Floats, Floats]:
         """Bounds if the trace ends with the last sample, (instants, traces) each."""
-        record = Record.of(self._signals, NUMPY)
-        low, high = rule_bounds(self.rule, record, self._shifted(starts), self.horizon, self.ending)
+        low, high = rule_bounds(self.rule, Record.of(signals, NUMPY), starts, self.horizon, self.ending)
         return np.asarray(low), np.asarray(high)
 
-    def _shifted(self, starts: range) -> range:
-        return range(starts.start - self._first, starts.stop - self._first)
+
+@final
+@dataclass(slots=True)
+class Recomputed:
+    """A requirement that is evaluated anew after each sample.
+
+    Attributes:
+        asked: the requirement.
+        tally: as of `Streamed`.
+        news: as of `Streamed`.
+    """
+
+    asked: Asked
+    _history: ColumnHistory
+    tally: RequirementSummary = field(init=False)
+    news: dict[int, Status] = field(default_factory=dict)
+    _values: GrowingBounds = field(init=False)
+    _looked: int = 0
+    _decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+
+    def __post_init__(self) -> None:
+        asked = self.asked
+        _require_bounded(asked)
+        self.tally = RequirementSummary(low_at=asked.begin, high_at=asked.begin, first=asked.begin)
+        self._values = GrowingBounds(asked.rule, asked.horizon, asked.ending)
+
+    @property
+    def _over(self) -> bool:
+        """True if the requirement is evaluated only once, and its verdict is final."""
+        return not self.asked.everywhere and self.tally.instants > 0
+
+    def take(self) -> None:
+        """Take new samples: decide starts, and count those whose windows are complete."""
+        self.news = {}
+        samples = self._history.samples
+        stored = samples - self._history.first
+        if self._over or (stored > _NARROW and samples < self._looked + stored // 8):
+            return
+        self._looked, starts = samples, self.asked.starts(self.tally.next, samples)
+        judged = self.live(starts)
+        known = judged.holds | judged.fails
+        new = known.copy()
+        new[: len(self._decided)] &= ~self._decided
+        for i in np.flatnonzero(new).tolist():
+            self.news[starts[i]] = "violated" if judged.fails[i] else "satisfied"
+        settled = min(self._values.settled(samples), samples - self.asked.lag)
+        count = min(max(settled - starts.start, 0), len(starts))
+        self.tally = self.tally.with_more(judged, count)
+        self._decided = known[count:]
+
+    @property
+    def needs(self) -> int:
+        """The first sample that is still read, by the verdicts of the latest sample, too."""
+        starts = [*self.news] if self._over else [self.tally.next, *self.news]
+        return min(map(self._values.needs, starts), default=self._history.samples)
+
+    def live(self, starts: range) -> JudgedInstants:
+        """Return what `Streamed.live` does."""
+        return self._judged(starts, GrowingBounds.live)
+
+    def ended(self, starts: range) -> JudgedInstants:
+        """Return what `Streamed.ended` does."""
+        return self._judged(starts, GrowingBounds.ended)
+
+    def _judged(
+        self, starts: range, bounds: Callable[[GrowingBounds, Columns, range], tuple[Floats, Floats]]
+    ) -> JudgedInstants:
+        if not starts:
+            return self.asked.judged(np.zeros((0, 4)))
+        first, signals, asked = self._history.first, self._history.columns(), self.asked
+        there = range(starts.start - first, starts.stop - first)
+        values = truths = bounds(self._values, signals, there)
+        if asked.deciding is not asked.rule:
+            truths = bounds(GrowingBounds(asked.deciding, asked.horizon, asked.ending), signals, there)
+        return asked.judged(np.concatenate([*values, *truths], axis=1))
 
 
-def require_bounded(rule: CompiledRequirement, window: int | None, *, everywhere: bool) -> None:
-    """Check the work of one evaluation; `window` is the length of a planning window whose end moves.
+def _require_bounded(asked: Asked) -> None:
+    """Check the work of one evaluation.
 
     Raises:
         UsageError: E313, every instant reads too many values in a `freeze`, which no other instant reads.
     """
-    many = _span(rule.formula) + (window or 0) if everywhere or endless(rule.formula) else 1
+    rule, many = asked.rule, 1
+    if asked.everywhere or endless(rule.formula):
+        many = _span(rule.formula) + (window_of(rule, asked.horizon) or 0)
     work, heaviest = _own(rule.formula, many)
     if work > MOST:
         what = f"every instant keeps values of its own, and {work:,} samples to look at"
@@ -134,22 +200,3 @@ def _own(formula: ir.Formula, instants: int) -> tuple[int, ir.Formula]:
     return max(
         (_own(part, inner) for part in operands(formula)), key=lambda own: own[0], default=(0, formula)
     )
-
-
-def without_end(formula: ir.Formula, window: int) -> ir.Formula | None:
-    """Return the formula with bounded windows in place of its windows up to `end`.
-
-    `end` is the end of the planning window, `window` samples after each instant. None is returned where the
-    bounded formula would have another value: `end` occurs inside another temporal operator or in `sweep`
-    (motion between samples), or a bounded window extends beyond `end`.
-    """
-
-    def ended(part: ir.Formula) -> ir.Formula:
-        if isinstance(part, ir.BoolOp):
-            return map_children(part, formulas=ended)
-        if isinstance(part, (ir.Temporal, ir.Until)) and part.window.hi is None and part.window.lo <= window:
-            return replace(part, window=ir.Window(part.window.lo, window))
-        return part
-
-    moved = ended(formula)
-    return None if uses_end(moved) or reach(moved).future > window else moved

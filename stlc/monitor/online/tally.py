@@ -1,18 +1,66 @@
-"""Running summary of a requirement over instants: verdict, least robustness and where it occurs."""
+"""Requirements to watch, and running summaries of them: verdict, least robustness and where it occurs."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status, satisfied, status_of, violated
+from stlc.monitor.instants import window_of
 from stlc.monitor.online.history import Floats
+from stlc.monitor.values import Ends
 
 Flags = NDArray[np.bool_]
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Requirement to watch.
+
+    Attributes:
+        rule: the requirement.
+        deciding: the requirement whose robustness decides the verdict; mostly `rule`.
+        begin: the first start.
+        everywhere: whether every later sample is a start, too.
+        horizon: length of a planning window in steps; None if unknown.
+        ending: whether the end of the trace cuts windows.
+        tolerance: a requirement is satisfied if its robustness is at least minus this value.
+    """
+
+    rule: CompiledRequirement
+    deciding: CompiledRequirement
+    begin: int
+    everywhere: bool
+    horizon: int | None
+    ending: Ends
+    tolerance: float
+
+    @property
+    def window(self) -> int | None:
+        """Length of a planning window whose end moves; None without one."""
+        return window_of(self.rule, self.horizon)
+
+    @property
+    def lag(self) -> int:
+        """Samples after a start until its windows are complete."""
+        if not self.everywhere:
+            return 0
+        return (self.horizon or 0) if self.rule.windowed else self.rule.reach
+
+    def starts(self, first: int, samples: int) -> range:
+        """Starts from `first` on in a trace of `samples` samples."""
+        return range(first, samples if self.everywhere else min(self.begin + 1, samples))
+
+    def judged(self, bounds: Floats) -> JudgedInstants:
+        """Verdicts from bounds on the robustness and on that which decides, (instants, 4)."""
+        low, high, least, most = bounds.T
+        return JudgedInstants(low, high, satisfied(least, self.tolerance), violated(most, self.tolerance))
 
 
 class JudgedInstants(NamedTuple):
@@ -26,24 +74,9 @@ class JudgedInstants(NamedTuple):
     holds: Flags
     fails: Flags
 
-    @staticmethod
-    def of(bounds: Floats, tolerance: float) -> JudgedInstants:
-        """From bounds on the robustness and on that which decides, (instants, 4)."""
-        low, high, least, most = bounds.T
-        return JudgedInstants(low, high, satisfied(least, tolerance), violated(most, tolerance))
 
-    def followed_by(self, other: JudgedInstants) -> JudgedInstants:
-        """These instants, then those of `other`."""
-        return JudgedInstants(*(np.concatenate(both) for both in zip(self, other, strict=True)))
-
-    def widened(self, where: Flags, other: JudgedInstants) -> JudgedInstants:
-        """Bounds and verdicts that hold for both at the instants `where`."""
-        low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
-        both = JudgedInstants(low, high, self.holds & other.holds, self.fails & other.fails)
-        return JudgedInstants(*(np.where(where, a, b) for a, b in zip(both, self, strict=True)))
-
-
-@dataclass(slots=True)
+@final
+@dataclass(frozen=True, slots=True)
 class RequirementSummary:
     """Summary of a requirement at consecutive instants of one trace.
 
@@ -68,29 +101,28 @@ class RequirementSummary:
     high_at: int = 0
     first: int = 0
 
-    def add(self, judged: JudgedInstants, count: int) -> None:
-        """Add the first `count` instants of `judged`; they must follow the instants already counted."""
-        if not count:
-            return
-        low, high = int(np.argmin(judged.low[:count])), int(np.argmin(judged.high[:count]))
-        if judged.low[low] < self.low:
-            self.low, self.low_at = float(judged.low[low]), self.next + low
-        if judged.high[high] < self.high:
-            self.high, self.high_at = float(judged.high[high]), self.next + high
-        self.holds += int(np.count_nonzero(judged.holds[:count]))
-        self.fails += int(np.count_nonzero(judged.fails[:count]))
-        self.instants += count
+    def with_more(self, judged: JudgedInstants, count: int | None = None) -> RequirementSummary:
+        """Return a copy with the first `count` instants (None: all), which follow those already counted."""
+        low, high, holds, fails = (part[:count] for part in judged)
+        if not len(low):
+            return self
+        found = replace(
+            self,
+            instants=self.instants + len(low),
+            holds=self.holds + int(np.count_nonzero(holds)),
+            fails=self.fails + int(np.count_nonzero(fails)),
+        )
+        least, most = int(np.argmin(low)), int(np.argmin(high))
+        if low[least] < self.low:
+            found = replace(found, low=float(low[least]), low_at=self.next + least)
+        if high[most] < self.high:
+            found = replace(found, high=float(high[most]), high_at=self.next + most)
+        return found
 
     @property
     def next(self) -> int:
         """The instant after the last counted one."""
         return self.first + self.instants
-
-    def with_more(self, judged: JudgedInstants) -> RequirementSummary:
-        """Return a copy to which the instants of `judged` are added."""
-        more = replace(self)
-        more.add(judged, len(judged.low))
-        return more
 
     @property
     def status(self) -> Status:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,19 +20,13 @@ from stlc.monitor.explain.report import Cause, cause_of
 from stlc.monitor.instants import rule_bounds, window_of
 from stlc.monitor.judgement import RequirementVerdict
 from stlc.monitor.online.history import ColumnHistory, Floats
+from stlc.monitor.online.tally import RequirementSummary
 from stlc.monitor.prepared import Part, Prepared
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
 
 _MOST = 1 << 21
 """Fewest numbers stored, at most twice as many; causes are computed before samples are dropped."""
-
-
-class Worst(NamedTuple):
-    """Worst violation: the sample of the evaluation, and the greatest robustness over all continuations."""
-
-    start: int
-    high: float
 
 
 @dataclass(slots=True)
@@ -46,62 +39,56 @@ class TraceBuffer:
     compiled: Compiled
     t0: float
     _history: ColumnHistory = field(default_factory=ColumnHistory)
-    _found: dict[str, tuple[Worst, Cause]] = field(default_factory=dict)
+    _found: dict[tuple[str, int, float], Cause] = field(default_factory=dict)
     _width: int = 1
 
-    def take(self, columns: Mapping[str, Floats], count: int) -> None:
-        """Store `count` samples: arrays (count, 1) by signal name."""
+    def take(self, columns: Mapping[str, Floats]) -> None:
+        """Store samples: arrays (count, 1) by signal name."""
         self._width = len(columns)
-        self._history.take(columns, count)
+        self._history.take(columns)
 
     @property
     def full(self) -> bool:
         """True if the buffer is full, so that `forget` must be called."""
         return (self._history.samples - self._history.first) * self._width > 2 * _MOST
 
-    def forget(self, violations: Iterable[tuple[CompiledRequirement, Worst]]) -> None:
+    def forget(self, violations: Iterable[tuple[CompiledRequirement, RequirementSummary]]) -> None:
         """Drop the older half of the samples; the causes of `violations` are found and stored before."""
         for rule, worst in violations:
-            cause = self.cause(rule, worst)
-            if cause is not None:
-                self._found[rule.name] = worst, cause
+            if cause := self.cause(rule, worst):
+                self._found[rule.name, worst.high_at, worst.high] = cause
         self._history.forget(self._history.samples - _MOST // self._width)
 
-    def cause(self, rule: CompiledRequirement, worst: Worst) -> Cause | None:
-        """Return the cause of the violation `worst` of the requirement `rule`.
+    def cause(self, rule: CompiledRequirement, worst: RequirementSummary) -> Cause | None:
+        """Return the cause of the worst violation of the requirement `rule`, at the instant `worst.high_at`.
 
         None if the samples that show the violation were dropped before `forget` stored the cause.
         """
-        known = self._found.get(rule.name)
-        if known is not None and known[0] == worst:
-            return known[1]
-        excerpt = self._excerpt(rule, worst)
+        if known := self._found.get((rule.name, worst.high_at, worst.high)):
+            return known
+        excerpt = self._excerpt(rule, worst.high_at)
         if excerpt is None:
             return None
         first, start, env = excerpt
-        record = Record.of(env, NUMPY)
-        low, high = rule_bounds(rule, record, range(start, start + 1), self.compiled.grid.horizon, "open")
+        record, grid = Record.of(env, NUMPY), self.compiled.grid
+        low, high = rule_bounds(rule, record, range(start, start + 1), grid.horizon, "open")
         if first and high[0, 0] != worst.high:
             return None
-        dt = self.compiled.grid.dt
-        step = None if dt is None else float(dt)
+        step = None if grid.dt is None else float(grid.dt)
         signals = Signals(env, (), record.samples, NUMPY, dt=step, t0=self.t0 + first * (step or 0.0))
         fails = np.ones((1, 1), dtype=np.bool_)
         subject, part = Prepared(self.compiled, (rule,), signals, record), Part(0, record.samples)
-        cause = cause_of(
-            RequirementVerdict(
-                *(rule, start, low, high, ~fails, fails, (), part, subject.timeline), subject=subject
-            )
-        )
+        judged = (rule, start, low, high, ~fails, fails, (), part, subject.timeline)
+        cause = cause_of(RequirementVerdict(*judged, subject=subject))
         if cause is None:
             return None
         sample = first + cause.sample
         time = float(sample) if step is None else self.t0 + sample * step
         violated = first + cause.violated
-        return replace(cause, start=worst.start, sample=sample, time=time, violated=violated, first=first)
+        return replace(cause, start=worst.high_at, sample=sample, time=time, violated=violated, first=first)
 
-    def _excerpt(self, rule: CompiledRequirement, worst: Worst) -> tuple[int, int, dict[str, Floats]] | None:
-        """Return (first sample, instant to explain, signals) of an excerpt that suffices to explain `worst`.
+    def _excerpt(self, rule: CompiledRequirement, at: int) -> tuple[int, int, dict[str, Floats]] | None:
+        """Return (first sample, instant to explain, signals) of an excerpt that explains a violation at `at`.
 
         The instant is counted from the first sample. None if needed samples were dropped.
         """
@@ -113,10 +100,10 @@ class TraceBuffer:
             reads = _around(rule, formula, horizon)
         lasting = _endless_always(rule, formula)
         if not history.first and (reads is None or lasting):
-            return 0, worst.start, history.columns()
+            return 0, at, history.columns()
         if reads is None:
             return None
-        start, first, stop = worst.start, max(worst.start - reads[0], 0), worst.start + reads[1] + 1
+        start, first, stop = at, max(at - reads[0], 0), at + reads[1] + 1
         if lasting:
             first, stop = history.first, history.samples
             start = max(start, first + reads[0])

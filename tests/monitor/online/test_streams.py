@@ -20,8 +20,9 @@ from stlc.compile.ir.simplify import simplify
 from stlc.compile.pipeline import Compiled
 from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.instants import rule_bounds
-from stlc.monitor.online.online import How, Online, Recomputed, Streamed
-from stlc.monitor.online.recompute import RecomputeTracker
+from stlc.monitor.online.kernel import Streamed
+from stlc.monitor.online.online import How, Online
+from stlc.monitor.online.recompute import GrowingBounds, Recomputed
 from stlc.monitor.prefix_bounds import FAR, lengthened, prefix_bound, with_seen
 from stlc.monitor.values import Record, bounds, decisive
 from stlc.monitor.verdict import Monitor
@@ -67,15 +68,14 @@ def check_stream(formula: ir.Formula, trace: dict[str, np.ndarray], how: How) ->
     """Compare a stream with the evaluator after each sample, and at its end."""
     rule = random_formulas.a_rule(formula)
     online = Online(compiled(), [rule], how)
-    name, values = rule.name, RecomputeTracker(rule, None, "truncate")
+    name, values = rule.name, GrowingBounds(rule, None, "truncate")
     deciding = decisive(rule, how.tolerance, compiled().signature).formula
     everywhere, cut, said = online.repeats(name), how.end == "truncate", {}
     for k in range(len(trace["x"])):
         known = {each: x[: k + 1] for each, x in trace.items()}
         assert online.push({each: x[k, 0] for each, x in known.items()}) == len(online.verdicts())
         starts = range(k + 1 if everywhere else 1)
-        values.grow(known, 0, k + 1)
-        settled = values.settled
+        settled = values.settled(k + 1)
         low, high = so_far(formula, known, starts, settled, cut=cut)
         for decision in online.verdicts():
             assert decision.start not in said

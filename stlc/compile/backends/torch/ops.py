@@ -6,6 +6,7 @@ import operator
 from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache, reduce
+from itertools import pairwise
 from typing import Any, cast, final
 
 import torch
