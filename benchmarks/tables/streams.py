@@ -339,7 +339,7 @@ def memory(sizes: Sizes) -> Parts:
     for formula in (NESTED, ALWAYS, Over("always", (0, sizes.samples // 2), ALWAYS.body)):
         online, wedges = online_of([formula]), wedge_bytes(formula)
         assert online._kernel is not None
-        state = online._kernel._state.nbytes
+        state = online._kernel.state.nbytes
         shown = written(formula)
         note = f"{state:,} bytes, wedges {wedges:,}"
         yield StreamRow("memory", "", shown, 0, "of the wedges' bytes", state / wedges, note=note)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status, satisfied, status_of, violated
-from stlc.monitor.instants import window_of
 from stlc.monitor.online.history import Floats
 from stlc.monitor.values import Ends
 
@@ -40,11 +39,6 @@ class Asked:
     horizon: int | None
     ending: Ends
     tolerance: float
-
-    @property
-    def window(self) -> int | None:
-        """Length of a planning window whose end moves; None without one."""
-        return window_of(self.rule, self.horizon)
 
     @property
     def lag(self) -> int:
