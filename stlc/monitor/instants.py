@@ -20,7 +20,7 @@ from stlc.compile.backends.array.graph import robustness_signal
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined, defined_at
+from stlc.compile.ir.defined import defined_at
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.support import earliest
 from stlc.compile.namespace import Array
@@ -136,7 +136,7 @@ def rule_known(
     """
     window = window_of(rule, horizon)
     if window is None:
-        return np.array(defined(rule.formula, samples)[starts.start : starts.stop], dtype=bool)
+        return np.array([defined_at(rule.formula, samples, range(k, k + 1)) for k in starts], dtype=bool)
     whole = defined_at(rule.formula, window + 1, range(1))
     return np.array([whole and start + window < samples for start in starts], dtype=bool)
 

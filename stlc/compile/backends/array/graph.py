@@ -19,7 +19,7 @@ from stlc.compile.backends.array.steps import ArrayPlan, array_plan
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.backends.schedule import Boundary, End, TraceDomain, spanning
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined_at, undefined
+from stlc.compile.ir.defined import undefined
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import overall
@@ -124,9 +124,9 @@ def planned(
         first, last = instants.start, instants.stop - 1
         raise ValueError(f"instants {first}..{last} of a trace with {samples} samples")
     if end == "strict":
-        for formula in formulas:
-            if not defined_at(formula, samples, instants):
-                raise ValueError(f"the formula looks beyond the end of a trace of {samples} samples")
+        missing = (each for formula in formulas for each in undefined(formula, samples))
+        if any(each.start < instants.stop and instants.start < each.stop for each in missing):
+            raise ValueError(f"the formula looks beyond the end of a trace of {samples} samples")
     run = spanning(instants.start, len(instants))
     return array_plan(formulas, run, domain, Windows(semantics, ops))
 

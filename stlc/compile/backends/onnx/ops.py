@@ -17,7 +17,7 @@ from stlc.compile.backends.numbers import Untranslatable
 from stlc.compile.backends.onnx.graph import BATCH, Attribute, GraphBody, Kind, OnnxGraph, Value, joined
 from stlc.compile.backends.schedule import spanning
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import defined, defined_at
+from stlc.compile.ir.defined import defined
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
 from stlc.compile.namespace import FloatConstants, Ops, Pick, ScanByRows, Sliding
 
@@ -294,7 +294,7 @@ def build_graph(
     samples = len(next(iter(env.values())))
     for formula in formulas:
         require_numbers(numbers(formula))
-        if not defined_at(formula, samples, range(count)):
+        if not defined(formula, samples)[:count].all():
             raise Untranslatable("a sample outside of the plan")
     substituted = [_without_freeze(formula, env) for formula in formulas]
     found: list[Value] = evaluate(substituted, env, ops=ONNX, count=count)
