@@ -22,7 +22,7 @@ from stlc.dynamics.load import load_system_decl
 from stlc.files import read_source
 from stlc.grammar.parser import parse
 from stlc.plants.declaration import load_plant_decl, plant_schema
-from stlc.plants.kinds import KINDS
+from stlc.plants.kind import KINDS
 from stlc.plugins import plugins, variable
 from stlc.registry import GUARDS, METHODS, PLANNERS, PackageRegistry
 from stlc.rundir import RunDir

@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from stlc.extras import needed
-from stlc.plants.kinds import FaultError, Floats, Layout, UnfitError
+from stlc.plants.kind import FaultError, Floats, Layout, UnfitError
 
 _TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 

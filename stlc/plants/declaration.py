@@ -38,7 +38,7 @@ from stlc.dynamics.declaration.schema.record import (
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Node, Scalar, Sequence, load_yaml
 from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
 from stlc.files import read_source
-from stlc.plants.kinds import KINDS, ControllerLayout, Layout, PlantKind, Port
+from stlc.plants.kind import KINDS, ControllerLayout, Layout, PlantKind, Port
 from stlc.source import Source, Span
 from stlc.trace.trace import RESERVED
 from stlc.units import DIMENSIONLESS, Unit
@@ -234,7 +234,7 @@ class PlantDecl:
         doc: description in one line.
         path: path of the plant file.
         source: text of the plant file.
-        kind: kind of plant, an entry of `stlc.plants.kinds.KINDS`.
+        kind: kind of plant, an entry of `stlc.plants.kind.KINDS`.
         options: keys and values under the name of the kind in the plant file.
         dt: time step in seconds.
         steps: time steps of a simulation.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import usage
 from stlc.dynamics.declaration.inputs import drawn_numbers, signal_values
 from stlc.plants.declaration import PlantDecl, load_plant_decl
-from stlc.plants.kinds import Reason
+from stlc.plants.kind import Reason
 from stlc.plants.messages import Message
 from stlc.plants.process import Fault, FaultyError, PlantProcess
 from stlc.signature import Column, Signature

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.extras import not_installed
 from stlc.plants.declaration import OutputDecl, PlantDecl, PlantInput, VariableDecl
-from stlc.plants.kinds import Reason
+from stlc.plants.kind import Reason
 from stlc.plants.messages import SAID, Message, MessageError, encoded, received
 from stlc.plants.watchdog import Watchdog
 from stlc.units import parse_unit

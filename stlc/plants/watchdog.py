@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from secrets import token_hex
 
-from stlc.plants.kinds import SCRATCH
+from stlc.plants.kind import SCRATCH
 
 _SCRIPT = """
 mkdir -m 700 -- "$1" || exit 1

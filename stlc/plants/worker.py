@@ -18,7 +18,7 @@ import numpy as np
 
 from stlc.extras import NotInstalledError
 from stlc.plants.controller import NetworkController
-from stlc.plants.kinds import (
+from stlc.plants.kind import (
     KINDS,
     BlackBox,
     FaultError,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.plants import FILE, changed, pendulum, read, simulated
 
-from stlc.plants.kinds import FaultError, UnfitError
+from stlc.plants.kind import FaultError, UnfitError
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

@@ -16,7 +16,7 @@ from jsonschema import Draft202012Validator
 
 from stlc.diagnostics import StlcError, SystemFileError
 from stlc.plants.declaration import load_plant_decl, plant_schema
-from stlc.plants.kinds import KINDS, layout_of
+from stlc.plants.kind import KINDS, layout_of
 
 HERE = Path(__file__).parent
 

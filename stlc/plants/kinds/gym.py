@@ -19,7 +19,7 @@ import numpy as np
 
 from stlc.dynamics.declaration.schema.record import TEXT, key, raw
 from stlc.extras import needed
-from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, Port, UnfitError
+from stlc.plants.kind import FaultError, Floats, Layout, PlantKind, Port, UnfitError
 
 _PLACE = re.compile(r"(?P<name>obs|state|action)\[(?P<index>\d{1,6})\]")
 _FIRST = {"output": "obs[{}]", "input": "action[{}]", "initial": "state[{}]"}

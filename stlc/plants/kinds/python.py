@@ -28,7 +28,7 @@ import numpy as np
 from stlc.dynamics.declaration.schema.record import TEXT, integer, key, number, word
 from stlc.extras import needed
 from stlc.foreign import module_at
-from stlc.plants.kinds import FaultError, Floats, Layout, PlantKind, UnfitError, vector
+from stlc.plants.kind import FaultError, Floats, Layout, PlantKind, UnfitError, vector
 from stlc.registry import did_you_mean
 
 TARGET = re.compile(r"(?P<module>[\w./-]+\.py|\w+(?:\.\w+)*):(?P<attribute>[^\W\d]\w*)")

@@ -10,7 +10,7 @@ from helpers.plants import read, simulated
 from scipy.integrate import solve_ivp
 
 from stlc.monitor.verdict import Monitor
-from stlc.plants.kinds import UnfitError
+from stlc.plants.kind import UnfitError
 from stlc.plants.plant import Plant
 from stlc.plants.worker import ControlledPlant
 from stlc.toolchain import compiler

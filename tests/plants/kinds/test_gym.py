@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.plants import read, simulated
 
-from stlc.plants.kinds import FaultError, UnfitError
+from stlc.plants.kind import FaultError, UnfitError
 
 gymnasium = pytest.importorskip("gymnasium")
 

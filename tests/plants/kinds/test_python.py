@@ -9,7 +9,7 @@ import pytest
 from helpers.plants import FILE, changed, pendulum, read, simulated
 from scipy.integrate import solve_ivp
 
-from stlc.plants.kinds import FaultError, UnfitError
+from stlc.plants.kind import FaultError, UnfitError
 
 START = {"angle": 0.9, "length": 1.3}
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from stlc.dynamics.declaration.schema.record import key, number
-from stlc.plants.kinds import PlantKind
+from stlc.plants.kind import PlantKind
 
 
 @dataclass(frozen=True, slots=True)
