@@ -1,28 +1,21 @@
-"""Building, caching, threads, and going on without a compiler."""
+"""Building, caching, and going on without a compiler."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from stlc import native, toolchain
 from stlc.cache import persistent
-from stlc.compile.backends.c.adjoint import emit_adjoint
-from stlc.compile.backends.c.emit import LANES, Motion, emit
-from stlc.compile.ir import nodes as ir
 from stlc.diagnostics import Notice
 from stlc.toolchain import CompilerError
 
-MOTION = Motion(("x",), ("u",), (), {"x": ir.Op("add", (ir.Signal("x"), ir.Signal("u")))}, 5, 0.1)
-SIZES = native.Sizes(states=1, controls=1, steps=5, rules=1)
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="there is no C compiler here")
-RULES = [ir.Temporal("always", ir.Window(0, None), ir.Predicate(ir.Signal("x")))]
 SMALL = "int answer(void) { return 42; }\n"
 EVIL = "int answer(void) { return 666; }\n"
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
@@ -36,54 +29,11 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "cache/stlc"
 
 
-def _kernel() -> native.Kernel:
-    library = native.load(emit(MOTION, RULES))
-    assert library is not None
-    return native.Kernel(library, SIZES)
-
-
 def answer(text: str = SMALL) -> int:
     library = native.load(text)
     assert library is not None
     found: int = library.answer()
     return found
-
-
-@pytest.mark.parametrize("batch", [1, LANES - 1, LANES, LANES + 1, 5 * LANES + 3, 2000])
-@pytest.mark.parametrize("threads", [1, 3])
-def test_every_row_is_judged_whatever_the_batch_and_the_threads(batch: int, threads: int) -> None:
-    rng = np.random.default_rng(batch)
-    x0, u = rng.normal(size=(batch, 1)), rng.normal(size=(batch, 5, 1))
-    rho, columns = _kernel().judge(x0, u, threads=threads, columns=True)
-    assert columns is not None
-    expected = np.concatenate([x0, x0 + u[:, :, 0].cumsum(1)], 1)
-    np.testing.assert_allclose(columns[0].T, expected)
-    np.testing.assert_allclose(rho[:, 0], expected.min(1))
-
-
-def test_arrays_of_other_sizes_are_refused() -> None:
-    """Compiled code would read beyond their ends."""
-    kernel, library = _kernel(), native.load(emit_adjoint(MOTION, RULES))
-    assert library is not None
-    adjoint = native.Adjoint(library, SIZES)
-    search = native.SearchOptions(np.zeros((3, 1)), np.ones(1), np.zeros((2, 4, 1)), 1, 0.0, 0)
-    x0, u = np.zeros((4, 1)), np.zeros((4, 5, 1))
-    slopes = native.ObjectiveSlopes(np.ones((4, 1)), np.ones((1, 6, 4)), 1.0)
-    assert adjoint.pull(x0, u, slopes).shape == u.shape
-    for start, plans in ((x0, u[:1]), (x0[:1], u), (x0[:, :0], u), (x0, u[:, :4]), (x0, u[:, :, :0])):
-        for call in (
-            lambda: kernel.judge(start, plans),  # noqa: B023 - called at once
-            lambda: kernel.local_search(start, plans, search),  # noqa: B023
-            lambda: adjoint.pull(start, plans, slopes),  # noqa: B023
-            lambda: adjoint.pull_starts(start, plans, slopes),  # noqa: B023
-        ):
-            with pytest.raises(ValueError, match=r"x0 \(B, 1\) and u \(B, 5, 1\)"):
-                call()
-    with pytest.raises(ValueError, match="library of plans"):
-        kernel.local_search(x0, u, search)
-    for wrong in (replace(slopes, by_rho=np.ones((3, 1))), replace(slopes, by_columns=np.ones((1, 5, 4)))):
-        with pytest.raises(ValueError, match="by_"):
-            adjoint.pull(x0, u, wrong)
 
 
 def test_a_kernel_is_built_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import pytest
 
-from stlc import native, stopping
+from stlc import stopping
 
 STUBBORN = """
 import signal, sys, time
@@ -73,45 +70,3 @@ def test_children_have_less_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("never", "-1", "1e9"):
         monkeypatch.setenv(stopping.CHILD, text)
         assert 0.0 <= stopping._patience() <= stopping.PATIENCE
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_rows_are_shared_in_parts_and_each_is_done_once(threads: int) -> None:
-    done: list[int] = []
-
-    def rows(first: int, last: int) -> int:
-        assert first % native.GRAIN == 0
-        done.extend(range(first, last))
-        return 0
-
-    native._share(rows, 1000, threads)
-    assert sorted(done) == list(range(1000))
-
-
-def test_work_is_stopped_between_two_parts() -> None:
-    done: list[int] = []
-
-    def rows(first: int, _last: int) -> int:
-        done.append(first)
-        return 0
-
-    native._share(rows, 10**6, 1, stop=lambda: len(done) == 3)
-    assert len(done) == 3
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_an_interruption_ends_the_work(threads: int) -> None:
-    def rows(first: int, last: int) -> int:
-        time.sleep(0.001 * (last - first))  # else parts grow until one holds them all
-        return 0
-
-    timer = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
-    with pytest.raises(KeyboardInterrupt):
-        native._share(rows, 1 << 40, threads, grain=1)
-    timer.join()
-
-
-def test_a_part_without_memory_is_told() -> None:
-    with pytest.raises(MemoryError):
-        native._share(lambda _first, _last: 1, 100, 2)

@@ -579,7 +579,7 @@ def gradient_in_c() -> list[float]:
 
     from stlc.compile.backends.c.emit import Motion
     from stlc.compile.ir import nodes as ir
-    from stlc.native import ObjectiveSlopes
+    from stlc.controller.problem.kernel import ObjectiveSlopes
 
     motion = Motion(("y",), ("x",), (), {"y": sine()}, 1, 0.1)
     at = np.linspace(-3.0, 3.0, 7)

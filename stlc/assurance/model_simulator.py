@@ -20,6 +20,7 @@ from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.semantics.tolerance import violated
+from stlc.controller.problem.kernel import Adjoint, ObjectiveSlopes
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
 from stlc.controller.search.plan_traces import trace_of
@@ -28,7 +29,6 @@ from stlc.diagnostics import usage
 from stlc.dynamics.quantiles import InitialPoints
 from stlc.monitor.instants import rule_bounds
 from stlc.monitor.values import Record
-from stlc.native import Adjoint, ObjectiveSlopes
 
 if TYPE_CHECKING:
     from torch import Tensor

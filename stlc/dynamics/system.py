@@ -33,7 +33,6 @@ from stlc.dynamics.model.samplers import Drawing, InitialStates, Rows
 from stlc.dynamics.model.step import ModelStep, build_step, commands
 from stlc.dynamics.scenario import truth, under
 from stlc.files import find_system
-from stlc.native import check_plans
 from stlc.source import Source
 from stlc.tabular import html_table
 
@@ -545,3 +544,27 @@ class System:
         u = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
         self.require_finite(self.rollout(x0, u))
         return (*self.decl.warnings, *self.initial.warnings(), *unstable(self.decl))
+
+
+def check_plans(
+    who: str, x0: tuple[int, ...], u: tuple[int, ...], *, states: int, controls: int, steps: int | None = None
+) -> None:
+    """Check the shapes of initial states `x0`, (B, n), and plans `u`, (B, T, m).
+
+    Args:
+        who: what takes the arrays, for the message.
+        x0: shape of the initial states.
+        u: shape of the plans.
+        states: number n of states.
+        controls: number m of controls.
+        steps: number T of steps; None if any number is accepted.
+
+    Raises:
+        ValueError: the shapes are others.
+    """
+    if x0 == (*u[:1], states) and len(u) == 3 and u[2] == controls and steps in (None, u[1]):
+        return
+    length = "T" if steps is None else steps
+    raise ValueError(
+        f"{who} takes x0 (B, {states}) and u (B, {length}, {controls}), not {tuple(x0)} and {tuple(u)}"
+    )

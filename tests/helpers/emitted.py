@@ -25,7 +25,8 @@ from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.traverse import leaves, nodes, subexpressions
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.native import Adjoint, Kernel, ObjectiveSlopes, Sizes, load
+from stlc.controller.problem.kernel import Adjoint, Kernel, ObjectiveSlopes, Sizes
+from stlc.native import load
 
 T = TypeVar("T")
 

@@ -20,20 +20,10 @@ from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.advance import emit_advance
 from stlc.compile.backends.c.emit import Motion, emit
 from stlc.compile.backends.numbers import Untranslatable
+from stlc.controller.problem.kernel import Adjoint, Advance, Kernel, ObjectiveSlopes, SearchOptions, Sizes
 from stlc.diagnostics import usage
 from stlc.dynamics.model.step import commands
-from stlc.native import (
-    Adjoint,
-    Advance,
-    Kernel,
-    ObjectiveSlopes,
-    SearchOptions,
-    Sizes,
-    Stop,
-    load,
-    never,
-    why_none,
-)
+from stlc.native import Stop, load, never, why_none
 from stlc.toolchain import compiler
 
 if TYPE_CHECKING:

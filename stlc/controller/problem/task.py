@@ -24,7 +24,7 @@ from stlc.compile.semantics.switch import Hard, Switch
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
-from stlc.native import check_plans
+from stlc.dynamics.system import check_plans
 from stlc.runtime.decision import rank
 from stlc.tabular import html_table
 

@@ -23,8 +23,8 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough
 from stlc.compile.semantics.tolerance import satisfied, weighed
+from stlc.controller.problem.kernel import ObjectiveSlopes
 from stlc.controller.search.starts import extremes
-from stlc.native import ObjectiveSlopes
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task

@@ -18,7 +18,8 @@ from helpers.formula_strategies import NAMES
 
 from stlc.compile.backends.c.emit import Motion
 from stlc.compile.ir import nodes as ir
-from stlc.native import ObjectiveSlopes, compiler
+from stlc.controller.problem.kernel import ObjectiveSlopes
+from stlc.native import compiler
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")
 

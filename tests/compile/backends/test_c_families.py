@@ -29,7 +29,7 @@ from stlc.compile.backends.c.emit import emit
 from stlc.compile.backends.c.families import families
 from stlc.compile.backends.c.plan import Tabled, plan_of
 from stlc.compile.ir import nodes as ir
-from stlc.native import ObjectiveSlopes
+from stlc.controller.problem.kernel import ObjectiveSlopes
 
 X, Y, Z = (ir.Signal(name) for name in NAMES)
 WHOLE = ir.Window(0, STEPS)

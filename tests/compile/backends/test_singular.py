@@ -21,7 +21,8 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.functions import FUNCTIONS
 from stlc.compile.ir.traverse import leaves, nodes, subexpressions
 from stlc.compile.semantics.semantics import Exact, LogSumExp, Semantics, semantics_of
-from stlc.native import ObjectiveSlopes, compiler
+from stlc.controller.problem.kernel import ObjectiveSlopes
+from stlc.native import compiler
 
 PARTIAL = [name for name, function in FUNCTIONS.items() if function.singular]
 TOTAL = [

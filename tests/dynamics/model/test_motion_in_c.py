@@ -12,9 +12,10 @@ from dynamics.test_vectors import ARM
 from helpers.emitted import sizes_of
 
 from stlc.compile.backends.c.emit import Motion, emit
+from stlc.controller.problem.kernel import Kernel
 from stlc.dynamics.model.step import build_step
 from stlc.dynamics.system import System
-from stlc.native import Kernel, compiler, load
+from stlc.native import compiler, load
 
 Make = Callable[..., System]
 pytestmark = pytest.mark.skipif(compiler() is None, reason="there is no C compiler here")

@@ -51,7 +51,7 @@ def emit_adjoint(
 ) -> str:
     """Return the C source of the function `pull`, which computes the gradient.
 
-    `stlc.native` describes its signature.
+    `stlc.controller.problem.kernel` describes its signature.
 
     Args:
         motion: one step of the system.

@@ -20,7 +20,9 @@ FEEDBACK = Path(__file__).with_name("feedback.c")
 def emit_advance(
     motion: Motion, *, observed: Sequence[ir.Num], reward: ir.Num | None, commands: Mapping[str, ir.Num]
 ) -> str:
-    """Return the C source of steps, observations and feedback along trajectories, for `stlc.native.Advance`.
+    """Return the C source of steps, observations and feedback along trajectories.
+
+    `stlc.controller.problem.kernel.Advance` calls them.
 
     Args:
         motion: one step of the system.

@@ -89,7 +89,8 @@ class Motion:
 def emit(motion: Motion, formulas: Sequence[ir.Formula], end: End = "strict") -> str:
     """Return the C source of the functions `judge` (robustness) and `local_search`.
 
-    `stlc.native` describes these functions. With `end` "truncate", windows are cut at the end of the plan.
+    `stlc.controller.problem.kernel` describes these functions. With `end` "truncate", windows are cut at the
+    end of the plan.
 
     Raises:
         Untranslatable: the IR has a node without a C form.

@@ -27,8 +27,9 @@ from stlc.compile.ir.normal_form import joined
 from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import map_children, nodes
+from stlc.controller.problem.kernel import Kernel, SearchOptions, Sizes
 from stlc.controller.problem.native import motion_of
-from stlc.native import Kernel, SearchOptions, Sizes, load
+from stlc.native import load
 
 if TYPE_CHECKING:
     from numpy.random import Generator
