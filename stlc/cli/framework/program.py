@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -490,21 +490,28 @@ class _AsGiven:
         several = param.multiple or param.nargs == -1
         if value is None:
             return () if several else None
-        annotation = param.type_descriptor.annotation
-        if several and get_origin(annotation) is list and isinstance(value, list | tuple):
-            kinds = get_args(annotation)
-            if len(kinds) == 1 and all(_fits(item, kinds[0]) for item in value):
-                return list(value)
-        elif not several and _fits(value, annotation):
-            return value
+        kind, info = param.type_descriptor.annotation, param.type_descriptor.parameter_info
+        if several and get_origin(kind) is list and isinstance(value, list | tuple):
+            found = [_converted(item, get_args(kind)[0], info) for item in value]
+            if None not in found:
+                return found
+        elif not several and (one := _converted(value, kind, info)) is not None:
+            return one
         setattr(param, _SLOT, None)
         return param.get_runtime_param().coerce(value, param=param, ctx=ctx)
 
 
-def _fits(value: Any, annotation: Any) -> bool:
-    """True if a value already has its annotated type."""
-    if annotation in (str, bool, int, float):
-        return type(value) is annotation
-    if get_origin(annotation) is Literal:
-        return isinstance(value, str) and value in get_args(annotation)
-    return annotation is Path and isinstance(value, Path)
+def _converted(value: Any, kind: Any, info: Any) -> Any:
+    """Return a value as one of type `kind`, within the bounds of an option; None if typer must convert it."""
+    if kind in (str, bool) and type(value) is kind:
+        return value
+    if get_origin(kind) is Literal:
+        return value if isinstance(value, str) and value in get_args(kind) else None
+    if kind is Path and isinstance(value, str | Path):
+        return Path(value)
+    if kind in (int, float) and isinstance(value, str | kind):
+        with suppress(ValueError):
+            number = kind(value)
+            if (info.min is None or number >= info.min) and (info.max is None or number <= info.max):
+                return number
+    return None
