@@ -112,10 +112,7 @@ def check(
     each time; with --certify 0 certified, 1 refuted, 4 undecided; with --again 0 the same result, 1 another;
     with -q nothing is printed.
     """
-    from stlc.cli.commands.certify.text import require_claim
-    from stlc.cli.commands.check.junit import junit as junit_xml
     from stlc.cli.commands.check.many import Work, all_outcomes, exit_code, out_paths
-    from stlc.cli.commands.check.table import require_table, write_table
 
     repetition = None if again is None else _repetition(again, files)
     if repetition is None:
@@ -124,11 +121,16 @@ def check(
         judging = replace(judging, spec=spec)
     else:
         spec, traces, judging = None, repetition.traces, repetition.options
-    require_table(table)
+    if table is not None:
+        from stlc.cli.commands.check.table import require_table, write_table
+
+        require_table(table)
     require_no_jobs(cluster, jobs)
     question = judging.question()
-    require_claim(certify, fail_under)
     if certify is not None:
+        from stlc.cli.commands.certify.text import require_claim
+
+        require_claim(certify, fail_under)
         _require_distinct(traces)
     if STDIN in traces:
         _require_alone(traces, certify, out, cluster)
@@ -153,6 +155,8 @@ def check(
     if table is not None:
         write_table(table, outcomes)
     if junit is not None:
+        from stlc.cli.commands.check.junit import junit as junit_xml
+
         write_atomic(junit, junit_xml(outcomes, strict=question.strict))
     verdicts = [outcome.verdict for outcome in outcomes if outcome.verdict is not None]
     findings = [finding for outcome in outcomes for finding in outcome.errors]

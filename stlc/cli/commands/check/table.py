@@ -27,15 +27,13 @@ COLUMNS = {
 SUFFIXES = (".parquet", ".csv")
 
 
-def require_table(path: Path | None) -> None:
-    """Check the value of `--table`, if given, before anything is judged.
+def require_table(path: Path) -> None:
+    """Check the value of `--table` before anything is judged.
 
     Raises:
         UsageError: U101, the suffix is unknown, or the path is a folder.
         MissingError: R301, the package that writes the file is not installed.
     """
-    if path is None:
-        return
     if path.suffix.lower() not in SUFFIXES:
         raise usage(f"`--table {path}` is not a table that stlc writes", "name it .parquet or .csv")
     if path.is_dir():
