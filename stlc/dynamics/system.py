@@ -22,10 +22,10 @@ from stlc.compile.ir.typed import Parameter
 from stlc.compile.semantics.switch import Hard, Switch
 from stlc.diagnostics import Diagnostic, SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
-from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.functions import load_functions
 from stlc.dynamics.load import load_system_decl
+from stlc.dynamics.model.cost import PlanCost
 from stlc.dynamics.model.feedback import unstable
 from stlc.dynamics.model.mirror import Mirror
 from stlc.dynamics.model.rollout import Columns, Stepper
@@ -445,53 +445,19 @@ class System:
             u: controls, (B, T, m), for terms that read a control; such terms are averaged over the T steps.
             switch: whether `ind(…)` in a term is an exact or a smooth indicator.
         """
-        like = next(iter(columns.values()))
-        sat = sat.detach().to(like.dtype)
-        rho = torch.zeros_like(sat) if rho is None else rho
-        states, controlled = self._terms
-        total = self._mean(states, columns, sat, rho, switch)
-        if controlled is None:
-            return total
-        if u is None:
+        if self.cost.controlled and u is None:
             raise ValueError(f"the objective of {self.decl.name} needs the controls")
-        inputs = dict(zip(self.control_names, u.permute(2, 1, 0), strict=True))
-        before = {name: column[:-1] for name, column in columns.items()}
-        return total + self._mean(controlled, {**before, **inputs}, sat, rho, switch)
-
-    def _mean(
-        self,
-        program: ArrayProgram | None,
-        columns: Mapping[str, Tensor],
-        sat: Tensor,
-        rho: Tensor,
-        switch: Switch,
-    ) -> Tensor:
-        """Mean over time of a sum of performance terms (`program`), (B,); 0 if `program` is None.
-
-        The terms read the states over time in `columns`, and the outcome `sat` and `rho`.
-        """
-        if program is None:
-            return torch.zeros_like(sat)
-        like = next(iter(columns.values()))
-        k = torch.arange(len(like), dtype=like.dtype, device=like.device)[:, None]
-        first = {name + START: columns[name][0] for name in self._named_first}
-        env = {"k": k, "t": k * self.dt, "sat": sat, "rho": rho, **first, **columns}
-        cost: Tensor = program(env, TORCH, switch)["cost"]
-        return cost.expand(len(like), sat.shape[0]).mean(0)
+        sat = sat.detach().to(next(iter(columns.values())).dtype)[None]
+        rho = torch.zeros_like(sat) if rho is None else rho[None]
+        inputs = {} if u is None else dict(zip(self.control_names, u.permute(2, 1, 0), strict=True))
+        cost: Tensor = self.cost(columns, inputs, sat, rho, TORCH, switch)[0]
+        return cost
 
     @cached_property
-    def _named_first(self) -> tuple[str, ...]:
-        """Names of the states whose value at the start of the plan (`x_start`) a performance term reads."""
-        read = {name for term in self.decl.objective.terms for name in columns_in(term.value)}
-        return tuple(name for name in self.names if name + START in read)
-
-    @cached_property
-    def _terms(self) -> tuple[ArrayProgram | None, ArrayProgram | None]:
-        """Compiled programs of the two sums that `objective` returns; None for a sum without terms."""
-        states, controlled = (
-            None if total is None else ArrayProgram({"cost": total}) for total in self.objective
-        )
-        return states, controlled
+    def cost(self) -> PlanCost:
+        """The cost of plans by the performance terms, the sums of `objective`."""
+        states, controlled = self.objective
+        return PlanCost((), self.dt).with_mean(states).with_mean(controlled, controlled=True)
 
     @cached_property
     def objective(self) -> tuple[ir.Num | None, ir.Num | None]:

@@ -21,9 +21,8 @@ from stlc.compile.backends.c.emit import CHECK, HEAD, Motion, forward_blocks, pa
 from stlc.compile.backends.c.numbers import NumberWriter, literal
 from stlc.compile.backends.c.parts import declared, in_parts
 from stlc.compile.backends.c.plan import Plan, plan_of
-from stlc.compile.backends.numbers import Leaf, Untranslatable
+from stlc.compile.backends.numbers import Leaf
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import nodes
 from stlc.controller.guard.candidates import grid_of
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
@@ -31,17 +30,10 @@ from stlc.controller.problem.native import motion_of
 from stlc.controller.problem.task import Task
 from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.controls import SQUASHES, raw_width
+from stlc.dynamics.model.cost import REDUCED, CostTerm
 from stlc.dynamics.model.step import commands
 from stlc.escape import c_comment, c_string
-from stlc.export.description import (
-    MARGIN,
-    REDUCED,
-    CostTerm,
-    control_images,
-    cost_terms,
-    observation,
-    state_images,
-)
+from stlc.export.description import control_images, observation, state_images
 from stlc.runtime.decision import TIE
 from stlc.runtime.prefixes import generators
 
@@ -239,30 +231,22 @@ def cost(task: Task) -> list[str]:
     at |= {name + START: f"x[{i}][0][j]" for i, name in enumerate(task.system.names)}
     at |= {"k": "(double)k", "t": f"(k * {literal(task.system.dt)})", "sat": "1.0", "rho": "rho"}
     at |= {name: f"u[{i}][k][j]" for i, name in enumerate(task.system.control_names)}
-    return [line for term in cost_terms(task) for line in _term(term, at)]
+    samples = task.horizon + 1
+    return [line for term in task.plan_cost.terms for line in _term(term, at, samples - term.controlled)]
 
 
-def _term(term: CostTerm, at: Mapping[str, str]) -> list[str]:
+def _term(term: CostTerm, at: Mapping[str, str], samples: int) -> list[str]:
     each = NumberWriter(_columns(at))
-    if term.goal is not None:
-        if any(isinstance(node, ir.Predicate) and node.guard for node in nodes(term.goal)):
-            raise Untranslatable("a goal with a timer")
-        each.bound[MARGIN.name] = each.margin(term.goal)
     number = each.number(term.number)
-    first, join, reduced = "0.0", f"all += {number};", f"all / {term.samples}"
+    first, join, reduced = "0.0", f"all += {number};", f"all / {samples}"
     if term.greatest:
         first, join, reduced = "-INFINITY", f"all = MAX(all, {number});", "all"
     result = NumberWriter(_columns({**at, REDUCED.name: reduced}))
     value = result.number(term.value)
-    condition = ""
-    if term.condition is not None:
-        gate = NumberWriter(_columns(at))
-        truth = gate.truth(term.condition)
-        condition = " ".join(["int counts; {", *gate.lines, f"counts = {truth}; }} if (counts) "])
     return [
-        f"{{ {condition}{{ double all = {first};",
-        " ".join([f"for (int k = 0; k < {term.samples}; ++k) {{", *each.lines, join, "}"]),
-        " ".join([*result.lines, f"cost += {value}; }} }}"]),
+        f"{{ double all = {first};",
+        " ".join([f"for (int k = 0; k < {samples}; ++k) {{", *each.lines, join, "}"]),
+        " ".join([*result.lines, f"cost += {value}; }}"]),
     ]
 
 

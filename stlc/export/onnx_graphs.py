@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
 
 from stlc.compile.backends.array.arith import ArrayProgram
@@ -21,15 +20,11 @@ from stlc.compile.semantics.tolerance import overall, satisfied, violated
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.task import Task
-from stlc.dynamics.declaration.learning import START
 from stlc.dynamics.model.controls import raw_width, shares
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.description import (
-    MARGIN,
-    REDUCED,
     control_images,
-    cost_terms,
     observation,
     state_images,
 )
@@ -249,7 +244,10 @@ def judged(task: Task, start: States, plans: Value) -> Verdicts:
     by_name = dict(zip((rule.name for rule in task.rules), each, strict=True))
     rho = _overall(task.rules, by_name, like)
     safe = ONNX_OPS.where(broken, -math.inf, _overall(task.compiled.safety, by_name, like))
-    return Verdicts(rho, safe, each, _cost(task, states, controls, rho), states)
+    require_numbers(part for term in task.plan_cost.terms for part in (term.number, term.value))
+    sat = ONNX_OPS.full((1, 1), 1.0, rho)  # terms that depend on satisfaction are computed as if it were so
+    cost = task.plan_cost(states, controls, sat, rho, ONNX)
+    return Verdicts(rho, safe, each, cost.expand(1, BATCH, like=rho), states)
 
 
 def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) -> Value:
@@ -288,51 +286,6 @@ def _reduced(op: str, x: Value, axes: tuple[int, ...]) -> Value:
     shape = tuple(1 if place in axes else length for place, length in enumerate(x.shape))
     (out,) = x.graph.emit(op, (x, x.graph.constant(axes, "int64")), [shape], x.kind, {"keepdims": 1})
     return out
-
-
-# ------------------------------------------------------------------------ cost
-
-
-def _cost(task: Task, states: States, controls: States, rho: Value) -> Value:
-    """Cost of plans, (1, batch): sum of the cost terms.
-
-    Terms that depend on whether a plan satisfies the specification are computed as if it did.
-    """
-    moments = rho.graph.constant([[float(k)] for k in range(task.horizon + 1)])
-    once = {"sat": ONNX_OPS.full((1, 1), 1.0, rho), "rho": rho}
-    once |= {name + START: column[:1] for name, column in states.items()}
-    timed = {"k": moments, "t": moments * task.system.dt} | dict(states)
-    parts = [rho.graph.constant([[0.0]])]
-    for term in cost_terms(task):
-        rows = term.samples
-        env = once | {name: column[:rows] for name, column in timed.items()}
-        if rows == task.horizon:
-            env |= controls
-        if term.goal is not None:
-            env[MARGIN.name] = build_graph([term.goal], states, count=rows)[0]
-        each = assigned({"each": term.number}, env)["each"]
-        each = each.expand(rows, each.shape[1])
-        reduced = ONNX_OPS.amax(each) if term.greatest else _reduced("ReduceMean", each, (0,))
-        value = term.value
-        if term.condition is not None:
-            value = ir.Where(term.condition, value, ir.Const(0.0))
-        parts.append(assigned({"value": value}, {**once, REDUCED.name: reduced})["value"])
-    return reduce(ONNX_OPS.add, parts).expand(1, BATCH, like=rho)
-
-
-def deepened(task: Task, states: States) -> Value:
-    """Mask of the plans whose next step increases the robustness of a goal, (1, batch).
-
-    A goal counts only if it is satisfied now, with a robustness below the number `gamma` in the system file.
-    The task must have at least one goal. The mask equals `PendingGoals.deepened`.
-    """
-    soon = {name: column[:2] for name, column in states.items()}
-    gamma, found = task.system.decl.objective.gamma, []
-    for margin in build_graph([each.body for each in task.pending_goals.items], soon, count=2):
-        now, next_ = margin.expand(2, margin.shape[1])[:1], margin.expand(2, margin.shape[1])[1:]
-        held = ONNX_OPS.both(ONNX_OPS.ge(now, 0.0), ONNX_OPS.gt(gamma, now))
-        found.append(ONNX_OPS.both(held, ONNX_OPS.gt(next_, now)))
-    return reduce(ONNX_OPS.either, found)
 
 
 # ------------------------------------------------------------------------ prefixes
@@ -473,7 +426,7 @@ def _table(task: Task, state: Value, plans: Value) -> dict[str, Value]:
     rows = {"rho": found.rho, "safe": found.safe, "cost": found.cost}
     rows["rank"] = rank(found.rho, found.cost, found.safe, ONNX)
     if task.pending_goals.items:
-        rows["deepened"] = deepened(task, found.states)
+        rows["deepened"] = task.pending_goals.deepened(found.states, ONNX)
     table = {name: row.reshaped(BATCH, count) for name, row in rows.items()}
     requirements = joined(found.each).T.reshaped(BATCH, count, len(found.each))
     return {**table, "requirements": requirements, "plan": plans}

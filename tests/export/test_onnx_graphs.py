@@ -13,12 +13,14 @@ from helpers.onnx_graphs import computed
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.onnx import ops
 from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph
+from stlc.compile.backends.onnx.ops import ONNX
+from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import substitute
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
-from stlc.export.onnx_graphs import columns_of, deciding, deepened, judged, judging, rollout
+from stlc.export.onnx_graphs import columns_of, deciding, judged, judging, rollout
 from stlc.export.verify import previous_plan_agreement, same_verdicts
 from stlc.registry import INTEGRATORS
 from stlc.runtime.facts import read_facts
@@ -31,11 +33,12 @@ def test_promises_deepen_as_the_task_says() -> None:
     x[:, 0] = torch.linspace(-1.0, 1.0, 80)
     x[:, 1] = torch.linspace(0.6, -0.6, 80).roll(20)
     plans = torch.zeros(80, run.task.horizon, 1, dtype=torch.float64)
-    wanted = run.task.pending_goals.deepened(run.task.judge(x, plans).columns)
+    goals, columns = run.task.pending_goals, run.task.judge(x, plans).columns
+    wanted = goals.deepened(columns, TORCH)[0]
     graph = OnnxGraph()
     start = columns_of(graph.input("state", (BATCH, len(run.task.system.names))), run.task.system.names)
     given = graph.input("plan", (BATCH, run.task.horizon, 1))
-    found = deepened(run.task, judged(run.task, start, given).states)
+    found = goals.deepened(judged(run.task, start, given).states, ONNX)
     said = computed({"deepened": found}, {"state": x.numpy(), "plan": plans.numpy()})["deepened"]
     assert said[0].tolist() == wanted.tolist()
     assert set(wanted.tolist()) == {True, False}

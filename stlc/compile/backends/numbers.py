@@ -5,6 +5,7 @@ Each expression is evaluated once. A function call can be replaced by the body o
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
@@ -89,20 +90,24 @@ class NumberEvaluator(ABC, Generic[V]):
     def _choice(self, cond: ir.Formula, yes: V, no: V) -> V: ...
 
 
-def margin_of(formula: ir.Formula) -> ir.Num:
+def margin_of(formula: ir.Formula, *, guarded: bool = False) -> ir.Num:
     """Return the robustness of a state formula (one without temporal operators) as an expression.
 
-    Guards are treated as ordinary predicates. (Elsewhere the robustness of a guard is +inf or -inf.)
+    Guards are treated as ordinary predicates; if `guarded`, the robustness of a guard is +inf or -inf, as it
+    is elsewhere.
 
     Raises:
         Untranslatable: the formula has a temporal operator.
     """
     match formula:
+        case ir.Predicate(guard=True) if guarded:
+            return ir.Where(formula, ir.Const(math.inf), ir.Const(-math.inf))
         case ir.Predicate(num, sign):
             return num if sign > 0 else ir.Op("neg", (num,))
         case ir.BoolOp(op, items):
-            return ir.Op("min" if op == "and" else "max", tuple(map(margin_of, items)))
+            parts = tuple(margin_of(item, guarded=guarded) for item in items)
+            return ir.Op("min" if op == "and" else "max", parts)
         case ir.Truth(value):
-            return ir.Const(float("inf") if value else float("-inf"))
+            return ir.Const(math.inf if value else -math.inf)
         case _:
             raise Untranslatable(type(formula).__name__)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.guard.candidates import Candidates, Limits, finite
 from stlc.controller.guard.kind import GuardInputs
@@ -227,7 +228,7 @@ class Guard:
         rest = self.strict.judge(x, previous.plan)
         better = self.strict.rank(rest) >= self.strict.rank(judged)
         if self.task.pending_goals.items:
-            better |= self.task.pending_goals.deepened(rest.columns)
+            better |= self.task.pending_goals.deepened(rest.columns, TORCH)[0]
         keep = (better & satisfied(rest.rho)).nonzero()[:, 0]
         before = Candidates(previous.plan, rest.rho, rest.safe, found.cost, previous.source, previous.t0)
         found.put(keep, before.of(keep))

@@ -12,14 +12,13 @@ retained.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from stlc.compile.backends.array.graph import evaluate
-from stlc.compile.backends.torch.ops import TORCH
+from stlc.compile.backends.array.arith import ArrayProgram
+from stlc.compile.backends.numbers import Untranslatable, margin_of
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.lower import lower
@@ -29,10 +28,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from stlc.compile.ir.discretize import Grid
+    from stlc.compile.namespace import Ops
     from stlc.compile.pipeline import Compiled
-
-HELD = 0.5
-"""Magnitude of a status below which the goal is pending."""
+    from stlc.dynamics.model.cost import PlanCost
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +39,13 @@ class PendingGoal:
 
     Attributes:
         status: name of the state that records the status of the goal; it is near 0 while the goal is pending.
-        body: the state formula.
+        margin: robustness of the state formula, an expression of the states at a sample.
         first: first step of the mission at which satisfaction counts.
         last: last step of the mission at which satisfaction counts.
     """
 
     status: str
-    body: ir.Formula
+    margin: ir.Num
     first: float
     last: float
 
@@ -72,45 +70,33 @@ class PendingGoals:
         ]
         self.items = tuple(goal for goal in found if goal is not None)
 
-    def short(self, columns: Mapping[str, Tensor]) -> Tensor:
-        """Margin that plans lack, summed over the goals that are pending at the first sample: (batch,).
+    def added_to(self, cost: PlanCost, weight: float) -> PlanCost:
+        """Add to a cost `weight` times the margins that plans lack at the goals that are pending."""
+        for goal in self.items:
+            times = goal.first, goal.last
+            cost = cost.with_goal(goal.margin, self.clock, times, goal.status, self._gamma, weight)
+        return cost
 
-        At one goal a plan lacks gamma, the margin that plans should have, minus the largest margin that the
-        plan reaches at this goal, clipped to the range from 0 to gamma.
-
-        Args:
-            columns: predicted states, name -> (time, batch); the result is differentiable with respect to
-                them.
-        """
-        clock = columns[self.clock]
-        lack = torch.zeros_like(clock[0])
-        for goal, margin in zip(self.items, self._margins(columns, len(clock)), strict=True):
-            counts = (clock >= goal.first) & (clock <= goal.last)
-            best = torch.where(counts, margin, torch.full_like(clock, -torch.inf)).amax(0)
-            is_open = columns[goal.status][0].abs() < HELD
-            lack = lack + torch.where(is_open, (self._gamma - best).clamp(0.0, self._gamma), 0.0)
-        return lack
-
-    def deepened(self, columns: Mapping[str, Tensor]) -> Tensor:
+    def deepened(self, columns: Mapping[str, Any], ops: Ops) -> Any:
         """Mask of the plans whose first step increases the margin of a goal that the first sample satisfies.
 
         Goals whose margin at the first sample is at least gamma, the margin that plans should have, are
-        ignored. The mask is (batch,).
+        ignored. There must be at least one goal. The mask is (1, batch).
 
         Args:
             columns: predicted states, name -> (time, batch).
+            ops: the array library.
         """
-        found = torch.zeros_like(columns[self.clock][0], dtype=torch.bool)
-        for margin in self._margins(columns, 2):
-            now, soon = margin.expand(2, -1)
-            found |= (now >= 0.0) & (now < self._gamma) & (soon > now)
-        return found
+        found = []
+        for margin in self._margins({name: column[:2] for name, column in columns.items()}, ops).values():
+            now, soon = margin[:1], margin[1:]
+            held = ops.both(ops.ge(now, 0.0), ops.gt(self._gamma, now))
+            found.append(ops.both(held, ops.gt(soon, now)))
+        return reduce(ops.either, found)
 
-    def _margins(self, columns: Mapping[str, Tensor], count: int) -> list[Tensor]:
-        """Robustness of every goal's state formula at the first `count` samples, (count, batch) each."""
-        env = {name: column[:count] for name, column in columns.items()}
-        found: list[Tensor] = evaluate([goal.body for goal in self.items], env, ops=TORCH, count=count)
-        return found
+    @cached_property
+    def _margins(self) -> ArrayProgram:
+        return ArrayProgram({goal.status: goal.margin for goal in self.items})
 
 
 def _goal(name: str, formula: typed.Formula, grid: Grid) -> PendingGoal | None:
@@ -122,7 +108,10 @@ def _goal(name: str, formula: typed.Formula, grid: Grid) -> PendingGoal | None:
         ):
             lowered = lower(body, grid, [])
             if reach(lowered) == Reach(0, 0):
-                return PendingGoal(name, lowered, _steps(lo, grid), _steps(hi, grid))
+                with suppress(Untranslatable):
+                    return PendingGoal(
+                        name, margin_of(lowered, guarded=True), _steps(lo, grid), _steps(hi, grid)
+                    )
         case _:
             pass
     return None

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor
 
-from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import RobustnessGraph, evaluate
 from stlc.compile.backends.c.adjoint import emit_adjoint
 from stlc.compile.backends.c.emit import emit
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from stlc.compile.backends.schedule import End
+    from stlc.dynamics.model.cost import PlanCost
     from stlc.dynamics.system import System
     from stlc.grammar import ast
 
@@ -393,11 +393,7 @@ class Task:
         plans should have: the missing robustness, times a weight, is added.
         """
         with torch.no_grad():
-            cost = self.performance(judged.columns, judged.rho, judged.plans)
-            if not self.compiled.timers:
-                return cost
-            gamma = self.system.decl.objective.gamma
-            return cost + SHORTFALL * (gamma - judged.rho).clamp(0.0, gamma)
+            return self._summed(self.plan_cost, judged.columns, judged.rho, judged.plans)
 
     def rank(self, judged: PlanVerdicts, *, safety: bool = True) -> Tensor:
         """Values that rank plans, (batch,), by `stlc.runtime.decision.rank`; `safety`: safe ones first."""
@@ -423,7 +419,7 @@ class Task:
         """Sum of the performance terms of plans, also for plans that violate the specification: (batch,).
 
         In a mission (a specification that adds timers to the state), two terms are added to those of the
-        system file: the margin that the plan lacks at pending goals (see `PendingGoals.short`), and the
+        system file: the margin that the plan lacks at pending goals (`PendingGoals`), and the
         guidance cost (distance to the next goal), each times a weight.
 
         Args:
@@ -431,30 +427,30 @@ class Task:
             rho: robustness, (batch,).
             u: controls, (batch, T, m).
         """
-        cost = self.system.performance(columns, torch.ones_like(rho), rho.detach(), u)
-        if self.pending_goals.items:
-            cost = cost + GOALS * self.pending_goals.short(columns)
-        if self._guidance is None:
-            return cost
-        gap: Tensor = self._guidance(columns, TORCH, HARD)["gap"]
-        return cost + GUIDANCE * gap.mean(0)
+        return self._summed(self._performance, columns, rho.detach(), u)
+
+    def _summed(self, cost: PlanCost, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:
+        inputs = zip(self.system.control_names, u.permute(2, 1, 0).unbind(0), strict=True)
+        given = dict(inputs) if cost.controlled else {}
+        found: Tensor = cost(columns, given, torch.ones_like(rho)[None], rho[None], TORCH)[0]
+        return found
+
+    @cached_property
+    def plan_cost(self) -> PlanCost:
+        """The cost that `cost` computes, over any array library."""
+        if not self.compiled.timers:
+            return self._performance
+        return self._performance.with_shortfall(self.system.decl.objective.gamma, SHORTFALL)
+
+    @cached_property
+    def _performance(self) -> PlanCost:
+        cost = self.pending_goals.added_to(self.system.cost, GOALS)
+        return cost.with_mean(self.compiled.guidance_cost, GUIDANCE)
 
     @cached_property
     def pending_goals(self) -> PendingGoals:
         """Goals `eventually@[a, b]` of the mission, and gamma, the margin that plans should have at them."""
         return PendingGoals(self.compiled, self.system.decl.objective.gamma)
-
-    @cached_property
-    def _guidance(self) -> ArrayProgram | None:
-        """Program that computes the guidance cost (distance to the next goal) at each sample.
-
-        Its output has the name `gap`. None if the specification has no goals.
-        """
-        return (
-            None
-            if self.compiled.guidance_cost is None
-            else ArrayProgram({"gap": self.compiled.guidance_cost})
-        )
 
     def alive(self, x: Tensor) -> Tensor:
         """Mask of the states in which no requirement of the mission is violated for good: (B, n) -> (B,)."""

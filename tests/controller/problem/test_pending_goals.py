@@ -9,10 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.guard.guard import Guard
 from stlc.controller.policies.policy import Policy
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.controller.problem.task import GOALS, Task
+from stlc.dynamics.model.cost import PlanCost
 from stlc.dynamics.system import System
 from stlc.grammar.parser import parse
 from stlc.source import Source
@@ -53,6 +55,13 @@ def columns(task: Task, x: list[float], clock: int = 0, there: float = 0.0) -> d
     return found
 
 
+def lack_of(task: Task, found: dict[str, Tensor]) -> Tensor:
+    """Margin that a path lacks at the goals, (1,)."""
+    cost = task.pending_goals.added_to(PlanCost((), task.system.dt), 1.0)
+    nothing = torch.zeros(1, 1)
+    return cost(found, {}, nothing, nothing, TORCH)[0]
+
+
 def test_only_requirements_that_are_one_promise_are_told(task: Task) -> None:
     (promise,) = task.pending_goals.items
     assert (promise.status, promise.first, promise.last) == ("there", 2.0, 20.0)
@@ -70,19 +79,19 @@ def test_only_requirements_that_are_one_promise_are_told(task: Task) -> None:
 def test_an_open_promise_lacks_what_the_deepest_sample_lacks(
     task: Task, path: list[float], lack: float
 ) -> None:
-    short = task.pending_goals.short(columns(task, path))
+    short = lack_of(task, columns(task, path))
     assert short.item() == pytest.approx(lack, abs=1e-6)
 
 
 def test_what_is_kept_or_over_lacks_nothing_or_all(task: Task) -> None:
-    assert task.pending_goals.short(columns(task, [0.0, 1.0, 2.1], there=1.0)).item() == 0.0
-    assert task.pending_goals.short(columns(task, [2.1] * 3, clock=19)).item() == pytest.approx(0.2, abs=1e-6)
-    assert task.pending_goals.short(columns(task, [2.1] * 3, clock=21)).item() == pytest.approx(0.3)
+    assert lack_of(task, columns(task, [0.0, 1.0, 2.1], there=1.0)).item() == 0.0
+    assert lack_of(task, columns(task, [2.1] * 3, clock=19)).item() == pytest.approx(0.2, abs=1e-6)
+    assert lack_of(task, columns(task, [2.1] * 3, clock=21)).item() == pytest.approx(0.3)
 
 
 def test_the_gradient_goes_into_the_deepest_sample(task: Task) -> None:
     found = columns(task, [0.0, 1.0, 1.0, 2.1, 2.05])
-    task.pending_goals.short(found).sum().backward()  # type: ignore[no-untyped-call]
+    lack_of(task, found).sum().backward()  # type: ignore[no-untyped-call]
     gradient = found["x"].grad
     assert gradient is not None
     assert gradient[:, 0].tolist() == [0.0, 0.0, 0.0, -1.0, 0.0]
@@ -101,7 +110,7 @@ def test_it_is_a_performance_term_of_missions(task: Task) -> None:
     [([2.1, 2.2], True), ([2.2, 2.1], False), ([2.4, 2.5], False), ([1.9, 2.1], False)],
 )
 def test_a_plan_goes_on_while_it_gets_further_in(task: Task, path: list[float], goes_on: bool) -> None:
-    assert task.pending_goals.deepened(columns(task, path)).tolist() == [goes_on]
+    assert task.pending_goals.deepened(columns(task, path), TORCH).tolist() == [[goes_on]]
 
 
 class Leaver(Policy):

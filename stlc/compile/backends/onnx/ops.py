@@ -164,6 +164,11 @@ class OnnxOps(FloatConstants, ScanByRows):
     def amax(self, x: Value) -> Value:
         return self.join(x.rows(), "max")
 
+    def sum(self, x: Value) -> Value:
+        axes = x.graph.constant([0], "int64")
+        (out,) = x.graph.emit("ReduceSum", (x, axes), [(1, *x.shape[1:])], x.kind, {"keepdims": 1})
+        return out
+
     def cummin(self, x: Value) -> Value:
         return _running(x, "Min")
 
