@@ -56,8 +56,8 @@ def pytest_collection_finish() -> None:
 SMALL = {
     "stlc.controller.training.learner.MARGIN_STATES": 8,
     "stlc.controller.training.learner.EFFORTS": (1000, 2000, 4000),
-    "stlc.controller.training.conflict.JUDGED": 1000,
-    "stlc.controller.training.conflict.TRIES": 1000,
+    "stlc.controller.search.conflict.JUDGED": 1000,
+    "stlc.controller.search.conflict.TRIES": 1000,
     "stlc.controller.evaluation.held_out.KNOWN_FEASIBLE_TRIES": 1000,
     "stlc.controller.evaluation.held_out.JUDGED": 1000,
     "stlc.controller.search.feasibility.TRIES": 1000,

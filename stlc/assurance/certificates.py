@@ -183,7 +183,7 @@ def _subject(name: str | None, options: CertifyOptions) -> tuple[Subject, Path, 
     drawn: PlantDraws | ModelDraws
     require = tuple(options.require)
     if options.plant is not None:
-        from stlc.plants.judge import PlantJudge
+        from stlc.assurance.plant_judge import PlantJudge
 
         judge = PlantJudge.load(name, options.plant, options.overrides)
         for warning in judge.monitor.compiled.warnings:

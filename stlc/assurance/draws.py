@@ -27,9 +27,9 @@ from stlc.provenance import sha256
 
 if TYPE_CHECKING:
     from stlc.assurance.model_simulator import ModelSimulator
+    from stlc.assurance.plant_judge import JudgedRun, PlantJudge
     from stlc.compile.pipeline import CompiledRequirement
     from stlc.grammar import ast
-    from stlc.plants.judge import JudgedRun, PlantJudge
     from stlc.plants.plant import PlantFinding
 
 MOST_FINDINGS = 20

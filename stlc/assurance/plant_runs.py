@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stlc.activity import PULSE
+from stlc.assurance.plant_judge import JudgedRun, PlantJudge, PlantSimulation
 from stlc.diagnostics import notice, usage
 from stlc.escape import visible
-from stlc.plants.judge import JudgedRun, PlantJudge, PlantSimulation
 from stlc.registry import did_you_mean
 from stlc.trace import Trace, check_writable, save_trace
 from stlc.units import parse_quantity

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from stlc.assurance.plant_judge import PlantJudge
 from stlc.assurance.search_space import Point, SearchSpace, SignalBlock
 from stlc.assurance.simulation import Simulations, Simulator
 from stlc.compile.ir import nodes as ir
@@ -18,7 +19,6 @@ from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic, SystemFileError
 from stlc.monitor.verdict import Monitor
-from stlc.plants.judge import PlantJudge
 from stlc.plants.plant import Plant, PlantFinding, PlantRun
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ from stlc.options import taking
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from stlc.assurance.plant_judge import PlantSimulation
     from stlc.assurance.simulated import Simulation
     from stlc.controller.deployment.simulator import Watch
     from stlc.controller.run.run import Run
-    from stlc.plants.judge import PlantSimulation
 
 
 @taking(SimulateOptions)

@@ -11,8 +11,8 @@ from stlc.assurance.campaign import Campaign, campaign
 from stlc.assurance.certificate import Claim
 from stlc.assurance.draws import PlantDraws
 from stlc.assurance.falsify import SearchBudget, falsify
+from stlc.assurance.plant_judge import PlantJudge
 from stlc.assurance.plant_simulator import PlantSimulator
-from stlc.plants.judge import PlantJudge
 from stlc.toolchain import compiler
 
 pytest.importorskip("fmpy")

@@ -43,7 +43,7 @@ RESULTS: dict[str, tuple[str, ...]] = {
     "runs": tuple(
         f"{_COMMANDS}.runs:{name}" for name in ("RunList", "RunComparison", "RunContent", "RemovedRuns")
     ),
-    "simulate": ("stlc.assurance.simulated:Simulation", "stlc.plants.judge:PlantSimulation"),
+    "simulate": ("stlc.assurance.simulated:Simulation", "stlc.assurance.plant_judge:PlantSimulation"),
     "stlc": (),
     "system": ("stlc.dynamics.facts:SystemList", "stlc.dynamics.facts:SystemFacts"),
     "train": (f"{_COMMANDS}.train.trained:TrainedRun", f"{_COMMANDS}.train.trained:TrainedRuns"),

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from stlc.controller.evaluation.closed_loop import ClosedLoop, closed_loop
 from stlc.controller.evaluation.held_out import Score, score, silent
 from stlc.controller.run.run import Run
+from stlc.controller.search.conflict import conflict, refuted
 from stlc.controller.training.budget import TimeBudget, simulation_reserve, verdict_reserve
-from stlc.controller.training.conflict import conflict, refuted
 from stlc.jsontext import plain
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from stlc.controller.problem.load import require_controls
 from stlc.controller.run.checkpoint import Checkpoint, load_checkpoint, never_saved, restoring
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.run.run import Run, load_config, spec_hash, system_hash, task_of_run
+from stlc.controller.search.conflict import refuted
 from stlc.controller.training.budget import PROVISIONAL, Pace, StepSchedule, TimeBudget, clock_of
 from stlc.controller.training.config import TrainConfig, resolve_config
-from stlc.controller.training.conflict import refuted
 from stlc.controller.training.diagnose import check_mirror
 from stlc.controller.training.failures import SHARE, FailureSearch
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome

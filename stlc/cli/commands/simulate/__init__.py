@@ -17,10 +17,10 @@ from stlc.jsontext import plain
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from stlc.assurance.plant_judge import PlantSimulation
     from stlc.assurance.simulated import Simulation
     from stlc.controller.problem.task import Task
     from stlc.controller.run.run import Run
-    from stlc.plants.judge import PlantSimulation
 
 OPTIONS = SimulateOptions()
 

@@ -12,7 +12,7 @@ from stlc.monitor.judgement import worst_of
 from stlc.units import time_text
 
 if TYPE_CHECKING:
-    from stlc.plants.judge import JudgedRun, PlantSimulation
+    from stlc.assurance.plant_judge import JudgedRun, PlantSimulation
 
 CARRYING = (".npz", ".mcap")
 """Suffixes of recorded traces that carry their specification."""

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from helpers.documents import misfits
 
+from stlc.assurance import plant_judge as module
 from stlc.cli.commands.schema import load_schema
 from stlc.cli.framework.app import main
-from stlc.plants import judge as module
 from stlc.trace import load_trace
 
 CODE = """

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.point import task
 
-from stlc.controller.training.conflict import conflict, refuted
+from stlc.controller.search.conflict import conflict, refuted
 
 
 @pytest.mark.parametrize(
