@@ -73,12 +73,14 @@ class Peer:
         package: its package on PyPI.
         module: the module of the package.
         feed: (formulas, data, "row" or "block") -> feed; None if it has no such form.
+        longest: longest window in samples that it is given.
     """
 
     name: str
     package: str
     module: str
     feed: Callable[[Sequence[Formula], Data, str], Feed | None]
+    longest: int = 1 << 62
 
     @property
     def installed(self) -> bool:
@@ -330,7 +332,7 @@ def first_verdicts(formula: Formula, data: Data) -> dict[int, tuple[int, bool]]:
 
 
 PEERS = (
-    Peer("RTAMT", "rtamt", "rtamt", _rtamt),
+    Peer("RTAMT", "rtamt", "rtamt", _rtamt, 1_000_000),
     Peer("Reelay", "reelay", "reelay", _reelay),
     Peer("SENTIL", "sentil", "sentil", _sentil),
     Peer("mstlo", "mstlo-python", "mstlo_python", _mstlo),

@@ -60,10 +60,8 @@ COMPARED = 5_000
 """Samples of which all monitors' values are compared."""
 _SPENT = 0.4
 """Processor time of one measurement of another monitor in seconds; a slow one gets fewer samples."""
-_FULL = 20.0
-"""Processor time that may be spent on filling its windows."""
-_SLOW = 0.5
-"""Processor time of a sample in seconds from which on another monitor is left out."""
+_FULL = 10.0
+"""Processor time in seconds that may be spent on filling its windows."""
 _OUTPUT = Output()
 
 # --------------------------------------------------------------------------- rows
@@ -228,7 +226,8 @@ def timed(formulas: Sequence[Formula], pushed: str, sizes: Sizes, *, calm: bool 
     full = max(map(lookahead, formulas)) + 100
     form = "block" if pushed == "block" else "row"
     makers: dict[str, Callable[[], Feed | None]] = {"stlc": partial(ours, formulas, data, pushed)}
-    makers |= {each.name: partial(each.feed, formulas, data, form) for each in installed()}
+    peers = [each for each in installed() if full <= each.longest]
+    makers |= {each.name: partial(each.feed, formulas, data, form) for each in peers}
     counts = {name: _counts(name, maker(), form, full, sizes.samples) for name, maker in makers.items()}
     best: dict[str, float] = {}
     for _ in range(sizes.rounds):
@@ -249,11 +248,11 @@ def _counts(name: str, feed: Feed | None, form: str, full: int, samples: int) ->
         return (-(-full // size), blocks, blocks * size) if name == "stlc" else (0, 1, min(samples, 100_000))
     if name == "stlc":
         return full, samples, samples
-    if max(feed.run(1), feed.run(1)) > _SLOW:
-        return 0, 0, 0
     once = feed.run(20) / 20
     number = int(min(max(_SPENT / once, 20), samples))
-    return full if once * full < _FULL else 0, number, number
+    if name == "RTAMT":  # its buffers are full from the start
+        return 0, number, number
+    return (full, number, number) if once * full < _FULL else (0, 0, 0)
 
 
 # --------------------------------------------------------------------------- parts
