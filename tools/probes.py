@@ -66,6 +66,9 @@ PLANNED = ("verdict by torch", "verdict by C", "verdict by ONNX", "verdict by th
 BACKUPS = ("backup", "backup as a torch program", "backup by the runtime", "backup by the header")
 POLICIES = ("policy", "policy as a torch program", "policy by ONNX", "policy by the header")
 SMOOTH = ("smooth by NumPy", "smooth by torch")
+INDICATORS = tuple(
+    f"indicator {by}" for by in ("in check", "in bounds", "by torch", "by ONNX", "by C", "by the header")
+)
 
 _LEVELS = "levels of a control in prefixes"
 ABS = """
@@ -170,6 +173,13 @@ PROBES = (
         ("check", "explain", "stream", "stream in C", *PLANNED, "bounds"),
     ),
     Probe(
+        "1 and 0 of an indicator",
+        "compile/backends/array/arith.py",
+        "return float(mask) if isinstance(mask, bool) else self.tape.number(mask)",
+        "return float(mask) if isinstance(mask, bool) else self.tape.mul(self.tape.number(mask), 2.0)",
+        INDICATORS,
+    ),
+    Probe(
         "steps of an integrator",
         "dynamics/model/integrators/rk4.py",
         "weights=(1, 2, 2, 1)",
@@ -223,6 +233,7 @@ PROBES = (
 _IN_C = "tests/runtime/test_decision.py::test_rank_and_choices_are_the_same_in_every_library_and_in_c"
 _WEIGHED = "tests/compile/semantics/test_tolerance.py::test_c_weighs_and_judges_alike"
 _FORMULAS = "tests/compile/backends/test_c_formulas.py::test_every_operator_over_every_window"
+_NUMBERS = "tests/compile/backends/test_emit_c.py::test_every_function_equals_the_evaluator"
 _SLOPES = "tests/compile/backends/test_c_adjoint.py::test_every_function_has_the_gradient_of_torch"
 _STREAMS = "tests/monitor/online/test_streams.py::test_a_stream_gives_what_the_whole_trace_gives"
 _EXPORT, _BACKENDS = "tests/export", "tests/compile/backends"
@@ -248,6 +259,8 @@ APART: Mapping[tuple[str, str], str] = {
         "until",
         "plan by milp",
     ): f"{_MILP}::test_proofs_and_plans_agree_with_trial",
+    ("1 and 0 of an indicator", "indicator by C"): _NUMBERS,
+    ("1 and 0 of an indicator", "indicator by the header"): _NUMBERS,
     ("value of a function", "verdict by ONNX"): f"{_ONNX}::test_every_function_equals_the_evaluator",
     ("derivative of a function", "gradient by torch"): _SLOPES,
     ("derivative of a function", "symbolic derivative"): (
@@ -298,6 +311,11 @@ require there: eventually@[0 s, 1 s] x > 0.3
 @safety
 require slow: always[0, T] abs(v) <= 1
 """
+INDICATOR = """spec cart
+state signal x [m]
+state signal v [m/s]
+require marked: always[0 s, 0.3 s] x / 1 m - 0.3 * ind(v > 0.2) > -0.5
+"""
 STATES, RECORDINGS = 16, 6
 
 
@@ -308,7 +326,7 @@ def work() -> Path:
 
     folder = Path(tempfile.mkdtemp(dir=os.environ["PROBES"]))
     (folder / "cart.yaml").write_text(CART, encoding="utf-8")
-    for name, text in (("cart", SPEC), ("mission", MISSION)):
+    for name, text in (("cart", SPEC), ("mission", MISSION), ("indicator", INDICATOR)):
         (folder / f"{name}.stl").write_text(text, encoding="utf-8")
     for i in range(RECORDINGS):
         rows = recordings()[i]
@@ -446,18 +464,18 @@ def streamed_in_c() -> list[Any]:
     return found
 
 
-def torch_verdicts() -> list[Any]:
+def torch_verdicts(spec: str = "cart") -> list[Any]:
     """Verdicts on plans, by torch alone."""
     from stlc.export.programs import judged_by_torch
 
-    found = judged_by_torch(run().task, states(), plans())
+    found = judged_by_torch(run(spec).task, states(spec), plans(spec))
     return [found.rho.tolist(), found.requirements.tolist()]
 
 
-def native_verdicts() -> list[Any]:
+def native_verdicts(spec: str = "cart") -> list[Any]:
     """Verdicts on plans, by the kernel in C."""
-    found = run().task.judge(states(), plans())
-    assert run().task.native is not None
+    found = run(spec).task.judge(states(spec), plans(spec))
+    assert run(spec).task.native is not None
     return [found.rho.tolist(), found.requirements.tolist()]
 
 
@@ -623,6 +641,12 @@ FACES: Mapping[str, Callable[[], Any]] = {
     "backup as a torch program": backup_program,
     "backup by the runtime": backup_of_runtime,
     "backup by the header": lambda: of_answer(header()("backup")(states())),
+    "indicator in check": lambda: documented("check indicator.stl {} --json"),
+    "indicator in bounds": lambda: documented("check indicator.stl {} --uncertain x=0.01 --json"),
+    "indicator by torch": lambda: torch_verdicts("indicator"),
+    "indicator by ONNX": lambda: onnx_verdicts("indicator").rho.tolist(),
+    "indicator by C": lambda: native_verdicts("indicator"),
+    "indicator by the header": lambda: of_answer(header("indicator")("policy")(states("indicator")))[1:4],
     "policy": policy,
     "policy as a torch program": policy_program,
     "policy by ONNX": policy_graph,
