@@ -38,7 +38,7 @@ def verdict_of(online: Online, name: str = "the stream") -> Verdict:
     timeline = Timeline(dt, online.time(0), TimeRange(online.time(0), online.time(samples - 1)))
     scope = np.zeros(1, dtype=np.bool_) if online.in_scope is False else None
     rows = []
-    for rule, tally in ((online.rule(name), tally) for name, tally in tallies.items()):
+    for rule, tally in ((online.requirement(name).rule, tally) for name, tally in tallies.items()):
         low, high = (np.array([[value]]) for value in (tally.low, tally.high))
         held, failed = (np.array([[tally.status == word]]) for word in ("satisfied", "violated"))
         seen = (np.array([each]) for each in (tally.holds, tally.fails, tally.low_at, tally.high_at))

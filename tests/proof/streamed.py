@@ -60,7 +60,7 @@ def check_stream(case: Case, monitor: Monitor) -> None:
     for k in range(case.samples):
         pushed.push({name: values[k] for name, values in case.signals.items()})
         known = {name: values[: k + 1] for name, values in case.signals.items()}
-        bounds = so_far(case, monitor, rule, known, everywhere=pushed.repeats("r"))
+        bounds = so_far(case, monitor, rule, known, everywhere=pushed.requirement("r").everywhere)
         now = {start: (low, high) for start, low, high in pushed.open_starts("r")}
         for start, (low, high) in now.items():
             if bounds is not None:

@@ -255,13 +255,9 @@ class Online:
         """Names of the requirements, in order."""
         return tuple(watched.asked.rule.name for watched in self._watched)
 
-    def rule(self, name: str) -> CompiledRequirement:
-        """Return the requirement `name`. Raises UsageError (U101) for an unknown name."""
-        return self._find(name).asked.rule
-
-    def repeats(self, name: str) -> bool:
-        """True if the requirement `name` is evaluated at every sample, False if it is evaluated once."""
-        return self._find(name).asked.everywhere
+    def requirement(self, name: str) -> Asked:
+        """Return the requirement `name`, and where it is evaluated. Raises UsageError (U101) without one."""
+        return self._find(name).asked
 
     @property
     def samples(self) -> int:

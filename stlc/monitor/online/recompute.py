@@ -7,15 +7,16 @@ whose end moves.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias, final
 
 import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
+from stlc.compile.backends.schedule import PICKS, neutral
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.support import endless, farthest, history
+from stlc.compile.ir.support import endless, farthest, history, reach
 from stlc.compile.ir.traverse import numbers, operands
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.tolerance import Status
@@ -31,6 +32,9 @@ MOST = 1 << 26
 
 _FROZEN = 500
 """Overhead of one instant of a `freeze`, in values."""
+
+_FINAL = 64
+"""Instants with final values that are taken in together."""
 
 _NARROW = 1 << 13
 """Samples that are evaluated anew after each new one; more of them when an eighth is new."""
@@ -95,6 +99,57 @@ class GrowingBounds:
 
 @final
 @dataclass(slots=True)
+class Extremum:
+    """Running extremum of `always` or `eventually` to the end of the trace, over instants with final values.
+
+    Attributes:
+        bodies: bounds on the operand, of the robustness and of that which decides.
+        lo: first instant of the window, after that of the operator.
+        choose: minimum or maximum.
+        next: the first instant that is not taken in.
+        known: bounds over the instants that are, as of `Asked.judged`.
+    """
+
+    bodies: Sequence[GrowingBounds]
+    lo: int
+    choose: np.ufunc
+    next: int
+    known: Floats
+
+    @staticmethod
+    def of(asked: Asked) -> Extremum | None:
+        """Return the extremum of a requirement; None unless it is such an operator over bounded windows."""
+        node, rule = asked.rule.formula, asked.rule
+        moving = rule.absolute or asked.everywhere or window_of(rule, asked.horizon) is not None
+        if moving or not isinstance(node, ir.Temporal) or node.window.hi is not None or endless(node.body):
+            return None
+        bodies = []
+        for each in (rule, asked.deciding):
+            body = each.formula.body  # type: ignore[union-attr]
+            inner = replace(each, formula=body, lowered=body, reach=reach(body).future)
+            bodies.append(GrowingBounds(inner, asked.horizon, "open"))
+        choose, lo = np.minimum if node.op == "always" else np.maximum, node.window.lo
+        return Extremum(bodies, lo, choose, asked.begin + lo, np.full((1, 4), neutral(PICKS[node.op])))
+
+    @property
+    def needs(self) -> int:
+        """The first sample that later instants read."""
+        return min(max(self.next - self.lo, 0), *(body.needs(self.next) for body in self.bodies))
+
+    def take(self, history: ColumnHistory) -> None:
+        """Take in instants with final values, some at a time; the last one stays."""
+        stop = min(body.settled(history.samples) for body in self.bodies) - 1
+        if stop < self.next + _FINAL:
+            return
+        first, signals = history.first, history.columns()
+        there = range(self.next - first, stop - first)
+        found = np.concatenate([end for body in self.bodies for end in body.live(signals, there)], axis=1)
+        self.known = self.choose(self.choose.reduce(found, axis=0, keepdims=True), self.known)
+        self.next = stop
+
+
+@final
+@dataclass(slots=True)
 class Recomputed:
     """A requirement that is evaluated anew after each sample.
 
@@ -109,6 +164,7 @@ class Recomputed:
     tally: RequirementSummary = field(init=False)
     news: dict[int, Status] = field(default_factory=dict)
     _values: GrowingBounds = field(init=False)
+    _final: Extremum | None = field(init=False)
     _looked: int = 0
     _decided: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
@@ -117,6 +173,7 @@ class Recomputed:
         _require_bounded(asked)
         self.tally = RequirementSummary(low_at=asked.begin, high_at=asked.begin, first=asked.begin)
         self._values = GrowingBounds(asked.rule, asked.horizon, asked.ending)
+        self._final = Extremum.of(asked)
 
     @property
     def _over(self) -> bool:
@@ -141,10 +198,14 @@ class Recomputed:
         count = min(max(settled - starts.start, 0), len(starts))
         self.tally = self.tally.with_more(judged, count)
         self._decided = known[count:]
+        if self._final is not None:
+            self._final.take(self._history)
 
     @property
     def needs(self) -> int:
         """The first sample that is still read, by the verdicts of the latest sample, too."""
+        if self._final is not None:
+            return self._final.needs
         starts = [*self.news] if self._over else [self.tally.next, *self.news]
         return min(map(self._values.needs, starts), default=self._history.samples)
 
@@ -162,11 +223,15 @@ class Recomputed:
         if not starts:
             return self.asked.judged(np.zeros((0, 4)))
         first, signals, asked = self._history.first, self._history.columns(), self.asked
-        there = range(starts.start - first, starts.stop - first)
+        final, there = self._final, range(starts.start - first, starts.stop - first)
+        if final is not None:
+            begin = final.next - final.lo - first
+            there = range(begin, begin + 1)
         values = truths = bounds(self._values, signals, there)
         if asked.deciding is not asked.rule:
             truths = bounds(GrowingBounds(asked.deciding, asked.horizon, asked.ending), signals, there)
-        return asked.judged(np.concatenate([*values, *truths], axis=1))
+        found = np.concatenate([*values, *truths], axis=1)
+        return asked.judged(found if final is None else final.choose(found, final.known))
 
 
 def _require_bounded(asked: Asked) -> None:

@@ -315,3 +315,27 @@ def test_requirements_that_read_no_signal(formula: str, end: Any, tolerance: flo
     assert {name: tally.status for name, tally in online.finish().items()} == {
         judgement.name: judgement.status for judgement in whole
     }
+
+
+@pytest.mark.parametrize(("end", "at"), [("open", None), ("truncate", 4)])
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "always[0.4 s, inf] (freeze p = x in (eventually[0 s, 0.2 s] (x > p - 1 or y > 0)))",
+        "eventually (freeze p = y in (p > 1.8 and historically[0.1 s, 0.3 s] x < p))",
+    ],
+)
+def test_values_that_are_final_need_no_samples(formula: str, end, at: int | None) -> None:
+    monitor, rng = Monitor(f"signal x\nsignal y\nrequire r: {formula}\n", dt=0.1), np.random.default_rng(5)
+    trace = {name: rng.normal(size=150) for name in ("x", "y")}
+    trace["y"][77] = np.nan
+    online = monitor.online(How(at=at, end=end))
+    for k in range(150):
+        online.push([trace[name][k] for name in online.signals])
+        if end == "open" and k in (5, 90, 140):
+            low, high = monitor.bounds({name: x[: k + 1] for name, x in trace.items()}, at=at or 0)
+            ((_, least, most),) = online.open_starts("r")
+            assert (least, most) == ((-np.inf, high) if formula.startswith("always") else (low, np.inf))
+    assert len(next(iter(online._history.columns().values()))) < 100
+    wanted, found = monitor.check(trace, at=at, end=end)["r"], online.finish()["r"]
+    assert (found.low, found.high, found.status) == (*wanted.bounds, wanted.overall)

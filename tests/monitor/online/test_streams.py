@@ -70,7 +70,7 @@ def check_stream(formula: ir.Formula, trace: dict[str, np.ndarray], how: How) ->
     online = Online(compiled(), [rule], how)
     name, values = rule.name, GrowingBounds(rule, None, "truncate")
     deciding = decisive(rule, how.tolerance, compiled().signature).formula
-    everywhere, cut, said = online.repeats(name), how.end == "truncate", {}
+    everywhere, cut, said = online.requirement(name).everywhere, how.end == "truncate", {}
     for k in range(len(trace["x"])):
         known = {each: x[: k + 1] for each, x in trace.items()}
         assert online.push({each: x[k, 0] for each, x in known.items()}) == len(online.verdicts())

@@ -220,13 +220,13 @@ def _tell(decision: Decision, online: Online) -> None:
     """
     from stlc.cli.commands.check.text import WORDS, in_unit, signed
 
-    repeated = online.repeats(decision.requirement)
-    if decision.status == "satisfied" and repeated:
+    asked = online.requirement(decision.requirement)
+    if decision.status == "satisfied" and asked.everywhere:
         return
     low, high = decision.low, decision.high
     bounds = signed(low) if low == high else f"[{signed(low)}, {signed(high)}]"
-    value = in_unit(bounds, online.rule(decision.requirement).unit)
-    judged = f", judged from t = {decision.time:.10g} s" if repeated else ""
+    value = in_unit(bounds, asked.rule.unit)
+    judged = f", judged from t = {decision.time:.10g} s" if asked.everywhere else ""
     now = f"t = {online.time(decision.sample):.10g} s"
     emit(f"{now}  {visible(decision.requirement)}  {WORDS[decision.status]}  {value}{judged}")
 
