@@ -240,6 +240,10 @@ class Excerpt(NamedTuple):
     at: int
     stop: int
 
+    def within(self, samples: int) -> slice:
+        """The samples that are kept of a trace."""
+        return slice(self.first, min(self.stop, samples)) if self.at < samples else slice(0, samples)
+
 
 _FLOAT64 = np.dtype(np.float64)
 WHOLE = Excerpt(0, 0, 1 << 60)
@@ -250,20 +254,20 @@ def plain_columns(given: Given, needs: Sequence[Need], excerpt: Excerpt) -> Sign
 
     They need none if they are vectors (time,) in float64, and no times are given with them.
     """
-    env, samples, (first, at, stop) = {}, 0, excerpt
+    env, samples, kept = {}, 0, slice(0)
     for need in needs:
-        name = need.column.name
-        x = given.get(name)
+        x = given.get(need.column.name)
         if type(x) is not np.ndarray or x.ndim != 1 or x.dtype != _FLOAT64:
             return None
-        if (count := len(x)) != (samples or count):
-            return None
-        samples = count
-        env[name] = np.ascontiguousarray(x[first:stop, None] if at < count else x[:, None])
+        if len(x) != samples:
+            if samples:
+                return None
+            samples = len(x)
+            kept = excerpt.within(samples)
+        env[need.column.name] = np.ascontiguousarray(x[kept, None])
     if not samples or not given.keys().isdisjoint(CLOCKS):
         return None
-    cut = at < samples
-    return Signals(env, (), min(stop, samples) - first if cut else samples, NUMPY, first=first if cut else 0)
+    return Signals(env, (), kept.stop - kept.start, NUMPY, first=kept.start)
 
 
 def arrange(
@@ -294,18 +298,15 @@ def arrange(
         found |= {key: found[key].detach().cpu().numpy() for key in tensors}
         tensors = []
     shape, samples = _common_shape(found, name)
-    first, at, stop = excerpt if trace is None else WHOLE
-    if at >= samples:
-        first = 0
-    elif first or stop < samples:
-        found = {key: x[..., first:stop] if x.ndim else x for key, x in found.items()}
-        samples = min(stop, samples) - first
+    kept = (excerpt if trace is None else WHOLE).within(samples)
+    found = {key: x[..., kept] if x.ndim else x for key, x in found.items()}
+    samples = kept.stop - kept.start
     if tensors:
         from stlc.compile.backends.torch.ops import TORCH
 
         given_tensors = [found[key] for key in tensors]
         columns = _torch_columns(found, given_tensors, (*shape, samples))
-        return Signals(columns, shape, samples, TORCH, name, first=first)
+        return Signals(columns, shape, samples, TORCH, name, first=kept.start)
     columns = {}
     for key, x in found.items():
         array = np.asarray(x, dtype=np.float64)
@@ -313,7 +314,7 @@ def arrange(
             array = np.broadcast_to(array, (*shape, samples))
         columns[key] = np.ascontiguousarray(array.reshape(-1, samples).T)
     if trace is None:
-        return Signals(columns, shape, samples, NUMPY, name, first=first)
+        return Signals(columns, shape, samples, NUMPY, name, first=kept.start)
     changes = _conversions(needs, trace)
     columns = {key: changes[key](values) if key in changes else values for key, values in columns.items()}
     cells = None if trace.moments is None else _cells(trace.moments, columns, changes)

@@ -6,6 +6,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -114,9 +115,8 @@ class Monitor:
     def reads(self, require: Sequence[str] = ()) -> frozenset[str]:
         """Signals that assumptions and the named requirements (empty: all) read; components as `q[0]`."""
         rules = chosen(self.resolved.requirements, require)
-        formulas = [each.formula for each in (*rules, *self.resolved.assumptions)]
-        read = (columns_in(num) for formula in formulas for num in numbers(formula))
-        return frozenset[str]().union(*read)
+        formulas = (each.formula for each in (*rules, *self.resolved.assumptions))
+        return frozenset[str]().union(*map(columns_in, chain.from_iterable(map(numbers, formulas))))
 
     @property
     def compiled(self) -> Compiled:
@@ -368,11 +368,11 @@ def _selection(compiled: Compiled, names: Sequence[str], plain: bool) -> _Select
     needs = needs_of(compiled, [*rules, *compiled.assumptions] if plain else rules)
     past, future = 0, 0
     for rule in rules:
-        nums = list(numbers(rule.formula))
-        counted = any(leaf == ir.Signal(ir.ELAPSED) for num in nums for leaf in leaves(num))
-        past = max(past, FAR if rule.absolute or counted else history(rule.formula))
+        formula = rule.formula
+        counted = any(leaf == ir.Signal(ir.ELAPSED) for leaf in leaves(formula))
+        past = max(past, FAR if rule.absolute or counted else history(formula))
         lasting = rule.uses_end and window_of(rule, horizon) is None
-        later = max((farthest(num).future for num in nums), default=0) + (horizon or 0)
+        later = max((farthest(num).future for num in numbers(formula)), default=0) + (horizon or 0)
         future = max(future, FAR if lasting else rule.reach + later)
     return _Selection(compiled, rules, needs, Reach(past, future))
 

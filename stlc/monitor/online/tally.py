@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
@@ -100,18 +100,13 @@ class RequirementSummary:
         low, high, holds, fails = (part[:count] for part in judged)
         if not len(low):
             return self
-        found = replace(
-            self,
-            instants=self.instants + len(low),
-            holds=self.holds + int(np.count_nonzero(holds)),
-            fails=self.fails + int(np.count_nonzero(fails)),
-        )
-        least, most = int(np.argmin(low)), int(np.argmin(high))
-        if low[least] < self.low:
-            found = replace(found, low=float(low[least]), low_at=self.next + least)
-        if high[most] < self.high:
-            found = replace(found, high=float(high[most]), high_at=self.next + most)
-        return found
+        least, low_at, most, high_at = self.low, self.low_at, self.high, self.high_at
+        if low.min() < least:
+            least, low_at = float(low.min()), self.next + int(low.argmin())
+        if high.min() < most:
+            most, high_at = float(high.min()), self.next + int(high.argmin())
+        counts = self.instants + len(low), self.holds + int(holds.sum()), self.fails + int(fails.sum())
+        return RequirementSummary(*counts, least, most, low_at, high_at, self.first)
 
     @property
     def next(self) -> int:

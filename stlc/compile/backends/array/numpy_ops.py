@@ -129,21 +129,18 @@ class NumpyOps(FloatConstants, ScanByRows):
         if first.ndim != 2 or self._seen < _MANY or any(each.dtype != first.dtype for each in operands):
             return None
         name, traces, flags = _NAMES.get(first.dtype.char, ""), first.shape[1], first.flags
-        if len(operands) == 1:
-            if window.to_end:
-                return None
-            if window.width * traces <= _NARROW and (library := kernel_library(name)) is not None:
-                x = first if flags.c_contiguous and flags.writeable else first.copy()
-                out = np.empty((window.count, traces), x.dtype)
-                places = _BYTE.from_buffer(x.data), _BYTE.from_buffer(out.data)
-                sizes = window.rows, window.count, window.width, traces
-                if library.double_all(*places, *sizes, pick == "max"):
-                    raise MemoryError
-                return out
+        one, out = len(operands) == 1, np.empty((window.count, traces), first.dtype)
+        if one and window.to_end:
+            return None
+        if one and window.width * traces <= _NARROW and (library := kernel_library(name)) is not None:
+            x = first if flags.c_contiguous and flags.writeable else first.copy()
+            places = _BYTE.from_buffer(x.data), _BYTE.from_buffer(out.data)
+            if library.double_all(*places, window.rows, window.count, window.width, traces, pick == "max"):
+                raise MemoryError
+            return out
         kernel = window_kernel(name, traces, len(operands), pick, window)
         if kernel is None:
             return None
-        out = np.empty((window.count, traces), first.dtype)
         arrays = (*operands, out)
         kernel.run([Strided(x.ctypes.data, *(stride // x.itemsize for stride in x.strides)) for x in arrays])
         return out

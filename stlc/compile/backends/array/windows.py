@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import final
 
 from stlc.compile.backends.schedule import dual, neutral
@@ -26,9 +25,6 @@ _TILE = 1 << 17
 
 _OVERLAP = 8
 """Minimum tile length, in window widths."""
-
-
-_sliding = lru_cache(maxsize=512)(Sliding)
 
 
 @final
@@ -94,7 +90,7 @@ class Windows:
                 x = self.semantics.pair(held, x, other, self.ops)
             return self.semantics.reduce(x, pick, self.ops)
         if self.semantics.exact and rows:
-            found = self.ops.windows(operands, pick, _sliding(rows, min(count, rows), width))
+            found = self.ops.windows(operands, pick, Sliding(rows, min(count, rows), width))
             if found is not None:
                 return self.padded(found, count, neutral(pick))
         if width >= rows > 0 and (to_end := self._to_end(operands, pick, min(rows, count))) is not None:
