@@ -628,7 +628,7 @@ PARTS: dict[str, Callable[[Sizes], Parts]] = {
 
 @command(
     "python -m benchmarks streams",
-    "python -m benchmarks streams --only rows,blocks --rounds 3",
+    "python -m benchmarks streams --only rows,blocks --page docs/streams.md",
 )
 def streams(
     only: OnlyOption = None,
