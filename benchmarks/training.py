@@ -19,8 +19,8 @@ from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.parallel import executor
-from stlc.controller.parallel.inputs import input_files
 from stlc.controller.parallel.jobs import Job
+from stlc.controller.problem.inputs import input_files
 from stlc.controller.problem.task import Task
 from stlc.controller.run.checkpoint import load_checkpoint
 from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED

@@ -11,7 +11,7 @@ from helpers.tools import ROOT, load_tool
 structure = load_tool("structure")
 
 NODES = 463393
-CROSSINGS = 5.81
+CROSSINGS = 5.79
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {
     "numbers of one step": 5,

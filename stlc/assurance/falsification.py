@@ -185,8 +185,8 @@ class _Source:
 
     def files(self) -> CallFiles:
         """Files that the simulator reads, those of a black box among them."""
-        from stlc.controller.parallel.inputs import input_files
         from stlc.controller.parallel.workers import CallFiles
+        from stlc.controller.problem.inputs import input_files
 
         given = self.options
         if not self.model:

@@ -21,7 +21,7 @@ from stlc.extras import needed
 from stlc.jsontext import dumps
 from stlc.provenance import sha256
 from stlc.runtime import Controller
-from stlc.runtime.facts import CONTINUE, DECIDE, FACTS, FALL, FOLLOW, FORMAT, JUDGE, ControllerQuantity
+from stlc.runtime.facts import FACTS, FORMAT, ControllerQuantity, GraphFile
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -150,14 +150,14 @@ def write_onnx(run: Run, folder: Path, real: Precision = "float64") -> None:
     require_onnx()
     task, facts = run.task, {**_facts(run), "precision": real}
     graphs: dict[str, Callable[[], dict[str, Value]]] = {
-        DECIDE: lambda: deciding(task, run.network),
-        FOLLOW: lambda: following(task, run.network),
-        JUDGE: lambda: judging(task),
+        GraphFile.DECIDE: lambda: deciding(task, run.network),
+        GraphFile.FOLLOW: lambda: following(task, run.network),
+        GraphFile.JUDGE: lambda: judging(task),
     }
     if len(run.network.changes):
-        graphs[CONTINUE] = lambda: deciding(task, run.network, varied=False)
+        graphs[GraphFile.CONTINUE] = lambda: deciding(task, run.network, varied=False)
     if task.compiled.safety:
-        graphs[FALL] = lambda: falling(task)
+        graphs[GraphFile.FALL] = lambda: falling(task)
     digests = {}
     for name, make in graphs.items():
         try:

@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, get_args
 
@@ -141,7 +142,8 @@ def export(run: Run, target: Target, folder: Path, precision: Precision = "float
     with tempfile.TemporaryDirectory() as name:
         beside = Path(name)
         try:
-            (found, latency), unchecked = _WRITERS[target](run, beside, precision), ""
+            write = partial(_onnx, precision=precision) if target == "onnx" else _WRITERS[target]
+            (found, latency), unchecked = write(run, beside), ""
         except Unchecked as why:
             found, latency, unchecked = None, None, why.why
         texts = {path.name: path.read_bytes() for path in sorted(beside.iterdir()) if path.name != BUILT}
@@ -166,7 +168,7 @@ EXAMPLES = ("main.c", "Makefile")
 Checked: TypeAlias = tuple[Agreement | None, Latency | None]
 
 
-def _torch(run: Run, folder: Path, precision: Precision) -> Checked:  # noqa: ARG001
+def _torch(run: Run, folder: Path) -> Checked:
     """Write `decide.pt2`, `backup.pt2` and `controller.json`; compare the programs with the run.
 
     `controller.json` describes the inputs and outputs of the programs.
@@ -201,7 +203,7 @@ def _onnx(run: Run, folder: Path, precision: Precision) -> Checked:
     return fresh.worst(kept, off).worst(guarded), timed(run.task, folder)
 
 
-def _c(run: Run, folder: Path, precision: Precision) -> Checked:  # noqa: ARG001
+def _c(run: Run, folder: Path) -> Checked:
     """Write the C header, its weights, an example program and its Makefile.
 
     The example program is then compiled and compared with the run.
@@ -229,11 +231,7 @@ def _c(run: Run, folder: Path, precision: Precision) -> Checked:  # noqa: ARG001
     return agreement(run.policy, program("policy"), states=STATES).worst(guarded), None
 
 
-_WRITERS: Mapping[Target, Callable[[Run, Path, Precision], Checked]] = {
-    "torch": _torch,
-    "c": _c,
-    "onnx": _onnx,
-}
+_WRITERS: Mapping[Target, Callable[[Run, Path], Checked]] = {"torch": _torch, "c": _c}
 
 
 def _facts(run: Run) -> dict[str, object]:

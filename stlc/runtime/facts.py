@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,11 +20,8 @@ from stlc.runtime.prefixes import SAMPLINGS, PrefixGrid
 Numbers: TypeAlias = NDArray[np.float64]
 FACTS = "controller.json"
 FORMAT = "stlc-controller/1"
-DECIDE, FOLLOW, JUDGE, FALL = "decide.onnx", "follow.onnx", "judge.onnx", "fall.onnx"
-CONTINUE = "continue.onnx"
 MAX_STEPS, MAX_PREFIXES = 100_000, 10_000_000
 """Largest number of steps of a plan, and of prefixes of one length, that a description may ask for."""
-_NEEDED, _GRAPHS = {DECIDE, FOLLOW, JUDGE}, {DECIDE, FOLLOW, JUDGE, FALL, CONTINUE}
 _DAMAGE = (
     OSError,
     ValueError,
@@ -33,6 +31,20 @@ _DAMAGE = (
     OverflowError,
     RecursionError,
 )
+
+
+class GraphFile(StrEnum):
+    """Files of the graphs of an exported controller."""
+
+    DECIDE = "decide.onnx"
+    FOLLOW = "follow.onnx"
+    JUDGE = "judge.onnx"
+    FALL = "fall.onnx"
+    CONTINUE = "continue.onnx"
+
+
+NEEDED = frozenset({GraphFile.DECIDE, GraphFile.FOLLOW, GraphFile.JUDGE})
+"""Files that every exported controller has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +161,7 @@ def _facts(read: Mapping[str, Any], folder: Path) -> Facts:
     if read["format"] != FORMAT:
         raise ValueError(f"its format is {read['format']}, not {FORMAT}")
     digests = dict(read["files"])
-    if not _NEEDED <= digests.keys() <= _GRAPHS:
+    if not NEEDED <= digests.keys() <= {*GraphFile}:
         raise ValueError(f"its graphs are {', '.join(digests)}")
     states, controls = (tuple(map(_quantity, read[key])) for key in ("states", "controls"))
     requirements, dt, horizon = tuple(read["requirements"]), float(read["dt"]), int(read["horizon"])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stlc.diagnostics import Diagnostic, RunError
 from stlc.extras import needed
-from stlc.runtime.facts import CONTINUE, DECIDE, FALL, FOLLOW, JUDGE, Facts
+from stlc.runtime.facts import Facts, GraphFile
 
 Numbers: TypeAlias = NDArray[np.float64]
 _KINDS: Mapping[str, type] = {"tensor(double)": np.float64, "tensor(float)": np.float32}
@@ -63,7 +63,7 @@ class Graphs:
     def __init__(self, facts: Facts, *, threads: int = 1) -> None:
         self.facts = facts
         self.threads = threads
-        self._decide, self._follow = self._session(DECIDE), self._session(FOLLOW)
+        self._decide, self._follow = self._session(GraphFile.DECIDE), self._session(GraphFile.FOLLOW)
 
     def prepare(self) -> None:
         """Load the graphs of the backup policy now, so that its first decision does not wait for them."""
@@ -117,15 +117,15 @@ class Graphs:
 
     @cached_property
     def _judge(self) -> Any:
-        return self._session(JUDGE)
+        return self._session(GraphFile.JUDGE)
 
     @cached_property
     def _continue(self) -> Any:
-        return self._session(CONTINUE) if CONTINUE in self.facts.graphs else self._decide
+        return self._session(GraphFile.CONTINUE) if GraphFile.CONTINUE in self.facts.graphs else self._decide
 
     @cached_property
     def _fall(self) -> Any:
-        return self._session(FALL) if FALL in self.facts.graphs else None
+        return self._session(GraphFile.FALL) if GraphFile.FALL in self.facts.graphs else None
 
     def _session(self, name: str) -> Any:
         onnxruntime = needed("onnxruntime")

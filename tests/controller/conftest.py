@@ -1,4 +1,4 @@
-"""The traffic task, compiled once."""
+"""The traffic task, compiled once, and a project in two folders."""
 
 from __future__ import annotations
 
@@ -28,3 +28,19 @@ def car_task() -> Task:
 def car_run(car_task: Task, tmp_path: Path) -> RunDir:
     """The folder of a run that has not begun."""
     return open_folder(car_task, TrainConfig(steps=1), Launch(root=tmp_path / "runs", name="test"))
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a specification and its system in a folder beside."""
+    home = tmp_path / "project"
+    (home / "specs").mkdir(parents=True)
+    (home / "models").mkdir()
+    car = (ROOT / "examples/car.yaml").read_text()
+    (home / "models/base.yaml").write_text(car)
+    (home / "models/car.yaml").write_text("extends: base.yaml\n")
+    text = (ROOT / "specs/traffic.stl").read_text().replace('"../examples/car.yaml"', '"../models/car.yaml"')
+    (home / "specs/drive.stl").write_text(text)
+    (home / "specs/driving_rules.stl").write_text((ROOT / "specs/driving_rules.stl").read_text())
+    monkeypatch.chdir(home)
+    return home

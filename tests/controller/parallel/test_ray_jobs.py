@@ -14,10 +14,10 @@ import pytest
 import torch
 
 from stlc.controller.parallel.elsewhere import RemoteCall, RemoteValue, absolute, answer, linked
-from stlc.controller.parallel.inputs import input_files
 from stlc.controller.parallel.jobs import Job, JobResult, core_shares
 from stlc.controller.parallel.ray_jobs import RayExecutor, TrainingCall, claimed, received, trained
 from stlc.controller.parallel.workers import CallFiles, LostCall
+from stlc.controller.problem.inputs import input_files
 from stlc.controller.run.checkpoint import load_checkpoint, save_checkpoint
 from stlc.diagnostics import RunError
 from stlc.rundir import RunDir, every_run

@@ -193,7 +193,7 @@ def _judged(works: Sequence[Work], jobs: int, cluster: str | None) -> Iterator[t
     texts: Sequence[Path] = ()
     if cluster is not None:
         sent = [replace(work, name=_seen(work)) for work in works]
-        from stlc.controller.parallel.inputs import input_files
+        from stlc.controller.problem.inputs import input_files
 
         question = works[0].question
         if question.spec is not None:

@@ -94,7 +94,7 @@ class Many:
         arguments = (operand(str(part.spec)), *command_line(words), *drawn)
         if self.cluster is None:
             return Job(self.name(part), arguments)
-        from stlc.controller.parallel.inputs import input_files
+        from stlc.controller.problem.inputs import input_files
 
         read = input_files(part.spec, self.system, launch.overrides)
         return Job(self.name(part), arguments, read, launch.root)

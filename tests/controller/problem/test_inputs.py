@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stlc.controller.parallel.inputs import input_files
-
-ROOT = Path(__file__).parents[3]
+from stlc.controller.problem.inputs import input_files
 
 
 def test_what_a_training_reads(project: Path) -> None:

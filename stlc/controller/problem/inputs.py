@@ -1,4 +1,4 @@
-"""Input files of a training run: the specification, and what it and its system name."""
+"""Input files of a problem: the specification, and what it and its system name."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from stlc.grammar.parser import parse
 def input_files(
     path: Path, system: str | None = None, overrides: Mapping[str, str] | None = None
 ) -> tuple[Path, ...]:
-    """Paths of the input files of a training run.
+    """Paths of the input files of a problem.
 
-    If a file has errors, the files that it names may be missing; the training itself reports the errors.
+    If a file has errors, the files that it names may be missing; whoever reads it reports the errors.
 
     Args:
         path: path of the specification.
