@@ -74,6 +74,10 @@ class Windows:
             reached = self.over((lefts[0][lo:], x), pick, count=count, width=width)
             held = self.over(lefts, other, count=count, width=lo)
             return self.semantics.pair(held, reached, other, self.ops)
+        if self.semantics.exact and rows and count > 1:
+            found = self.ops.windows(operands, pick, Sliding(rows, min(count, rows), width))
+            if found is not None:
+                return self.padded(found, count, neutral(pick))
         if lefts and width >= rows and (tiles := self._tiles(x, min(count, rows), 1)):
             return self.padded(self._until_by_tiles(operands, pick, tiles), count, neutral(pick))
         if tiles := self._tiles(x, count, width):
@@ -89,10 +93,6 @@ class Windows:
                 held = (self.ops.cummin if pick == "max" else self.ops.cummax)(left)
                 x = self.semantics.pair(held, x, other, self.ops)
             return self.semantics.reduce(x, pick, self.ops)
-        if self.semantics.exact and rows:
-            found = self.ops.windows(operands, pick, Sliding(rows, min(count, rows), width))
-            if found is not None:
-                return self.padded(found, count, neutral(pick))
         if width >= rows > 0 and (to_end := self._to_end(operands, pick, min(rows, count))) is not None:
             return self.padded(to_end, count, neutral(pick))
         return self._doubling(operands, pick, count, width)
