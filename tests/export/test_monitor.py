@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import formula_strategies as random_formulas
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from stlc.cli.framework.app import main
 from stlc.compile.backends.c.streams import streams_of
+from stlc.compile.ir import nodes as ir
+from stlc.compile.ir import typed
 from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.diagnostics import UsageError
@@ -84,7 +86,13 @@ def test_a_monitor_is_built_without_warnings_and_says_what_python_says(
     np.testing.assert_allclose(found, wanted, rtol=1e-6 if single else 1e-12)
 
 
+X, Y = (typed.Predicate(random_formulas.SPAN, ir.Signal(name), strict=False) for name in ("x", "y"))
+
+
 @settings(max_examples=EXAMPLES, deadline=None)
+@example(
+    [typed.Edge(random_formulas.SPAN, "rise", X), Y], {name: np.ones((2, 1)) for name in ("x", "y", "z")}
+)
 @given(
     written=st.lists(random_formulas.formulas(), min_size=1, max_size=12),
     trace=random_formulas.traces(1, 30, 1),

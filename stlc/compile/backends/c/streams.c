@@ -520,7 +520,7 @@ static void begin(monitor *m, int32_t r, const graph *g) {
   }
   for (int32_t i = g->first; i < g->first + g->count; ++i) {
     const node *o = m->t->nodes + i;
-    const node *part = m->t->nodes + m->t->operands[o->operands].node;
+    const node *part = m->t->nodes + (o->count ? m->t->operands[o->operands].node : i);
     const int yes = o->flags & DUAL ? NO : YES;
     const at top = n + o->ahead;
     if (o->kind == TRUTH && !n) ever(m, r, i, 0, o->lo);
