@@ -194,7 +194,7 @@ def c2po(text: str) -> tuple[list[str], list[str]]:
 
 def samples_of(path: Path, names: Sequence[str]) -> list[dict[str, float]]:
     """Samples of a trace; its header may be a comment."""
-    lines = path.read_text().splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines()
     rows = csv.reader(line for line in lines if not line.startswith("#"))
     head = lines[0].lstrip("# ").split(",") if lines[0].startswith("#") else list(names)
     found = [dict(zip(map(str.strip, head), map(float, row), strict=True)) for row in rows]

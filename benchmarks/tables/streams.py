@@ -381,14 +381,14 @@ def _growth(name: str, formula: Formula, samples: int) -> tuple[float, int]:
     if once * filled < _FULL:
         feed.run(filled)
     number = min(samples, int(_FULL / once))
-    Path("/proc/self/clear_refs").write_text("5")  # the peak is what is used now
+    Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # the peak is what is used now
     before = _peak()
     feed.run(number)
     return _peak() - before, number
 
 
 def _peak() -> float:
-    (found,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    (found,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="utf-8"))
     return float(found)
 
 
