@@ -14,7 +14,7 @@ from typing import Any
 from stlc.diagnostics import Diagnostic, MissingError
 
 EXTRAS = {
-    "train": ("torch", "safetensors"),
+    "train": ("torch", "safetensors", "mpmath"),
     "plot": ("matplotlib", "pillow"),
     "parquet": ("pyarrow",),
     "mat": ("h5py",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import pickle
 import re
@@ -25,6 +26,20 @@ def test_the_table_is_that_of_the_project():
         names = [re.split(r"[<>=~; ]", entry)[0] for entry in declared[extra]]
         assert EXTRAS[extra] == tuple(name for name in names if not name.startswith("stlc[")), extra
     assert EXTRAS.keys() <= declared.keys()
+
+
+def test_what_is_imported_is_declared():
+    """Packages that `needed` asks for may belong to no extra: the error names them."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {re.split(r"[<>=~; ]", entry)[0] for entry in project["dependencies"]}
+    declared |= {name for brought in EXTRAS.values() for name in brought} | {"stlc"}
+    other = {"yaml": "pyyaml", "pybullet_utils": "pybullet"} | extras._PACKAGES
+    for path in (ROOT / "stlc").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            for name in {each.split(".")[0] for each in names} - sys.stdlib_module_names:
+                assert other.get(name, name).replace("_", "-") in declared, (path, name)
 
 
 def test_torch_is_asked_for_with_the_build_for_processors():
