@@ -86,6 +86,9 @@ class Question:
     strict: bool = False
 
 
+OF_FILES = {"resample", "dt", "max_gap", "between", "clock", "group", "columns"}
+
+
 def check(
     spec: ast.Spec | str | Path | None,
     trace: Subject,
@@ -99,7 +102,7 @@ def check(
         spec: a specification, its text, or the path of its file; None: the one that the trace stores.
         trace: path of a trace file, a `Trace`, a data frame of pandas or polars, or arrays by signal name.
         chunk: samples per chunk of a file; 0: a file is read in chunks only if memory is too small for it.
-        options: fields of `Question`, such as `at`, `require`, `overrides` or, for a file, `resample`.
+        options: fields of `Question`, such as `at`, `require` or `overrides`; those in `OF_FILES` are for files.
 
     Raises:
         SpecError: the specification is invalid.
@@ -113,6 +116,8 @@ def check(
     if not isinstance(trace, str | Path):
         if known is None:
             raise usage("which specification?", "stlc.check(spec, trace)")
+        for name in options.keys() & OF_FILES:
+            raise usage(f"`{name}` is for files; these samples are judged as they are", "give a path")
         return judged_by(known, trace, question)
     found = judge(Path(trace), question, known=known, chunk=chunk)
     if len(found) > 1:

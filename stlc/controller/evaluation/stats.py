@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
-from typing import Any
 
 from stlc.jsontext import Num
 
@@ -44,9 +43,8 @@ def student(freedom: int) -> float:
     """97.5 % quantile of Student's t distribution with `freedom` degrees of freedom."""
     from mpmath import betainc, findroot  # torch brings it
 
-    def above(t: float) -> Any:
-        """Probability that the absolute value exceeds `t`, above that of the quantile."""
-        share = freedom / (freedom + t * t)
-        return betainc(freedom / 2, 0.5, 0, share, regularized=True) - (1.0 - CONFIDENCE)
+    def above(t: float) -> float:
+        share: float = betainc(freedom / 2, 0.5, 0, freedom / (freedom + t * t), regularized=True)
+        return share - 1.0 + CONFIDENCE
 
     return float(findroot(above, (1.0, 20.0), solver="anderson"))
