@@ -102,7 +102,7 @@ def check(
         spec: a specification, its text, or the path of its file; None: the one that the trace stores.
         trace: path of a trace file, a `Trace`, a data frame of pandas or polars, or arrays by signal name.
         chunk: samples per chunk of a file; 0: a file is read in chunks only if memory is too small for it.
-        options: fields of `Question`, such as `at`, `require` or `overrides`; those in `OF_FILES` are for files.
+        options: fields of `Question`, such as `at` or `require`; those in `OF_FILES` are for files.
 
     Raises:
         SpecError: the specification is invalid.
