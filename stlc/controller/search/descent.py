@@ -28,8 +28,10 @@ if TYPE_CHECKING:
 
 LEVELS = np.array([1.0, 0.1, 0.01])
 """Shares of the margins of the conditions, from one to the next where that much is not possible."""
-DAMPING, LEAST, MOST = 1e-2, 1e-9, 1e4
+DAMPING, LEAST, MOST = 1e-4, 1e-9, 1e4
 """The first, the least and the greatest damping."""
+CAUTIOUS = 1e-2
+"""The first damping of a plan that approaches all of its new schedule at once."""
 EASED, RAISED, LONG = 0.3, 10.0, 0.3
 """Factors of the damping after a step of more than the length `LONG`, and after one that improved nothing."""
 GAIN = 0.95
@@ -91,7 +93,8 @@ class Descent:
         """
         self._now.put(index, self._newton.begin(self._x0, plans))
         self._needed[index], self._given[index], self._stalled[index] = needed, GIVEN, 0
-        self._level[index], self._damping[index] = np.arange(len(index)) // 2 % 2, DAMPING
+        self._level[index] = np.arange(len(index)) // 2 % 2
+        self._damping[index] = np.where(ordered, DAMPING, CAUTIOUS)
         self._end[index], self._ahead[index] = np.where(ordered, -1, self._last), AHEAD
         self.over[index] = False
 

@@ -134,7 +134,8 @@ class _Orders:
                 continue
             local = float(search.spent[row] - self._own[row])
             share = ORDERS if self._ordered else min(SHARE, local / EQUAL)
-            lead = LONG if self._ordered or not self._rounds else LEAD if self._first == 0 else 0.0
+            alone = not self._rounds and not self._jumps
+            lead = LONG if self._ordered or alone else LEAD if self._first == 0 else 0.0
             allowed = local + max(lead, share * local)
             going, before = self._running.get(row), search.spent.clone()
             if going is None:
