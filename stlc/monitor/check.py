@@ -86,6 +86,7 @@ class Question:
     strict: bool = False
 
 
+# of reading a file; signals that are given as arrays or frames are judged as they are
 OF_FILES = {"resample", "dt", "max_gap", "between", "clock", "group", "columns"}
 
 
@@ -117,7 +118,10 @@ def check(
         if known is None:
             raise usage("which specification?", "stlc.check(spec, trace)")
         for name in options.keys() & OF_FILES:
-            raise usage(f"`{name}` is for files; these samples are judged as they are", "give a path")
+            raise usage(
+                f"`{name}` is for files; these samples are judged as they are",
+                "write them to a file, and give its path",
+            )
         return judged_by(known, trace, question)
     found = judge(Path(trace), question, known=known, chunk=chunk)
     if len(found) > 1:

@@ -451,7 +451,7 @@ def name_values(command: Any) -> None:
 
 #
 # Newer releases of typer build a pydantic adapter for every parameter of the running command, which takes a
-# tenth of a second. Most values are texts already and are passed on; typer converts the others.
+# tenth of a second. Texts, paths and numbers within bounds are converted here; typer converts the others.
 # Releases without adapters are not changed.
 
 _SLOT = "_runtime_param"
@@ -460,8 +460,8 @@ _SLOT = "_runtime_param"
 def spare_adapters(command: Any) -> None:
     """Replace the converters of all parameters of a command, and of its subcommands, to save time.
 
-    The converters of typer are slow to build. Their replacements return a value of the right type unchanged,
-    and build typer's converter only for other values.
+    The converters of typer are slow to build. Their replacements convert texts, paths and numbers within
+    their bounds, and build typer's converter only for other values.
     """
     for param in _params(command):
         if getattr(param, _SLOT, param) is None and hasattr(param, "type_descriptor"):

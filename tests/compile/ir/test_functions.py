@@ -53,7 +53,7 @@ class TestEveryEntryHasEverything:
             assert len(function.slopes("r", *arguments)) == len(arguments)
 
     def test_its_range_is_that_of_interval_arithmetic(self, function: Function) -> None:
-        """Where both know the range; that of a function in `COARSE` may be wider."""
+        """Equality of two known ranges; that of a function in `COARSE` may be wider."""
         names = [f"x{i}" for i in range(max(function.least, 2 if function.most is None else 1))]
         cases = list(product(ENDS, repeat=len(names)))
         number = ir.Op(function.name, tuple(map(ir.Signal, names)))
