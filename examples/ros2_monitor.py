@@ -75,7 +75,8 @@ class MonitorNode(Node):
         """A verdict as a diagnostic; a violation with its cause."""
         violated = decision.status == "violated"
         cause = self.online.cause(decision.requirement) if violated else None
-        values = {"start": f"{decision.time:g} s", "low": f"{decision.low:g}", "high": f"{decision.high:g}"}
+        low, high = self.online.bounds(decision.requirement, decision.start)
+        values = {"start": f"{decision.time:g} s", "low": f"{low:g}", "high": f"{high:g}"}
         return DiagnosticStatus(
             level=ERROR if violated else OK,
             name=f"stlc: {decision.requirement}",

@@ -474,7 +474,9 @@ def online(monitor: Monitor, signals: Mapping[str, Any]) -> list[list[Any]]:
     run, found = monitor.online(), []
     for k in range(len(signals["x"])):
         run.push({name: values[k] for name, values in signals.items()})
-        found += [[k, d.requirement, d.start, str(d.status), d.low, d.high, d.sample] for d in run.verdicts()]
+        for each in run.verdicts():
+            bounds = run.bounds(each.requirement, each.start)
+            found.append([k, each.requirement, each.start, str(each.status), *bounds, each.sample])
     return found
 
 

@@ -270,18 +270,16 @@ def _compare(method: ast.FunctionDef, numbers: Mapping[str, float], counts: Coun
     names = sorted(rows[0])
     monitor = stlc.Monitor(f"signal {', '.join(names)}\nrequire r: {formula}", dt=1.0)
     online = monitor.online(How(at="all"))
-    said: dict[int, Decision] = {}
+    said: dict[int, tuple[Decision, float, float]] = {}
     for row in rows:
         if online.push(row):
-            said |= {each.start: each for each in online.verdicts()}
+            said |= {each.start: (each, *online.bounds("r", each.start)) for each in online.verdicts()}
     values = monitor.robustness({name: [float(row[name]) for row in rows] for name in names}, end="truncate")
     for update, wanted in expected:
         if (at := update - ahead) < 0:
             continue  # before the first value is known
-        value, decision = float(values[at]), said[at]
-        agrees = decision.low <= value <= decision.high and (decision.status == "satisfied") == (
-            value >= -1e-6
-        )
+        value, (decision, low, high) = float(values[at]), said[at]
+        agrees = low <= value <= high and (decision.status == "satisfied") == (value >= -1e-6)
         if agrees and (value == wanted or abs(value - wanted) < 1e-12):
             counts.equal += 1
         else:

@@ -9,7 +9,6 @@ absolute operators (`always@[a, b]`), whose interval counts from the start of th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -153,8 +152,7 @@ def rule_signal(rule: CompiledRequirement, record: Record, horizon: int | None, 
         least, most = (rule_signal(each, record.sure, horizon, end) for each in sides)
         return _agreed(least, most, record, end)
     if rule.absolute:
-        (value,) = rules_at([rule], record, 0, horizon, end)
-        return record.ops.cat([value] * record.samples)
+        return record.ops.cat([rule_at(rule, record, 0, horizon, end)] * record.samples)
     if window_of(rule, horizon) is None:
         formula = rule.under(record.semantics)
         return robustness_signal(formula, record.env, ops=record.ops, semantics=record.semantics, end=end)
@@ -180,30 +178,21 @@ def _nan(record: Record, count: int) -> Array:
     return record.ops.full((count, like.shape[1]), math.nan, like)
 
 
-def rules_at(
-    rules: Sequence[CompiledRequirement], record: Record, at: int, horizon: int | None, end: Boundary
-) -> list[Array]:
-    """Robustness of several requirements at sample `at`, `(1, batch)` each.
-
-    `end` is that of `rule_signal`; `horizon` is the length of a planning window in steps.
-    """
-    sides = [_sides(rule, record) for rule in rules]
-    if any(sides):
-        known = [each for rule, pair in zip(rules, sides, strict=True) for each in pair or (rule,)]
-        rows = iter(rules_at(known, record.sure, at, horizon, end))
-        return [_agreed(next(rows), next(rows), record, end) if pair else next(rows) for pair in sides]
-    starts = [0 if rule.absolute else starts_of(rule, record.samples, horizon, at).start for rule in rules]
-    together = {
-        i: rule.under(record.semantics)
-        for i, (rule, start) in enumerate(zip(rules, starts, strict=True))
-        if start == at and window_of(rule, horizon) is None and _has_value(rule, record, at, end)
-    }
-    values = record.values([*together.values()], range(at, at + 1), end) if together else []
-    found = dict(zip(together, values, strict=True))
-    return [
-        found[i] if i in found else _alone(rule, record, start, horizon, end)
-        for i, (rule, start) in enumerate(zip(rules, starts, strict=True))
-    ]
+def rule_at(rule: CompiledRequirement, record: Record, at: int, horizon: int | None, end: Boundary) -> Array:
+    """Robustness of a requirement at sample `at`, `(1, batch)`; the arguments are those of `rule_signal`."""
+    sides = _sides(rule, record)
+    if sides:
+        least, most = (rule_at(each, record.sure, at, horizon, end) for each in sides)
+        return _agreed(least, most, record, end)
+    start = 0 if rule.absolute else starts_of(rule, record.samples, horizon, at).start
+    there, window = range(start, start + 1), window_of(rule, horizon)
+    stop = None if window is None else start + window + 1
+    inner = record if stop is None else record.cut(stop)
+    whole = stop is None or stop <= record.samples
+    if end == "strict" and not (whole and defined_at(rule.formula, inner.samples, there)):
+        return _nan(record, 1)
+    going_on = not whole and end in ("lower", "upper")
+    return inner.values([rule.under(record.semantics)], there, end, stop if going_on else None)[0]
 
 
 def _sides(rule: CompiledRequirement, record: Record) -> tuple[CompiledRequirement, ...]:
@@ -218,22 +207,6 @@ def _agreed(least: Array, most: Array, record: Record, end: Boundary) -> Array:
     if end in ("lower", "upper"):
         return least if end == "lower" else most
     return record.ops.where(least == most, least, math.nan)
-
-
-def _has_value(rule: CompiledRequirement, record: Record, at: int, end: Boundary) -> bool:
-    return end != "strict" or defined_at(rule.formula, record.samples, range(at, at + 1))
-
-
-def _alone(rule: CompiledRequirement, record: Record, at: int, horizon: int | None, end: Boundary) -> Array:
-    window = window_of(rule, horizon)
-    stop = None if window is None else at + window + 1
-    inner = record if stop is None else record.cut(stop)
-    whole = stop is None or stop <= record.samples
-    if end == "strict" and not (whole and _has_value(rule, inner, at, end)):
-        return _nan(record, 1)
-    going_on = not whole and end in ("lower", "upper")
-    formula = rule.under(record.semantics)
-    return inner.values([formula], range(at, at + 1), end, stop if going_on else None)[0]
 
 
 def check_length(rule: CompiledRequirement, samples: int, starts: range, grid: Grid) -> Diagnostic | None:

@@ -224,7 +224,12 @@ class Signals:
         return np.asarray(unknown)
 
     def like_given(self, values: Array) -> Array:
-        """Reshape values (time, batch) to (…, time), the shape in which the signals were given."""
+        """Reshape values (time, batch) to (…, time), the shape in which the signals were given.
+
+        Values that are those of a signal, as of `x >= 0`, are copied.
+        """
+        if self.ops is NUMPY and values.base is not None:
+            values = values.copy()
         return values.swapaxes(0, 1).reshape((*self.shape, len(values)))
 
     def at_one(self, values: Array) -> Array:
@@ -249,25 +254,29 @@ _FLOAT64 = np.dtype(np.float64)
 WHOLE = Excerpt(0, 0, 1 << 60)
 
 
-def plain_columns(given: Given, needs: Sequence[Need], excerpt: Excerpt) -> Signals | None:
-    """Return signals as `arrange` does if they need no conversion, else None.
+def plain_columns(given: Given, needs: Sequence[Need], excerpt: Excerpt) -> dict[str, Array] | None:
+    """Return the columns of `arrange` if they need no conversion, else None.
 
-    They need none if they are vectors (time,) in float64, and no times are given with them.
+    They need none if they are vectors (time,) in float64 without NaN, and no times are given with them.
     """
     env, samples, kept = {}, 0, slice(0)
     for need in needs:
-        x = given.get(need.column.name)
+        name = need.column.name
+        x = given.get(name)
         if type(x) is not np.ndarray or x.ndim != 1 or x.dtype != _FLOAT64:
             return None
         if len(x) != samples:
             if samples:
                 return None
             samples = len(x)
+            if excerpt.at >= samples:
+                return None
             kept = excerpt.within(samples)
-        env[need.column.name] = np.ascontiguousarray(x[kept, None])
-    if not samples or not given.keys().isdisjoint(CLOCKS):
-        return None
-    return Signals(env, (), kept.stop - kept.start, NUMPY, first=kept.start)
+        x = np.ascontiguousarray(x[kept])
+        if np.isnan(x.dot(x)):  # a sum of squares is NaN only where one of them is
+            return None
+        env[name] = x[:, None]
+    return env if samples and given.keys().isdisjoint(CLOCKS) else None
 
 
 def arrange(

@@ -6,20 +6,24 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from stlc.compile.backends.array.graph import SignalPlan, signal_plan
+from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid, lacks
+from stlc.compile.ir.holes import partial
 from stlc.compile.ir.support import Reach, columns_in, farthest, history
 from stlc.compile.ir.traverse import leaves, numbers
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
-from stlc.compile.semantics.semantics import Semantics, semantics_of
+from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import TOLERANCE, End, overall, satisfied, violated
 from stlc.diagnostics import SpecError, TraceError, usage
 from stlc.files import read_source
@@ -33,10 +37,10 @@ from stlc.monitor.grid import Times, agreed_times, given_times, named_times, req
 from stlc.monitor.instants import (
     At,
     check_length,
+    rule_at,
     rule_bounds,
     rule_known,
     rule_signal,
-    rules_at,
     starts_of,
     window_of,
 )
@@ -210,7 +214,12 @@ class Monitor:
         Returns:
             An array of the shape of the signals; with `at`, of that shape without the time axis.
         """
-        return _least(self._prepare(signals, at=at, semantics=semantics_of(semantics, smoothing)), end, at)
+        chosen, known = semantics_of(semantics, smoothing), self._selected.get(_ALL)
+        if known is not None and type(signals) is dict and chosen.exact:
+            found = known.least(signals, end, at)
+            if found is not None:
+                return found
+        return _least(self._prepare(signals, at=at, semantics=chosen), end, at)
 
     def requirement_robustness(
         self,
@@ -265,19 +274,14 @@ class Monitor:
         at: int | None = None,
         semantics: Semantics | None = None,
     ) -> Prepared:
-        key, signals = (_UNKNOWN, tuple(require), plain), None
-        selected = self._selected.get(key)
-        if selected is not None and type(subject) is dict:
-            signals = plain_columns(subject, selected.needs, selected.excerpt(at))
-        if selected is None or signals is None:
-            given, recorded = self._read(subject, key[1])
-            key = (recorded, *key[1:])
-            if key not in self._selected:
-                self._selected[key] = _selection(self._ready(recorded), *key[1:])
-            selected = self._selected[key]
-            if isinstance(given, Trace):
-                require_windows(given, selected.rules)
-            signals = arrange(given, selected.needs, plain=plain, excerpt=selected.excerpt(at))
+        given, recorded = self._read(subject, tuple(require))
+        key = (recorded, tuple(require), plain)
+        if key not in self._selected:
+            self._selected[key] = _selection(self._ready(recorded), *key[1:])
+        selected = self._selected[key]
+        if isinstance(given, Trace):
+            require_windows(given, selected.rules)
+        signals = arrange(given, selected.needs, plain=plain, excerpt=selected.excerpt(at))
         record = Record.of(signals.env, signals.ops, signals.cells, semantics)
         return Prepared(selected.compiled, selected.rules, signals, record, cause_of, facts_of)
 
@@ -337,10 +341,12 @@ class Monitor:
         return self._compiled[grid]
 
 
-_UNKNOWN = Times()
+_UNKNOWN, _EXACT = Times(), Exact()
+_ALL = (_UNKNOWN, (), False)
+"""Key of the selection of all requirements, for signals without times."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Selection:
     """Requirements that are evaluated together.
 
@@ -348,12 +354,14 @@ class _Selection:
         compiled: the specification.
         rules: the requirements.
         needs: signals that they read.
+        factors: factor of each in the overall robustness.
         reach: samples before and after an instant that their values there may depend on.
     """
 
     compiled: Compiled
     rules: tuple[CompiledRequirement, ...]
     needs: tuple[Need, ...]
+    factors: tuple[float, ...]
     reach: Reach
 
     def excerpt(self, at: int | None) -> Excerpt:
@@ -361,6 +369,34 @@ class _Selection:
         if at is None or at < 0:
             return WHOLE
         return Excerpt(max(at - self.reach.past, 0), at, at + self.reach.future + 1)
+
+    def least(self, given: Given, end: Boundary, at: int | None) -> Array | None:
+        """Robustness of the requirements on signals that need no conversion; see `Monitor.robustness`.
+
+        None is returned where `Prepared` must be evaluated: signals have unknown values, or there is no plan.
+        """
+        excerpt = self.excerpt(at)
+        env = None if (at or 0) < 0 else plain_columns(given, self.needs, excerpt)
+        if env is None:
+            return None
+        samples = len(next(iter(env.values())))
+        plan = _plan(self, samples, end, None if at is None else excerpt.at - excerpt.first)
+        if plan is None:
+            return None
+        whole = overall(plan.values(env), self.factors, NUMPY, _EXACT)
+        if at is not None:
+            return np.float64(whole[0, 0])
+        return whole.reshape(-1) if whole.base is None else whole.flatten()  # see `Signals.like_given`
+
+
+@lru_cache(maxsize=512)
+def _plan(selected: _Selection, samples: int, end: Boundary, at: int | None) -> SignalPlan | None:
+    """Plan of the robustness at every sample or at one; None where values are not those of the formulas."""
+    rules, horizon = selected.rules, selected.compiled.grid.horizon
+    if any(rule.absolute or window_of(rule, horizon) is not None or partial(rule.formula) for rule in rules):
+        return None
+    instants = range(samples) if at is None else range(at, at + 1)
+    return signal_plan(tuple(rule.formula for rule in rules), samples, instants, end)
 
 
 def _selection(compiled: Compiled, names: Sequence[str], plain: bool) -> _Selection:
@@ -374,7 +410,7 @@ def _selection(compiled: Compiled, names: Sequence[str], plain: bool) -> _Select
         lasting = rule.uses_end and window_of(rule, horizon) is None
         later = max((farthest(num).future for num in numbers(formula)), default=0) + (horizon or 0)
         future = max(future, FAR if lasting else rule.reach + later)
-    return _Selection(compiled, rules, needs, Reach(past, future))
+    return _Selection(compiled, rules, needs, tuple(rule.factor for rule in rules), Reach(past, future))
 
 
 def _chosen(compiled: Compiled, names: Sequence[str]) -> tuple[CompiledRequirement, ...]:
@@ -393,19 +429,15 @@ def robustness_signals(ready: Prepared, end: Boundary = "strict", at: int | None
 
 def _rows(ready: Prepared, end: Boundary, at: int | None) -> list[Array]:
     """Robustness of every requirement, (samples, batch), or (1, batch) at the one sample `at`."""
-    record, horizon = ready.record, ready.horizon
-    if record.cells is None:
-        if at is None:
-            return [rule_signal(rule, record, horizon, end) for rule in ready.rules]
-        return rules_at(ready.rules, record, at - ready.signals.first, horizon, end)
-    rows = []
+    rows, horizon = [], ready.horizon
     for rule in ready.rules:  # a formula may need a record of its own
         record = record_of(rule, ready, Part(0, ready.record.samples))
         if at is None:
-            rows.append(rule_signal(rule, record, horizon, end))
+            row = rule_signal(rule, record, horizon, end)
         else:
-            rows += rules_at([rule], record, at, horizon, end)
-    return [outer_of(row, end) for row in rows]
+            row = rule_at(rule, record, at - ready.signals.first, horizon, end)
+        rows.append(outer_of(row, end))
+    return rows
 
 
 def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:

@@ -559,6 +559,23 @@ def test_a_value_at_one_sample_is_that_of_the_whole_signal(formula: str, at: int
     assert monitor.bounds({"x": x, "y": y}, at=at) == (low[at], high[at])
 
 
+def test_a_robustness_that_is_a_signal_is_a_copy_of_it() -> None:
+    monitor, x = Monitor("signal x\nrequire r: x >= 0", dt=1.0), np.arange(4.0)
+    for _ in range(2):  # the second time, the plan is known
+        found = [monitor.robustness({"x": x}), monitor.requirement_robustness({"x": x})["r"]]
+        assert [each.tolist() for each in found] == [x.tolist()] * 2
+        assert not any(np.shares_memory(each, x) for each in found)
+
+
+@pytest.mark.parametrize("at", [3, 4, 7, -1])
+def test_a_sample_beyond_the_trace_is_refused_each_time(at: int) -> None:
+    monitor = Monitor("signal x\nrequire r: once[0 s, 3 s] x > 0", dt=1.0)
+    for _ in range(2):
+        assert monitor.robustness({"x": np.arange(3.0)}, at=2) == 2.0
+        with pytest.raises(StlcError, match=f"U101.*no sample {at}"):
+            monitor.robustness({"x": np.arange(3.0)}, at=at)
+
+
 def test_a_value_at_one_sample_reads_only_what_it_needs() -> None:
     monitor = Monitor("signal x\nrequire r: once[0 s, 2 s] always[0 s, 5 s] x > 0", dt=1.0)
     ready = monitor._prepare({"x": np.zeros(1000)}, at=500)

@@ -17,7 +17,6 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.support import endless, reach, uses_end
 from stlc.compile.ir.traverse import map_children
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.semantics.tolerance import Status
 from stlc.monitor.instants import beyond, window_of
 from stlc.monitor.online.history import Floats
 from stlc.monitor.online.tally import Asked, JudgedInstants, RequirementSummary
@@ -56,7 +55,8 @@ def _transducers() -> ctypes.CDLL | None:
         library.stlc_init.argtypes = [pointer, flag, integer, flag, flag, ctypes.c_double]
         library.stlc_block.argtypes = [pointer, pointer, integer, flag, pointer]
         library.stlc_look.argtypes = [pointer, flag, flag, flag, integer, integer, pointer]
-        library.stlc_news.argtypes = library.stlc_tally.argtypes = [pointer, flag, pointer, pointer]
+        library.stlc_news.argtypes = [pointer, pointer, integer]
+        library.stlc_tally.argtypes = [pointer, flag, pointer, pointer]
         library.stlc_gap.argtypes = [pointer, flag, pointer]
     return library
 
@@ -85,8 +85,10 @@ class StreamKernel:
             raise MemoryError
         self.state = np.zeros(size // 8 + 1)
         self.at = self.state.ctypes.data
+        self._known = ctypes.c_int64.from_address(self.at + 8)  # `s.known`, after a pointer
         library.stlc_place(self.at, self.program)
         self._row = (ctypes.c_double * program.sizes["signals"])()
+        self._news = (ctypes.c_int64 * 3)()
         self._step = library.stlc_step
         self._arguments = (ctypes.c_void_p(self.at), ctypes.cast(self._row, ctypes.c_void_p))
         for rule, each in enumerate(asked):
@@ -96,7 +98,7 @@ class StreamKernel:
     @property
     def samples(self) -> int:
         """Number of samples received."""
-        return int(self.state[1:2].view(np.int64)[0])  # `s.known`, after a pointer
+        return self._known.value
 
     @staticmethod
     def of(asked: Sequence[Asked], rules: Sequence[Rule], signals: Sequence[str]) -> StreamKernel | None:
@@ -129,6 +131,15 @@ class StreamKernel:
         rows, taken = np.ascontiguousarray(rows, dtype=np.float64), ctypes.c_int64()
         place = ctypes.addressof(taken)
         return self.library.stlc_block(self.at, rows.ctypes.data, len(rows), pause, place), taken.value
+
+    def news(self) -> list[tuple[int, int, int]]:
+        """Starts that the latest sample decided: number of the requirement, start, truth (1: no, 2: yes)."""
+        found, room = self._news, len(self._news) // 3
+        count = self.library.stlc_news(self.at, found, room)
+        if count > room:
+            self._news = (ctypes.c_int64 * (6 * count))()
+            return self.news()
+        return sorted([(found[i], found[i + 1], found[i + 2]) for i in range(0, 3 * count, 3)])
 
     def gap(self, signal: int) -> Gap:
         """Samples at which a signal is unknown."""
@@ -164,19 +175,14 @@ class Streamed:
         return counts.tolist(), bounds.tolist()
 
     @property
-    def news(self) -> dict[int, Status]:
-        """Starts that the latest sample decided, in order, and their verdicts."""
-        call, at = self.kernel.library.stlc_news, self.kernel.at
-        starts, truths = np.zeros((2, call(at, self.number, None, None)), dtype=np.int64)
-        call(at, self.number, starts.ctypes.data, truths.ctypes.data)
-        found = sorted(zip(starts.tolist(), truths.tolist(), strict=True))
-        return {start: "satisfied" if truth == 2 else "violated" for start, truth in found}
+    def counted(self) -> tuple[float, float]:
+        """Bounds on the robustness at the start that was counted last."""
+        low, high = self._counted()[1][2:4]
+        return low, high
 
     def live(self, starts: range) -> JudgedInstants:
-        """Bounds and verdicts at starts while the trace continues; at most the first of them is counted."""
-        counted = starts.start < self.tally.next
-        out = self._look(starts[counted:], _GROWING if self.asked.ending == "truncate" else _OPEN)
-        return self.asked.judged(np.concatenate([[self._counted()[1][2:]], out]) if counted else out)
+        """Bounds and verdicts at starts that are not counted, while the trace continues."""
+        return self.asked.judged(self._look(starts, _GROWING if self.asked.ending == "truncate" else _OPEN))
 
     def ended(self, starts: range) -> JudgedInstants:
         """Bounds and verdicts at starts that are not counted, once the trace has ended."""

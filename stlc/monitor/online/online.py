@@ -30,6 +30,8 @@ Sample: TypeAlias = Mapping[str, Any]
 
 _BEYOND_FLOATS = 1 << 1023
 _ROWS = frozenset((list, tuple))
+_TRUTHS: tuple[Status, ...] = ("violated", "violated", "satisfied")
+"""Verdict by the number of a truth in `streams.c`; 0 is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +42,7 @@ class Decision:
         requirement: name of the requirement.
         start: sample at which the requirement was evaluated.
         time: time of `start` in seconds; the sample number if the time step is unknown.
-        status: satisfied or violated.
-        low: least robustness over all continuations of the trace.
-        high: greatest robustness over all continuations.
+        status: satisfied or violated; `Online.bounds` gives bounds on the robustness.
         sample: index of the sample that decided the verdict.
     """
 
@@ -50,8 +50,6 @@ class Decision:
     start: int
     time: float
     status: Status
-    low: float
-    high: float
     sample: int
 
 
@@ -81,7 +79,7 @@ Watched: TypeAlias = Streamed | Recomputed
 """A requirement and its running verdict.
 
 A start is an instant at which the requirement is evaluated. It is counted in `tally` when its value is
-final and its windows are complete. `news` are the starts that the latest sample decided, in order.
+final and its windows are complete.
 """
 
 
@@ -107,6 +105,10 @@ class Online:
         asked = self.asked + [self._ask(rule, once=True) for rule in compiled.assumptions]
         self._kernel, watched = self._watch(asked)
         self._watched, self._scope = watched[: len(rules)], watched[len(rules) :]
+        self.requirements = tuple(rule.name for rule in rules)
+        """Names of the requirements, in order."""
+        self._streamed = [each.asked.rule.name for each in self._watched if isinstance(each, Streamed)]
+        self._step = None if compiled.grid.dt is None else float(compiled.grid.dt)
         self._recomputed = [each for each in watched if isinstance(each, Recomputed)]
         self._gaps: dict[str, Gap] = {}
         self._buffer = TraceBuffer(compiled, self.how.t0) if self.how.reasons else None
@@ -224,16 +226,16 @@ class Online:
     def verdicts(self) -> tuple[Decision, ...]:
         """Verdicts that the latest sample decided, in the order of the requirements."""
         found: list[Decision] = []
-        for watched in self._watched:
-            news = watched.news
-            if not news:
-                continue
-            starts = range(min(news), max(news) + 1)
-            judged = watched.live(starts)
-            for start, status in news.items():
-                low, high = float(judged.low[start - starts.start]), float(judged.high[start - starts.start])
-                name, sample = watched.asked.rule.name, self.samples - 1
-                found.append(Decision(name, start, self.time(start), status, low, high, sample))
+        names, sample = self._streamed, self.samples - 1
+        if self._kernel is not None:
+            for number, start, truth in self._kernel.news():
+                if number < len(names):  # no assumption
+                    found.append(Decision(names[number], start, self.time(start), _TRUTHS[truth], sample))
+        if self._recomputed:
+            for name, watched in zip(self.requirements, self._watched, strict=True):
+                news = watched.news.items() if isinstance(watched, Recomputed) else ()
+                found += [Decision(name, start, self.time(start), status, sample) for start, status in news]
+            found.sort(key=lambda each: self.requirements.index(each.requirement))
         return tuple(found)
 
     @property
@@ -247,13 +249,7 @@ class Online:
 
     def time(self, sample: int) -> float:
         """Time of a sample in seconds; the sample number if the time step is unknown."""
-        dt = self.compiled.grid.dt
-        return float(sample) if dt is None else self.how.t0 + sample * float(dt)
-
-    @property
-    def requirements(self) -> tuple[str, ...]:
-        """Names of the requirements, in order."""
-        return tuple(watched.asked.rule.name for watched in self._watched)
+        return float(sample) if self._step is None else self.how.t0 + sample * self._step
 
     def requirement(self, name: str) -> Asked:
         """Return the requirement `name`, and where it is evaluated. Raises UsageError (U101) without one."""
@@ -275,14 +271,22 @@ class Online:
         return list(zip(starts, judged.low.tolist(), judged.high.tolist(), strict=True))
 
     def bounds(self, name: str, start: int) -> tuple[float, float]:
-        """Least and greatest robustness of the requirement `name` at a start whose value is not final yet.
+        """Least and greatest robustness of the requirement `name` at a start, over all continuations.
+
+        The value at the start is not final yet, or became so with the latest start that did, or the latest
+        sample decided the start. The bounds are computed by this call.
 
         Raises UsageError (U101) for another start.
         """
-        found = {at: (low, high) for at, low, high in self.open_starts(name)}
-        if start not in found:
+        watched = self._find(name)
+        tally = watched.tally
+        if tally.instants and start == tally.next - 1:
+            return watched.counted
+        decided = isinstance(watched, Recomputed) and start in watched.news
+        if not decided and start not in watched.asked.starts(tally.next, self.samples):
             raise usage(f"`{name}` is not open at sample {start}")
-        return found[start]
+        judged = watched.live(range(start, start + 1))
+        return float(judged.low[0]), float(judged.high[0])
 
     def standing(self, name: str) -> RequirementSummary:
         """Summary of the requirement `name` over all samples at which it has been evaluated up to now.

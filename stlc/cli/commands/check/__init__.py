@@ -223,7 +223,7 @@ def _tell(decision: Decision, online: Online) -> None:
     asked = online.requirement(decision.requirement)
     if decision.status == "satisfied" and asked.everywhere:
         return
-    low, high = decision.low, decision.high
+    low, high = online.bounds(decision.requirement, decision.start)
     bounds = signed(low) if low == high else f"[{signed(low)}, {signed(high)}]"
     value = in_unit(bounds, asked.rule.unit)
     judged = f", judged from t = {decision.time:.10g} s" if asked.everywhere else ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
 
@@ -19,7 +20,7 @@ from stlc.compile.backends.array.steps import ArrayPlan, array_plan
 from stlc.compile.backends.array.windows import Windows
 from stlc.compile.backends.schedule import Boundary, End, TraceDomain, spanning
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.defined import undefined
+from stlc.compile.ir.defined import Undefined, undefined
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
 from stlc.compile.semantics.tolerance import overall
@@ -143,9 +144,45 @@ def robustness_signal(
 
     If `end` is "strict", the robustness is NaN at samples where the formula needs samples beyond the trace.
     """
-    samples, cut = len(next(iter(env.values()))), "truncate" if end == "strict" else end
-    (signal,) = _plan((formula,), env, range(samples), cut, None, semantics or _EXACT, ops).roots(env)
-    return signal if end != "strict" else ops.rows(undefined(formula, samples), signal, math.nan)
+    samples = len(next(iter(env.values())))
+    (signal,) = signal_plan((formula,), samples, range(samples), end, semantics or _EXACT, ops).values(env)
+    return signal
+
+
+@dataclass(frozen=True, slots=True)
+class SignalPlan:
+    """Evaluation plan of the robustness of formulas at consecutive instants.
+
+    Attributes:
+        plan: plan of the values.
+        missing: for each formula, the instants at which its robustness is NaN, counted from the first one.
+    """
+
+    plan: ArrayPlan
+    missing: tuple[Undefined, ...]
+
+    def values(self, env: Mapping[str, Array]) -> list[Array]:
+        """Return the robustness of each formula, `(instants, batch)`, from the signals `env`."""
+        ops, roots = self.plan.ops, self.plan.roots(env)
+        return [ops.rows(where, x, math.nan) for where, x in zip(self.missing, roots, strict=True)]
+
+
+def signal_plan(
+    formulas: tuple[ir.Formula, ...],
+    samples: int,
+    instants: range,
+    end: Boundary = "strict",
+    semantics: Semantics = _EXACT,
+    ops: Ops = NUMPY,
+) -> SignalPlan:
+    """Return the plan of `robustness_signal` for several formulas at `instants` of `samples` samples."""
+    cut, first, strict = "truncate" if end == "strict" else end, instants.start, end == "strict"
+    missing = tuple(
+        tuple(range(max(each.start - first, 0), max(each.stop - first, 0)) for each in undefined(x, samples))
+        for x in formulas
+    )
+    plan = planned(formulas, samples, instants, cut, None, semantics, ops)  # type: ignore[arg-type]
+    return SignalPlan(plan, missing if strict else ((),) * len(formulas))
 
 
 class Weighed(Protocol):

@@ -126,5 +126,7 @@ def kernel_library(dtype: str, *, few: bool = True) -> ctypes.CDLL | None:
     defined = f"#define REAL {real}\n#define INDEX {index}\n#define BYTES {vector}\n#define CHUNK {_CHUNK}\n"
     library = native.load(defined + _SOURCE.read_text(encoding="utf-8"))
     if library is not None:
-        library.double_all.argtypes = [*[ctypes.c_void_p] * 2, *[ctypes.c_int64] * 4, ctypes.c_int]
+        pointers, numbers = [ctypes.c_void_p] * 3, [ctypes.c_int64] * 4
+        library.double_all.argtypes = [*pointers[1:], *numbers, ctypes.c_int]
+        library.end_all.argtypes = [*pointers, *numbers[1:], ctypes.c_int]
     return library

@@ -128,14 +128,15 @@ class NumpyOps(FloatConstants, ScanByRows):
         self._seen += first.size
         if first.ndim != 2 or self._seen < _MANY or any(each.dtype != first.dtype for each in operands):
             return None
-        name, traces, flags = _NAMES.get(first.dtype.char, ""), first.shape[1], first.flags
-        one, out = len(operands) == 1, np.empty((window.count, traces), first.dtype)
-        if one and window.to_end:
-            return None
-        if one and window.width * traces <= _NARROW and (library := kernel_library(name)) is not None:
-            x = first if flags.c_contiguous and flags.writeable else first.copy()
-            places = _BYTE.from_buffer(x.data), _BYTE.from_buffer(out.data)
-            if library.double_all(*places, window.rows, window.count, window.width, traces, pick == "max"):
+        name, traces = _NAMES.get(first.dtype.char, ""), first.shape[1]
+        rows, count, width = window.rows, window.count, window.width
+        out, near = np.empty((count, traces), first.dtype), len(operands) == 1 and width * traces <= _NARROW
+        if (near or width >= rows) and (library := kernel_library(name)) is not None:
+            held = [x if x.flags.c_contiguous and x.flags.writeable else x.copy() for x in operands]
+            places = [_BYTE.from_buffer(x) for x in (*held, out)]
+            if width >= rows:
+                library.end_all(*[None] * (3 - len(places)), *places, rows, count, traces, pick == "max")
+            elif library.double_all(*places, rows, count, width, traces, pick == "max"):
                 raise MemoryError
             return out
         kernel = window_kernel(name, traces, len(operands), pick, window)

@@ -228,8 +228,28 @@ judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int
     return 0;
 }
 
-/* Extrema of rows that lie beside each other, values alone: blocks of 1, 2, 4, … rows are joined, some windows at a
-   time, so that they stay in the cache. */
+/* The better of two values; the earlier one where they tie. */
+#define BETTER(a, b, max) ((((max) ? (b) > (a) : (b) < (a)) | ((b) != (b))) ? (b) : (a))
+
+/* Extrema of `x` over all rows from one on, values alone; with `left`, `until`. Rows lie beside each other. */
+static inline __attribute__((always_inline)) void
+ended(const REAL *left, const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t traces, int max)
+{
+    REAL best = (REAL)(max ? -INFINITY : INFINITY);
+    for (int64_t i = 0; i < traces; i++)
+        out[(count - 1) * traces + i] = best;
+    for (int64_t t = rows - 1; t >= 0; t--) {
+        const REAL *after = out + least(t + 1, count - 1) * traces;
+        REAL *to = out + least(t, count - 1) * traces;
+        for (int64_t i = 0, at = t * traces; i < traces; i++, at++) {
+            best = BETTER(x[at], traces == 1 ? best : after[i], max);
+            to[i] = best = left ? BETTER(left[at], best, !max) : best;
+        }
+    }
+}
+
+/* Extrema over `width` rows each: blocks of 1, 2, 4, … rows are joined, some windows at a time, so that they stay in
+   the cache. */
 static inline __attribute__((always_inline)) int
 doubled(const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t width, int64_t traces, int max)
 {
@@ -251,7 +271,7 @@ doubled(const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t width, in
             const REAL *restrict a = from, *restrict b = from + next * traces;
             REAL *restrict both = to;
             for (int64_t i = 0; i < cells; i++)
-                both[i] = ((max ? b[i] > a[i] : b[i] < a[i]) | (b[i] != b[i])) ? b[i] : a[i];
+                both[i] = BETTER(a[i], b[i], max);
             to = from;
             from = both;
         }
@@ -274,6 +294,14 @@ int slide_all(REAL **arrays, const int64_t *shape, int max, int how)
 int double_all(const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t width, int64_t traces, int max)
 {
     return max ? doubled(x, out, rows, count, width, traces, 1) : doubled(x, out, rows, count, width, traces, 0);
+}
+
+void end_all(const REAL *left, const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t traces, int max)
+{
+    if (left)
+        max ? ended(left, x, out, rows, count, traces, 1) : ended(left, x, out, rows, count, traces, 0);
+    else
+        max ? ended(0, x, out, rows, count, traces, 1) : ended(0, x, out, rows, count, traces, 0);
 }
 
 int until_all(REAL **arrays, const int64_t *shape, int max, int how)

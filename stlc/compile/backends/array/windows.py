@@ -77,9 +77,7 @@ class Windows:
         if self.semantics.exact and rows and count > 1:
             found = self.ops.windows(operands, pick, Sliding(rows, min(count, rows), width))
             if found is not None:
-                return self.padded(found, count, neutral(pick))
-        if lefts and width >= rows and (tiles := self._tiles(x, min(count, rows), 1)):
-            return self.padded(self._until_by_tiles(operands, pick, tiles), count, neutral(pick))
+                return found if count <= rows else self.padded(found, count, neutral(pick))
         if tiles := self._tiles(x, count, width):
             out = self.ops.empty((count, *x.shape[1:]), x)
             for asked, seen in tiles:
@@ -227,21 +225,3 @@ class Windows:
             later = self.semantics.pair(x[size:], x[:-size], pick, self.ops)
             x, size = self.ops.cat([x[:size], later]), 2 * size
         return x
-
-    def _until_by_tiles(
-        self, operands: Sequence[Array], pick: Pick, tiles: list[tuple[slice, slice]]
-    ) -> Array:
-        """Unbounded `until` on a long recorded trace, tile by tile backward in time.
-
-        `tiles` contains consecutive ranges of rows, in the form of `_tiles`.
-        """
-        pair, ops, length = self.semantics.pair, self.ops, len(operands[0])
-        out = ops.empty((tiles[-1][0].stop, *operands[0].shape[1:]), operands[0])
-        later = self.over([each[len(out) :] for each in operands], pick, count=1, width=length)
-        for rows, _ in reversed(tiles):
-            size, (left, right) = rows.stop - rows.start, [each[rows] for each in operands]
-            held = self.over((left,), dual(pick), count=size, width=size)
-            met = self.over((left, right), pick, count=size, width=size)
-            out[rows] = pair(met, pair(held, later, dual(pick), ops), pick, ops)
-            later = out[rows.start : rows.start + 1]
-        return out

@@ -679,10 +679,17 @@ static void stlc_one(const monitor *m, int32_t r, int32_t i, int64_t *start, int
   *truth = of->said ? of->said : truth_at(m, m->t->nodes + m->t->graphs[a->truths].root, *start);
 }
 
-/* Number of starts of a requirement that the latest sample decided; these starts and their truths. */
-API int64_t stlc_news(const monitor *m, int32_t r, int64_t *starts, int64_t *truths) {
-  for (int32_t i = 0; starts && i < m->of[r].waiting; ++i) stlc_one(m, r, i, starts + i, truths + i);
-  return m->of[r].waiting;
+/* Starts that the latest sample decided, `most` of them at most: requirement, start and truth of each. Return their
+   number. */
+API int64_t stlc_news(const monitor *m, int64_t *out, int64_t most) {
+  int64_t found = 0;
+  for (int32_t r = 0; r < m->t->judged; ++r)
+    for (int32_t i = 0; i < m->of[r].waiting; ++i, ++found) {
+      if (found >= most) continue;
+      out[3 * found] = r;
+      stlc_one(m, r, i, out + 3 * found + 1, out + 3 * found + 2);
+    }
+  return found;
 }
 
 /* Instants that are counted, that hold, that fail, and those of the least bounds; these bounds, those at the instant

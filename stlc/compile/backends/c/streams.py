@@ -107,6 +107,8 @@ class Node:
         index: number of the node; operands come before the nodes that read them.
         form: the sub-formula, in normal form.
         args: numbers of the operands.
+        near: least instant, relative to now, at which it reads its operands or signals.
+        far: greatest one.
         delay: samples after an instant until its value is known.
         readers: numbers of the nodes that read it.
         ahead: instants after the latest sample at which its truth may be known.
@@ -119,7 +121,9 @@ class Node:
     index: int
     form: ir.Formula
     args: tuple[int, ...]
-    delay: int = 0
+    near: int
+    far: int
+    delay: int
     readers: list[int] = field(default_factory=list)
     ahead: int = 0
     age: int = 0
@@ -136,6 +140,24 @@ class Node:
     def rows(self) -> int:
         """Length of the ring of its truths, a power of 2."""
         return _ring(self.age + self.ahead + 3)
+
+
+def _reads(form: ir.Formula) -> tuple[int, int]:
+    """Least and greatest instant, relative to now, at which a node reads its operands or signals."""
+    match form:
+        case ir.Predicate(num):
+            reach = farthest(num)
+            return -reach.past if reach.past < 1 << 29 else 0, reach.future
+        case ir.Temporal(window=window):
+            return window.lo, window.hi or 0
+        case ir.PastTemporal(window=window):
+            return -(window.hi or 0), -window.lo
+        case ir.Shift(steps) if not isinstance(form, Begun):
+            return steps, steps
+        case ir.Until(window=window):
+            return 0, window.hi or 0
+        case _:
+            return 0, 0
 
 
 def _ring(rows: int) -> int:
@@ -184,26 +206,11 @@ class Graph:
             parts = parts[1:]
         args = tuple(map(self._place, parts))
         args = tuple(dict.fromkeys(args)) if isinstance(form, ir.BoolOp) else args
-        node = Node(len(self.nodes), form, args)
-        delays = [self.nodes[arg].delay for arg in args]
-        most = max(delays, default=0)
-        match form:
-            case ir.Predicate(num):
-                node.delay = farthest(num).future
-            case ir.Temporal(window=window):
-                node.delay = most + (window.hi or 0)
-            case ir.PastTemporal(window=window):
-                node.delay = max(most - window.lo, 0)
-            case Begun():
-                node.delay = most
-            case ir.Shift(steps):
-                node.delay = max(most + steps, 0)
-            case ir.Until(window=window):
-                node.endless = window.hi is None
-                node.delay = most + (window.hi or 0)
-            case _:
-                node.delay = most
-        node.endless = node.endless or any(self.nodes[arg].endless for arg in args)
+        near, far = _reads(form)
+        delay = max(max((self.nodes[arg].delay for arg in args), default=0) + far, 0)
+        node = Node(len(self.nodes), form, args, near, far, delay)
+        endless = isinstance(form, ir.Until) and form.window.hi is None
+        node.endless = endless or any(self.nodes[arg].endless for arg in args)
         self.nodes.append(node)
         for arg in args:
             self.nodes[arg].readers.append(node.index)
@@ -234,32 +241,14 @@ class Graph:
         for arg in node.args:
             self._skeleton(arg, later)
 
-    def _earliest(self, node: Node) -> int:
-        """Least instant, relative to now, at which a node reads its operands."""
-        match node.form:
-            case ir.Temporal(window=window):
-                return window.lo
-            case ir.PastTemporal(window=window):
-                return -(window.hi or 0)
-            case ir.Shift(steps) if not isinstance(node.form, Begun):
-                return steps
-            case _:
-                return 0
-
     def _sizes(self) -> None:
         for node in self.nodes:
-            below = [self.nodes[arg].ahead for arg in node.args]
-            match node.form:
-                case ir.Predicate():
-                    node.ahead = -node.delay
-                case ir.Temporal(window=window):
-                    node.ahead = below[0] - window.lo
-                case ir.PastTemporal(window=window):
-                    node.ahead = max(below[0] + (window.hi or 0), window.lo - 1)
-                case ir.Shift(steps, _, outside) if not isinstance(node.form, Begun):
-                    node.ahead = below[0] - steps if outside is None else max(below[0], -1) - steps
-                case _:
-                    node.ahead = max(below, default=0)
+            node.ahead = max((self.nodes[arg].ahead for arg in node.args), default=0)
+            if getattr(node.form, "outside", None) is not None:
+                node.ahead = max(node.ahead, -1)
+            node.ahead -= node.far if isinstance(node.form, ir.Predicate) else node.near
+            if isinstance(node.form, ir.PastTemporal):
+                node.ahead = max(node.ahead, -node.far - 1)
             node.lasts = isinstance(node.form, (ir.Truth, ir.Since)) or any(
                 self.nodes[arg].lasts for arg in node.args
             )
@@ -268,7 +257,7 @@ class Graph:
             node.ahead = max(node.ahead, 0)
             for part in (self.nodes[arg] for arg in node.args):
                 part.ahead = max(part.ahead, node.ahead if isinstance(node.form, ir.BoolOp) else 0)
-                part.age = max(part.age, node.age - self._earliest(node))
+                part.age = max(part.age, node.age - node.near)
         for node in self.nodes:
             for arg in () if node.endless else node.args:
                 self._keep(arg, self._late(node, arg))
@@ -282,43 +271,18 @@ class Graph:
 
     def _late(self, node: Node, arg: int) -> int:
         """Samples between the value of an operand and the one that reads it."""
-        part = self.nodes[arg]
-        match node.form:
-            case ir.Temporal():
-                return 0
-            case ir.PastTemporal(window=window):
-                return node.delay - part.delay + window.lo
-            case ir.Shift(steps):
-                return node.delay - part.delay - steps
-            case ir.Until() | ir.Since():
-                return max(self.nodes[each].delay for each in node.args) - part.delay
-            case _:
-                return node.delay - part.delay
+        return node.delay - node.far - self.nodes[arg].delay
 
     @property
     def samples(self) -> int:
         """Number of samples that predicates read, the latest included."""
-        found = [1]
-        for node in self.nodes:
-            if isinstance(node.form, ir.Predicate):
-                far = farthest(node.form.num)
-                found.append(far.future + (far.past if far.past < 1 << 29 else 0) + 1)
-        return max(found)
+        found = (node for node in self.nodes if isinstance(node.form, ir.Predicate))
+        return max((node.far - node.near + 1 for node in found), default=1)
 
     @property
     def far(self) -> int:
         """Number of unknown samples after which more of them change no bounds."""
-        spans = [self.lag + 2]
-        for node in self.nodes:
-            match node.form:
-                case ir.Predicate(num):
-                    far = farthest(num)
-                    spans.append(far.future + (far.past if far.past < 1 << 29 else 0))
-                case ir.Temporal(window=window) | ir.PastTemporal(window=window) | ir.Until(window=window):
-                    spans.append(window.hi or 0)
-                case ir.Shift(steps):
-                    spans.append(abs(steps))
-        return sum(spans)
+        return self.lag + 2 + sum(max(-node.near, 0) + max(node.far, 0) for node in self.nodes)
 
     # ------------------------------------------------------------------------- tables
 
