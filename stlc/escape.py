@@ -133,7 +133,7 @@ def c_comment(text: str) -> str:
 
 def lawful(text: str) -> str:
     """Text with the characters that HTML and XML 1.0 forbid replaced by symbols; nothing is escaped."""
-    return _KEPT_IN_MARKUP.sub(_sign, text)
+    return _REFUSED_IN_MARKUP.sub(_sign, text)
 
 
 def html(text: str) -> str:
@@ -147,8 +147,8 @@ def script_json(text: str) -> str:
 
 
 _IN_SCRIPT = str.maketrans({char: f"\\u{ord(char):04x}" for char in "<>&\u2028\u2029"})
-_KEPT_IN_MARKUP = re.compile(
-    "[^\t\n\\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufdcf\ufdf0-\ufffd\U00010000-\U0010ffff]"
+_REFUSED_IN_MARKUP = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufdd0-\ufdef\ufffe\uffff]"
 )
 """Characters that XML 1.0 forbids, that HTML replaces or rejects, or that change the text direction."""
 

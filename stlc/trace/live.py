@@ -24,7 +24,7 @@ from stlc.trace.formats.cells import bare, number_of, read_lines, value_of
 from stlc.trace.formats.csv import delimiter_of, filled, head_cells, split_head
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.recording import CLOCK, absent
-from stlc.trace.resample import FIRST, MAX_SAMPLES, ROUNDING, Between, longest_gap, track_of, usual_step
+from stlc.trace.resample import FIRST, MAX_SAMPLES, ROUNDING, Between, longest_gap, track_of
 from stlc.trace.time_grid import (
     NO_CLOCK,
     NO_STEP,
@@ -34,6 +34,7 @@ from stlc.trace.time_grid import (
     require_step,
     resample_advice,
     snapped,
+    usual_step,
 )
 from stlc.trace.trace import Reading
 from stlc.trace.tracks import OneTrace

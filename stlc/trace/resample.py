@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stlc.diagnostics import Diagnostic, TraceError
 from stlc.signature import Kind
 from stlc.trace.recording import ClockGroup, Recording, fit
-from stlc.trace.time_grid import NO_CLOCK, NO_STEP, check_finite, require_step, snapped
+from stlc.trace.time_grid import NO_CLOCK, NO_STEP, check_finite, require_step, snapped, usual_step
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -58,13 +58,6 @@ class Between:
     how: How
     age: float | None = None
     period: float = 2.0 * math.pi
-
-
-def usual_step(times: Floats) -> float:
-    """Usual time between samples in seconds: the median of the positive differences; 0 if there are none."""
-    gaps = np.diff(times)
-    gaps = gaps[gaps > 0]
-    return float(np.median(gaps)) if len(gaps) else 0.0
 
 
 FIRST = _GAPS + 1

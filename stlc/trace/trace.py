@@ -35,8 +35,8 @@ from stlc.trace.formats.registry import (
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.meta import TraceMeta
 from stlc.trace.recording import ALL, CLOCK, EXTRA, Clock, ClockGroup, Recording, Wanted, absent, fit
-from stlc.trace.resample import Between, Moments, TimeRange, resampled, usual_step
-from stlc.trace.time_grid import read_clock, resample_advice
+from stlc.trace.resample import Between, Moments, TimeRange, resampled
+from stlc.trace.time_grid import read_clock, resample_advice, usual_step
 from stlc.trace.tracks import separated
 
 __all__ = [

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -217,16 +218,13 @@ class Program:
 
     def names(self) -> list[str]:
         """Return the names of all commands, in the order of the help text."""
-        own, others = self._own(), self.elsewhere or ()
+        own, others = _modules_of(self.package), self.elsewhere or ()
         grouped = [name for names in self.groups.values() for name in names]
         ordered = [*(name for name in grouped if name in own), *sorted(own.difference(grouped))]
         return [*ordered, *(name for name in others if name not in own)]
 
-    def _own(self) -> set[str]:
-        return {each.name for each in pkgutil.iter_modules(import_module(self.package).__path__)}
-
     def _has(self, name: str) -> bool:
-        return name in self._own() or (self.elsewhere is not None and name in self.elsewhere)
+        return name in _modules_of(self.package) or (self.elsewhere is not None and name in self.elsewhere)
 
     def made(self, only: str = "") -> typer.Typer:
         """Return the typer application with the command `only`.
@@ -266,7 +264,7 @@ class Program:
         return _PARSERS[key]
 
     def _add(self, app: typer.Typer, name: str) -> None:
-        if name in self._own():
+        if name in _modules_of(self.package):
             own = vars(import_module(f"{self.package}.{name}"))
             found = own.get("GROUP") or own.get(name) or own[f"{name}_"]
         else:
@@ -305,6 +303,12 @@ class Program:
             code = report_error(SystemExit(stopped[0]) if stopped else error, rest)
         _flush()
         return code if isinstance(code, int) else 0
+
+
+@cache
+def _modules_of(package: str) -> frozenset[str]:
+    """Names of the modules of a package."""
+    return frozenset(each.name for each in pkgutil.iter_modules(import_module(package).__path__))
 
 
 _PARSERS: dict[tuple[str, str], Any] = {}

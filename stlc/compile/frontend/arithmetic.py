@@ -676,7 +676,7 @@ def broadcast(
     check_lengths(lengths, span, scope)
     size = lengths.pop()
     rows = [arg.items if isinstance(arg, VectorValue) else (arg,) * size for arg in args]
-    return VectorValue(tuple(apply(name, row, span, scope) for row in zip(*rows, strict=True)), span)
+    return VectorValue(tuple(apply(name, row, span, scope) for row in zip(*rows, strict=True)), span=span)
 
 
 def check_lengths(lengths: set[int], span: Span, scope: Scope) -> None:
@@ -690,7 +690,7 @@ def negate(value: Number | VectorValue, span: Span) -> Number | VectorValue:
     """Return a number or vector with its sign reversed."""
     if isinstance(value, Number):
         return negated(value, span)
-    return VectorValue(tuple(negated(item, span) for item in value.items), span)
+    return VectorValue(tuple(negated(item, span) for item in value.items), span=span)
 
 
 def minus(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> VectorValue:
@@ -701,7 +701,7 @@ def minus(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> Ve
     """
     check_lengths({len(left.items), len(right.items)}, span, scope)
     pairs = zip(left.items, right.items, strict=True)
-    return VectorValue(tuple(gap(a, b, span, scope) for a, b in pairs), span)
+    return VectorValue(tuple(gap(a, b, span, scope) for a, b in pairs), span=span)
 
 
 def norm(vector: VectorValue, span: Span, scope: Scope) -> Number:
@@ -737,7 +737,7 @@ def cross(left: VectorValue, right: VectorValue, span: Span, scope: Scope) -> Nu
         case 2, 2:
             return minor(0, 1)
         case 3, 3:
-            return VectorValue((minor(1, 2), minor(2, 0), minor(0, 1)), span)
+            return VectorValue((minor(1, 2), minor(2, 0), minor(0, 1)), span=span)
         case m, n:
             message = f"`cross` takes two vectors of 2 or of 3 components, these have {m} and {n}"
             return scope.fail(Diagnostic("E205", message, span))

@@ -97,12 +97,12 @@ def region(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> 
             offset = as_number(
                 given[1][1], given[1][0], Expectation("the offset of a half-space is a number"), scope
             )
-            return HalfSpace(normal, offset, call.span)
+            return HalfSpace(normal, offset, span=call.span)
         case "complement":
-            return Complement(_as_region(name, *given[0], scope), call.span)
+            return Complement(_as_region(name, *given[0], scope), span=call.span)
         case _:
             margin = as_number(given[1][1], given[1][0], Expectation("`dilate` grows by a length"), scope)
-            return Dilated(_as_region(name, *given[0], scope), margin, call.span)
+            return Dilated(_as_region(name, *given[0], scope), margin, span=call.span)
 
 
 def _bound(
@@ -143,7 +143,7 @@ def _ball_of(name: str, call: ast.Call, given: Sequence[tuple[ast.Expr, Value]],
         )
     if radius.constant is not None and radius.constant < 0:
         scope.fail(Diagnostic("E205", "a radius is not negative", given[1][0].span))
-    return NormBall(center, radius, call.span)
+    return NormBall(center, radius, span=call.span)
 
 
 def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> BoxRegion:
@@ -162,7 +162,7 @@ def _box_of(call: ast.Call, given: Sequence[tuple[ast.Expr, Value]], scope: Scop
             scope.fail(
                 Diagnostic("E205", "this box is empty: a lower bound is above the upper one", call.span)
             )
-    return BoxRegion(lower, upper, call.span)
+    return BoxRegion(lower, upper, span=call.span)
 
 
 def _polygon_of(call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Polygon:
@@ -178,7 +178,7 @@ def _polygon_of(call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: 
         )
     if not simple(known) or area(known) == 0:
         scope.fail(Diagnostic("E205", "this polygon has no inside, or crosses itself", call.span))
-    return Polygon(corners if area(known) > 0 else corners[::-1], call.span)
+    return Polygon(corners if area(known) > 0 else corners[::-1], span=call.span)
 
 
 def _combined(name: str, call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]], scope: Scope) -> Combined:
@@ -189,7 +189,7 @@ def _combined(name: str, call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]]
     if len(sizes) > 1:
         message = f"regions of {' and '.join(map(str, sorted(sizes)))} dimensions do not go together"
         scope.fail(Diagnostic("E205", message, call.span))
-    return Combined("union" if name == "union" else "intersect", parts, call.span)
+    return Combined("union" if name == "union" else "intersect", parts, span=call.span)
 
 
 _SECOND = SYMBOLS["s"]
@@ -210,8 +210,8 @@ def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -
         case "sweep":
             if not isinstance(value, VectorValue):
                 number = as_number(value, expr, Expectation("`sweep` follows a point"), scope)
-                value = VectorValue((number,), expr.span)
-            return Swept(value, call.span)
+                value = VectorValue((number,), span=expr.span)
+            return Swept(value, span=call.span)
         case "delta":
             return _delta(value, expr, call.span, scope)
     delay = typed.Time(steps=Fraction({"next": 1, "prev": -1}.get(name, 0)))
@@ -229,7 +229,7 @@ def _shifted(value: Value, delay: typed.Time, expr: ast.Expr, span: Span, name: 
         case Number() if value.kind != "bool":
             return replace(value, num=_delayed_number(value.num, delay), origin=None)
         case VectorValue(items):
-            return VectorValue(tuple(_later(item, delay, span) for item in items), span)
+            return VectorValue(tuple(_later(item, delay, span) for item in items), span=span)
         case _:
             return _delayed_formula(as_formula(value, expr, Expectation(name), scope), delay, span)
 
@@ -342,7 +342,7 @@ def outside(entry: External, call: ast.Call, values: Sequence[Value], scope: Sco
     numbers = [_output(entry, index, (*flat, *entry.further)) for index in range(entry.result or 1)]
     if entry.result is None:
         return replace(numbers[0], span=call.span)
-    return VectorValue(tuple(numbers), call.span)
+    return VectorValue(tuple(numbers), span=call.span)
 
 
 def _argument(number: Number, unit: Unit, need: Expectation, span: Span, scope: Scope) -> Number:

@@ -244,7 +244,7 @@ def sweeps(expr: ast.Member, segment: Swept, region: Sequence[Operand], scope: S
             as_number(value, end, Expectation("`in [lo, hi]` compares numbers", "a bound"), scope)
             for end, value in region
         ]
-        place: Region = BoxRegion(VectorValue((ends[0],)), VectorValue((ends[1],)), expr.region.span)
+        place: Region = BoxRegion(VectorValue((ends[0],)), VectorValue((ends[1],)), span=expr.region.span)
     elif isinstance(region[0].value, REGION_TYPES):
         place = region[0].value
     else:

@@ -104,7 +104,7 @@ def choose(expr: ast.IfThenElse, values: Sequence[Value], scope: Scope) -> Value
         message = f"vectors of {len(yes.items)} and {len(no.items)} components do not go together"
         scope.fail(Diagnostic("E205", message, expr.span))
     pairs = zip(yes.items, no.items, strict=True)
-    return VectorValue(tuple(_choose(expr, cond, pair, scope) for pair in pairs), expr.span)
+    return VectorValue(tuple(_choose(expr, cond, pair, scope) for pair in pairs), span=expr.span)
 
 
 def _is_bool(value: Value) -> bool:
@@ -191,7 +191,7 @@ def _measured(value: Fraction, unit_text: str) -> Number | None:
 def _vector(expr: ast.Vector, values: Sequence[Value], scope: Scope) -> Value:
     need = Expectation("a vector holds numbers", "this component")
     pairs = zip(values, expr.items, strict=True)
-    return VectorValue(tuple(as_number(value, item, need, scope) for value, item in pairs), expr.span)
+    return VectorValue(tuple(as_number(value, item, need, scope) for value, item in pairs), span=expr.span)
 
 
 def _index(expr: ast.Index, values: Sequence[Value], scope: Scope) -> Value:
@@ -681,7 +681,7 @@ def _freeze(expr: ast.Freeze, scope: Scope) -> Value:
     for (name, written), value in zip(expr.bindings, values, strict=True):
         if isinstance(value, VectorValue):
             items = [_frozen(item, f"{name}[{i}]", expr, bindings) for i, item in enumerate(value.items)]
-            bound[name] = (VectorValue(tuple(items), written.span), Cost(1, 1))
+            bound[name] = (VectorValue(tuple(items), span=written.span), Cost(1, 1))
         else:
             number = loose_number(value, written, Expectation("`freeze` binds numbers and vectors"), scope)
             bound[name] = (_frozen(number, name, expr, bindings), Cost(1, 1))

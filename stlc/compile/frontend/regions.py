@@ -226,7 +226,7 @@ def to_segment(point: VectorValue, start: VectorValue, end: VectorValue, span: S
     along, ahead = minus(end, start, span, scope), minus(point, start, span, scope)
     share = apply("div", (dot(ahead, along, span, scope), dot(along, along, span, scope)), span, scope)
     share = apply("clip", (share, literal(0, span), literal(1, span)), span, scope)
-    foot = VectorValue(tuple(apply("mul", (share, item), span, scope) for item in along.items), span)
+    foot = VectorValue(tuple(apply("mul", (share, item), span, scope) for item in along.items), span=span)
     return norm(minus(ahead, foot, span, scope), span, scope)
 
 

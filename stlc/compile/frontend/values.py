@@ -25,7 +25,14 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
+class Placed:
+    """Base class of values; `span` is the source location of the expression, which comparisons ignore."""
+
+    span: Span | None = field(default=None, compare=False, repr=False, kw_only=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Number(Placed):
     """Scalar expression in SI units, counted from the zero of its own unit: 20 degC is 20, not 293.15.
 
     A number in a unit with an offset (degC) is a temperature, as opposed to a temperature difference.
@@ -46,7 +53,6 @@ class Number:
         labels: (label, value) pairs of an enum.
         formula: for a number such as `if c then p else q` with bools p and q, the same choice as a formula,
             with the margins of p and q. None for any other number.
-        span: source location of the expression.
         origin: declaration of the name that stands for the number, if any.
     """
 
@@ -59,7 +65,6 @@ class Number:
     sense: Literal["", "difference", "open"] = ""
     labels: Labels = ()
     formula: typed.Formula | None = None
-    span: Span | None = field(default=None, compare=False, repr=False)
     origin: Origin | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -69,15 +74,14 @@ class Number:
 
 
 @dataclass(frozen=True, slots=True)
-class VectorValue:
+class VectorValue(Placed):
     """Vector of numbers."""
 
     items: tuple[Number, ...]
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class EnumMember:
+class EnumMember(Placed):
     """Name of a member of one or several enums.
 
     If there are several, the other operand of a comparison decides which enum is meant.
@@ -85,18 +89,16 @@ class EnumMember:
 
     name: str
     options: tuple[Labels, ...]
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class TimeExpr:
+class TimeExpr(Placed):
     """Time `seconds + steps * dt + horizons * T`, or `end` (also written `inf`), the end of the trace."""
 
     seconds: Fraction = Fraction(0)
     steps: Fraction = Fraction(0)
     horizons: Fraction = Fraction(0)
     end: bool = False
-    span: Span | None = field(default=None, compare=False, repr=False)
 
     def plus(self, other: TimeExpr, factor: int) -> TimeExpr:
         """Return `this time + factor * other`; neither time may be `end`."""
@@ -123,72 +125,64 @@ class Operand(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Swept:
+class Swept(Placed):
     """Value of `sweep(p)`: the straight segment from a point to its position at the next sample."""
 
     point: VectorValue
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class NormBall:
+class NormBall(Placed):
     """Region of the points at most `radius` from `center`; a disc in the plane."""
 
     center: VectorValue
     radius: Number
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class BoxRegion:
+class BoxRegion(Placed):
     """Region of the points whose components all lie between those of `lower` and `upper`."""
 
     lower: VectorValue
     upper: VectorValue
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Polygon:
+class Polygon(Placed):
     """Simple polygon in the plane with constant corners in counter-clockwise order."""
 
     corners: tuple[VectorValue, ...]
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class HalfSpace:
+class HalfSpace(Placed):
     """Region of the points p with `normal . p <= offset`."""
 
     normal: VectorValue
     offset: Number
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Combined:
+class Combined(Placed):
     """Union or intersection (`op`) of at least one region."""
 
     op: Literal["union", "intersect"]
     parts: tuple[Region, ...]
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Dilated:
+class Dilated(Placed):
     """Region of the points within `margin` of another region; a negative margin shrinks this region."""
 
     region: Region
     margin: Number
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Complement:
+class Complement(Placed):
     """Region of the points outside of another region."""
 
     region: Region
-    span: Span | None = field(default=None, compare=False, repr=False)
 
 
 Region: TypeAlias = NormBall | BoxRegion | Polygon | HalfSpace | Combined | Dilated | Complement
