@@ -5,6 +5,7 @@ They are printed by `stlc.cli.framework.render`.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -139,18 +140,28 @@ class StlcError(Exception):
     """Base class of the errors that a user can correct.
 
     `diagnostics` are the findings to show. `exit_code` is the exit code of a command that fails with the
-    error.
+    error. As text, the error says what helps with the names of Python's arguments.
     """
 
     exit_code = 3
 
     def __init__(self, *diagnostics: Diagnostic) -> None:
-        super().__init__("; ".join(f"{d.code}: {d.message}" for d in diagnostics))
+        super().__init__(*diagnostics)
         self.diagnostics = diagnostics
 
-    def __reduce__(self) -> tuple[type[StlcError], tuple[Diagnostic, ...]]:
-        """Arguments for pickling, so that an error keeps its findings when it is sent to another process."""
-        return type(self), self.diagnostics
+    def __str__(self) -> str:
+        return "\n".join(
+            line
+            for found in self.diagnostics
+            for line in (f"{found.code}: {found.message}", *(f"  help: {_in_python(e)}" for e in found.help))
+        )
+
+
+def _in_python(advice: str) -> str:
+    """Advice with arguments for options: `max_gap=3` for `--max-gap 3s`, `names={"t": "x"}` for `--map`."""
+    advice = re.sub(r"--map (\w+)=(\w+)", r'names={"\1": "\2"}', advice)
+    time = r"--([a-z]+(?:-[a-z]+)*) ([0-9.e+-]+)s(?!\w)"
+    return re.sub(time, lambda found: f"{found[1].replace('-', '_')}={found[2]}", advice)
 
 
 class SpecError(StlcError):

@@ -276,7 +276,7 @@ class CertificateVerification:
         return not self.inputs and not self.numbers
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class CertificateCheck:
     """Comparison of a stored certificate with a run, or with a plant or system, whose file is `run`."""
 

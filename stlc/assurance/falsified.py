@@ -62,7 +62,7 @@ class FalsifiedFinding:
     replay: str
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class FalsifiedSystem:
     """Searches for violations of the requirements of a system or run; failures are those of a plant.
 

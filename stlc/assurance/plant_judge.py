@@ -82,7 +82,7 @@ class JudgedRun:
         return tuple(found)
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class PlantSimulation:
     """Simulations of a plant, and their verdicts.
 

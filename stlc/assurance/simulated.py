@@ -97,7 +97,7 @@ class ScenarioResult:
     guards: Mapping[str, GuardedRuns]
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Simulation:
     """Results of closed-loop runs without and with a guard, and in scenarios; what `simulate.json` holds."""
 

@@ -49,10 +49,10 @@ def standard(name: str) -> ScenarioDecl | None:
     return ScenarioDecl(name, doc.format(percent), "ood", errors=shares)
 
 
-def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
+def find_scenario(decl: SystemDecl, name: str, *advice: str) -> ScenarioDecl:
     """Return the scenario called `name`, from the file or a standard one.
 
-    Raises UsageError (U101) if there is no such scenario.
+    Raises UsageError (U101), with `advice` added, if there is no such scenario.
     """
     for scenario in decl.scenarios:
         if scenario.name == name:
@@ -64,15 +64,18 @@ def find_scenario(decl: SystemDecl, name: str) -> ScenarioDecl:
     listed = f"scenarios of {decl.name}: {', '.join(names)}" if names else f"{decl.name} declares none"
     every = f"every system has {', '.join(DISTURBED)}"
     help_ = (f"did you mean `{near}`?  {listed}" if near else listed, every)
-    raise usage(f"there is no scenario `{name}`", *help_)
+    raise usage(f"there is no scenario `{name}`", *help_, *advice)
 
 
-def scenario_constants(path: Path | Source, name: str, overrides: Mapping[str, str]) -> Mapping[str, str]:
+def scenario_constants(
+    path: Path | Source, name: str, overrides: Mapping[str, str], *advice: str
+) -> Mapping[str, str]:
     """Return the constants that the scenario `name` of the system file `path` changes: name -> new value.
 
-    The new value is a text. The constants change in the specification as well as in the system.
+    The new value is a text. The constants change in the specification as well as in the system. `advice`: see
+    `find_scenario`.
     """
-    return find_scenario(load_system_decl(path, overrides), name).constants
+    return find_scenario(load_system_decl(path, overrides), name, *advice).constants
 
 
 def under(decl: SystemDecl, name: str) -> SystemDecl:

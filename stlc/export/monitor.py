@@ -33,7 +33,7 @@ _ROW, _RULE, _HEAD = 24, 136, 128
 """Bytes of a gap, of the verdicts of a requirement and of the head of a state, at most."""
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class ExportedMonitor:
     """Result of the export of a monitor.
 

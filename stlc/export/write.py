@@ -49,7 +49,7 @@ GUARDED = 16
 """Number of random states in which its backup policy is verified."""
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Exported:
     """Result of an export.
 

@@ -86,8 +86,8 @@ class Question:
     strict: bool = False
 
 
-# of reading a file; signals that are given as arrays or frames are judged as they are
-OF_FILES = {"resample", "dt", "max_gap", "between", "clock", "group", "columns"}
+OF_TABLES = frozenset({"names", "resample", "dt", "max_gap", "between", "clock", "group", "columns"})
+"""Options on how a table is read: a file, a data frame, or arrays by name; a `Trace` has been read."""
 
 
 def check(
@@ -103,25 +103,33 @@ def check(
         spec: a specification, its text, or the path of its file; None: the one that the trace stores.
         trace: path of a trace file, a `Trace`, a data frame of pandas or polars, or arrays by signal name.
         chunk: samples per chunk of a file; 0: a file is read in chunks only if memory is too small for it.
-        options: fields of `Question`, such as `at` or `require`; those in `OF_FILES` are for files.
+        options: fields of `Question`, such as `at` or `require`; those in `OF_TABLES` are not for a `Trace`.
 
     Raises:
         SpecError: the specification is invalid.
         TraceError: the trace cannot be read, or does not fit the specification.
         UsageError: U101, an option does not fit; U102, there is no such file.
     """
+    from stlc.grammar import ast
+    from stlc.monitor.given import is_frame, trace_of_table
     from stlc.monitor.verdict import Monitor
+    from stlc.trace import Trace
 
+    if isinstance(trace, str | Path):
+        swapped = Path(trace).suffix == ".stl"
+    else:
+        swapped = spec is None or isinstance(trace, ast.Spec)
+    if swapped or not isinstance(spec, ast.Spec | str | Path | None):
+        raise usage("a specification comes first, then the recording", "stlc.check(spec, trace)")
     question = Question(**options)
     known = None if spec is None else Monitor(spec, system=question.system, overrides=question.overrides)
     if not isinstance(trace, str | Path):
-        if known is None:
-            raise usage("which specification?", "stlc.check(spec, trace)")
-        for name in options.keys() & OF_FILES:
-            raise usage(
-                f"`{name}` is for files; these samples are judged as they are",
-                "write them to a file, and give its path",
-            )
+        assert known is not None
+        reading = sorted(options.keys() & OF_TABLES)
+        if reading and isinstance(trace, Trace):
+            raise usage(f"`{reading[0]}` says how a table is read, and a `Trace` has been read")
+        if reading or is_frame(trace):
+            trace = trace_of_table(trace, reading_options(known, question))
         return judged_by(known, trace, question)
     found = judge(Path(trace), question, known=known, chunk=chunk)
     if len(found) > 1:

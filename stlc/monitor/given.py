@@ -14,7 +14,7 @@ from stlc.diagnostics import Diagnostic, TraceError
 from stlc.trace import Reading, Trace, trace_of
 from stlc.trace.clocks import ClockSetting, clocked
 from stlc.trace.enums import Words, in_numbers
-from stlc.trace.recording import ClockGroup, Recording
+from stlc.trace.recording import ClockGroup, Recording, clock_rank
 from stlc.trace.time_grid import read_clock
 
 Given: TypeAlias = Mapping[str, Any]
@@ -30,20 +30,25 @@ def is_frame(given: object) -> bool:
     return hasattr(given, "columns") and hasattr(given, "dtypes") and not isinstance(given, Mapping)
 
 
-def trace_of_frame(frame: Any, reading: Reading) -> Trace:
-    """Return the trace in a data frame, whose clock is a column or an index of times.
+def trace_of_table(given: Any, reading: Reading) -> Trace:
+    """Return the trace in a data frame or in arrays by name; the clock is a column, or the index of a frame.
 
     Raises TraceError with the errors of `stlc.trace.trace_of`.
     """
     arrays: dict[str, NDArray[Any]] = {}
-    for name in map(str, frame.columns):
+    for key in given if isinstance(given, Mapping) else given.columns:
+        name = str(key)
         if reading.wanted.keeps(name):
             with nullcontext() if reading.wanted.reads(name) else suppress(TraceError):
-                arrays[name] = _flat(name, frame[name].to_numpy())
-    index = getattr(frame, "index", None)
-    if index is not None and getattr(index, "dtype", np.dtype("i8")).kind in "mM":
-        arrays.setdefault(str(index.name or "time"), _flat("index", index.to_numpy()))
-    return trace_of(Recording("the frame", (ClockGroup(arrays, None),)), reading)
+                arrays[name] = _flat(name, given[key])
+    index = getattr(given, "index", None)
+    name = str(getattr(index, "name", None) or "")
+    if clock_rank(name) == 2 or getattr(index, "dtype", np.dtype("i8")).kind in "mM":
+        arrays.setdefault(name or "time", _flat("index", index))
+    return trace_of(
+        Recording(UNNAMED if isinstance(given, Mapping) else "the frame", (ClockGroup(arrays, None),)),
+        reading,
+    )
 
 
 def plain(given: Given, reading: Reading) -> tuple[dict[str, Any], float | None]:
@@ -93,9 +98,10 @@ def _step(name: str, values: Any) -> float | None:
 
 def _flat(name: str, values: Any) -> NDArray[Any]:
     """Return an array of numbers, texts or dates. Raises TraceError (E603) for other objects."""
-    if isinstance(values, np.ma.MaskedArray):
+    if isinstance(values, np.ndarray) and hasattr(values, "filled"):  # masked; `np.ma` itself loads slowly
         is_number = values.dtype.kind in "biuf"
-        values = np.ma.filled(values.astype(np.float64), np.nan) if is_number else values.filled("")
+        masked: Any = values.astype(np.float64) if is_number else values
+        values = masked.filled(np.nan if is_number else "")
     try:
         array = np.asarray(values)
     except ValueError:

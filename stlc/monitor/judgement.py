@@ -123,20 +123,20 @@ class RequirementVerdict:
 
     rule: CompiledRequirement
     start: int
-    low: Floats = field(repr=False)
-    high: Floats = field(repr=False)
-    holds: Bools = field(repr=False)
-    fails: Bools = field(repr=False)
+    low: Floats
+    high: Floats
+    holds: Bools
+    fails: Bools
     shape: tuple[int, ...]
     part: Part
-    timeline: Timeline = field(repr=False)
+    timeline: Timeline
     tolerance: float = TOLERANCE
-    scope: Bools | None = field(default=None, repr=False)
-    reported: tuple[Floats, Floats] | None = field(default=None, repr=False)
-    counts: Counts | None = field(default=None, repr=False)
+    scope: Bools | None = None
+    reported: tuple[Floats, Floats] | None = None
+    counts: Counts | None = None
     facts: tuple[Fact, ...] = ()
     violated_at: float | None = None
-    subject: Prepared | None = field(default=None, repr=False, compare=False)
+    subject: Prepared | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         return f"RequirementVerdict({self.name}: {self.overall} · {self.brief})"
@@ -447,14 +447,14 @@ class Verdict:
     NAMES: ClassVar = {"Uncertainty": "stlc.monitor.uncertain"}
 
     requirements: tuple[RequirementVerdict, ...]
-    about: About = field(repr=False)
+    about: About
     end: End = "open"
     uncertain: Mapping[str, Uncertainty] = field(default_factory=dict)
     lint: tuple[str, ...] = ()
     evidence: Evidence | None = None
     notes: tuple[str, ...] = ()
     streamed: bool = False
-    judged_on: Prepared | None = field(default=None, repr=False, compare=False)
+    judged_on: Prepared | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         status = self.scoped
@@ -476,10 +476,13 @@ class Verdict:
     def to_frame(self) -> Any:
         """Return a data frame of pandas or polars with a row for each requirement and trace.
 
+        `unit` is that of the robustness. It is missing for a requirement that compares truth values, or
+        quantities of different units: its robustness is then a number whose sign tells the verdict.
+
         Raises MissingError (R301) if neither package is installed.
         """
         rows = [
-            (row.name, trace, status, float(least), row.unit, float(held) / row.instants)
+            (row.name, trace, status, float(least), row.unit or None, float(held) / row.instants)
             for row in self
             for trace, (status, least, held) in enumerate(zip(row.statuses, row.least, row.held, strict=True))
         ]

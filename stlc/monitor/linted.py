@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stlc.source import Source
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Lint:
     """Findings in specification files, and the number of those that were repaired."""
 

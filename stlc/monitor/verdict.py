@@ -31,7 +31,7 @@ from stlc.grammar import ast
 from stlc.grammar.parser import parse
 from stlc.monitor.explain.report import cause_of
 from stlc.monitor.facts.rules import facts_of
-from stlc.monitor.given import UNNAMED, Given, is_frame, trace_of_frame
+from stlc.monitor.given import UNNAMED, Given, is_frame, trace_of_table
 from stlc.monitor.given import plain as plain_signals
 from stlc.monitor.grid import Times, agreed_times, given_times, named_times, require_windows, system_of
 from stlc.monitor.instants import (
@@ -296,7 +296,7 @@ class Monitor:
                 given = load_trace(given, reading)
             elif is_frame(given):
                 step = None if self._given.dt is None else float(self._given.dt)
-                given = trace_of_frame(given, replace(reading, dt=step))
+                given = trace_of_table(given, replace(reading, dt=step))
             else:
                 given, found = plain_signals(given, reading)
                 if found is not None:

@@ -60,7 +60,7 @@ from stlc.view.words import (
 REPORT = "report.html"
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Report:
     """Report of a run: its page, and the verdict on the training; None if the run has none."""
 

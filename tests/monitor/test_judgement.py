@@ -23,8 +23,12 @@ def verdict() -> stlc.Verdict:
 def test_one_line_says_the_worst(verdict):
     assert repr(verdict) == "Verdict(violated: 1 of 2 · low -1 m at t = 2 s)"
     assert repr(verdict["low"]) == "RequirementVerdict(low: violated · -1 m at t = 2 s)"
+    assert repr(verdict["low"].cause) == "Cause(low: `level < 3 m` is false where level = 4 m, at t = 2 s)"
     several = stlc.Monitor(TEXT, dt=1.0).check(BATCH)
     assert repr(several) == "Verdict(violated: 1 of 2 on 2 traces · low -1 m at trace 0, t = 2 s)"
+    assert repr(stlc.explain(stlc.Monitor(TEXT, dt=1.0).check({"level": [1.0, 2.5]}))) == (
+        "Explanation(nothing is violated (satisfied); low comes closest: 0.5 m)"
+    )
     open_ = stlc.Monitor("signal x\nrequire r: always[0 s, 9 s] x < 3", dt=1.0).check({"x": [1.0]})
     assert repr(open_) == "Verdict(inconclusive: 1 of 1 · r [-inf, 2])"
 
@@ -42,6 +46,15 @@ def test_a_frame_has_a_row_for_each_requirement_and_trace():
     frame = stlc.Monitor(TEXT, dt=1.0).check(BATCH).to_frame()
     assert frame["verdict"].tolist() == ["violated", "satisfied", "satisfied", "satisfied"]
     assert frame["robustness"].tolist() == [-1.0, 0.5, 1.0, 1.0]
+
+
+def test_a_robustness_of_several_units_or_of_truth_values_has_no_unit_in_a_frame():
+    pytest.importorskip("pandas")
+    text = "signal x [m]\nsignal k [K]\nsignal on : bool\nsignal s [1]\n" + "".join(
+        f"require r{i}: {rule}\n" for i, rule in enumerate(("x < 3 m", "x < 3 m and k < 9 K", "on", "s < 2"))
+    )
+    frame = stlc.check(text, {"t": [0, 1], "x": [1, 1], "k": [2, 2], "on": [1, 1], "s": [1, 1]}).to_frame()
+    assert frame["unit"].fillna("none").tolist() == ["m", "none", "none", "1"]
 
 
 def test_polars_is_used_where_pandas_is_missing(verdict, monkeypatch):

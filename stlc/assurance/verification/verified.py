@@ -54,7 +54,7 @@ class VerifiedMode:
         return None if self.result.witness is None else self.result.witness.robustness
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Verified:
     """Proved, refuted and open shares of the initial states of a run.
 

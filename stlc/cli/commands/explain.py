@@ -78,7 +78,7 @@ def explain(
             say(line)
         show_diagnostics(verdict.warnings)
     text = "\n\n".join("\n".join(_violation_lines(each, verdict)) for each in found.causes)
-    nothing = f"{visible(verdict.about.trace)}: nothing is violated ({verdict.overall})"
+    nothing = f"{visible(verdict.about.trace)}: {visible(found.closest)}"
     code = EXIT_CODES.get(verdict.overall, SATISFIED)
     return Answer(found, lambda: emit(text or nothing, styled=True), code, verdict.warnings)
 

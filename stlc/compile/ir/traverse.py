@@ -237,16 +237,11 @@ def substitute_frozen(node: N, values: Mapping[str, ir.Num]) -> N:
 # --------------------------------------------------------------------------- typed formulas
 
 
-def margin_units(formula: typed.Formula) -> tuple[str, ...]:
-    """Return the units of the margins of a formula's predicates, each once; "" is a margin without unit."""
-    predicates = (node for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard)
-    return tuple(dict.fromkeys(node.unit.text for node in predicates))
-
-
 def margin_unit(formula: typed.Formula) -> str:
     """Return the unit of a formula's robustness; "" if its predicates have different units."""
-    found = margin_units(formula)
-    return found[0] if len(found) == 1 else ""
+    predicates = (node for node in nodes(formula) if isinstance(node, typed.Predicate) and not node.guard)
+    found = {node.unit.text for node in predicates}
+    return found.pop() if len(found) == 1 else ""
 
 
 def on_clock(node: typed.Formula) -> TypeGuard[typed.Temporal | typed.Until]:

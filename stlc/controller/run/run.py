@@ -169,7 +169,10 @@ def declaration_of_run(
 
 def _changes(folder: RunDir, overrides: Mapping[str, str] | None, scenario: str | None) -> dict[str, str]:
     trained = folder.record().get("overrides") or {}
-    overlay = {} if scenario is None else scenario_constants(folder.source(RunDir.SYSTEM), scenario, trained)
+    overlay: Mapping[str, str] = {}
+    if scenario is not None:
+        there = f"what counts is the system that the run stores: add it to {folder.shown}/{RunDir.SYSTEM}"
+        overlay = scenario_constants(folder.source(RunDir.SYSTEM), scenario, trained, there)
     return {**trained, **overlay, **(overrides or {})}
 
 

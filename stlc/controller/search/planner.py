@@ -51,7 +51,7 @@ class PlanBudget:
     stop: Stop = never
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class PlanResult(Rows):
     """Plans from given initial states, judged exactly in float64.
 

@@ -91,12 +91,15 @@ class Cause:
     place: Label
     labels: tuple[Label, ...]
     because: str
-    tree: CauseNode = field(repr=False)
+    tree: CauseNode
     alone: bool
-    timeline: Timeline = field(compare=False, repr=False)
+    timeline: Timeline = field(compare=False)
     first: int
     unit: str
-    subject: Prepared = field(compare=False, repr=False)
+    subject: Prepared = field(compare=False)
+
+    def __repr__(self) -> str:
+        return f"Cause({self.name}: {self.because})"
 
     def told(self) -> Cause:
         """Return the cause without the tree and the signals, which are large."""

@@ -10,7 +10,7 @@ from stlc.compile.ir.traverse import margin_unit
 from stlc.jsontext import Num
 from stlc.monitor.explain.causes import CauseNode
 from stlc.monitor.explain.report import Cause, readings_of
-from stlc.monitor.judgement import Verdict
+from stlc.monitor.judgement import Verdict, worst_of
 
 _WIDTH = 72
 
@@ -71,7 +71,7 @@ class ExplainedViolation:
         return self.cause.timeline.time(self.cause.violated - self.cause.first)
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Explanation:
     """Violations of a recording, and their causes; `verdict` is what was judged."""
 
@@ -82,7 +82,13 @@ class Explanation:
 
     def __repr__(self) -> str:
         causes = (f"{each.cause.name} because {each.cause.because}" for each in self.causes)
-        return f"Explanation({'; '.join(causes) or self.verdict.overall})"
+        return f"Explanation({'; '.join(causes) or self.closest})"
+
+    @property
+    def closest(self) -> str:
+        """That nothing is violated, and the least robustness: whose it is and where."""
+        worst = worst_of(self.verdict)
+        return f"nothing is violated ({self.verdict.overall}); {worst.name} comes closest: {worst.brief}"
 
 
 def explanation(verdict: Verdict) -> Explanation:

@@ -84,16 +84,15 @@ def fact_text(fact: Fact) -> str:
 
 
 def robustness_of(row: RequirementVerdict, verdict: Verdict | None) -> str:
-    """Least robustness of a requirement, with its unit; bounds, if it is inconclusive; "" without a trace."""
-    from stlc.compile.ir.traverse import margin_units
+    """Least robustness of a requirement, with its unit; bounds, if it is inconclusive; "" without a trace.
 
+    It has no unit where the requirement compares quantities of different units.
+    """
     found = row.figures
     if found.low is None or found.high is None or found.min is None:
         return ""
-    several = margin_units(row.rule.typed.formula)[:3]
-    units = found.unit or ("|".join(each or "1" for each in several) if any(several) else "")
     shown: Status = "inconclusive" if verdict is not None and verdict.uncertain else row.overall
-    return robustness_text(shown, found.low, found.high, found.min, units, row.tolerance)
+    return robustness_text(shown, found.low, found.high, found.min, found.unit, row.tolerance)
 
 
 def robustness_text(

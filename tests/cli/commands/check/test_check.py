@@ -395,14 +395,14 @@ def test_the_mean_of_huge_margins_is_a_number(tmp_path: Path, capsys: pytest.Cap
     assert found["robustness"]["mean"] == pytest.approx(1.5e308)
 
 
-def test_the_units_of_margins_that_are_compared_stand_in_the_row(tmp_path, capsys):
+def test_a_robustness_of_several_units_has_no_unit(tmp_path, capsys):
     spec, path = tmp_path / "s.stl", tmp_path / "t.csv"
     path.write_text("t,p,w\n0,1,1\n1,2,0\n")
     signals, both = "signal p [W]\nsignal w [rad/s]\n", "require a: always (p < 3 W and w < 2 rad/s)\n"
     spec.write_text(f"{signals}{both}require b: always p < 3 W\n")
     assert main(["check", str(spec), str(path)]) == 0
     rows = capsys.readouterr().out
-    assert re.search(r"a +satisfied +\+1\.000 W\|rad/s", rows)
+    assert re.search(r"a +satisfied +\+1\.000\n", rows)
     assert re.search(r"b +satisfied +\+1\.000 W\n", rows)
 
 

@@ -275,6 +275,7 @@ def test_fail_under_is_the_share_of_drives_that_satisfy_everything(
         (["--robustness", "-", "--json"], "both want the standard output"),
         (["--robustness", "nowhere/m.jsonl"], "cannot write"),
         (["--scenario", "mismatch-200"], "every system has mismatch-5"),
+        (["--scenario", "storm"], "what counts is the system that the run stores: add it to "),
         (["--margin", "wide"], "`wide` is no margin"),
         (["--guard", "full", "--margin", "gap=1"], "safety requirements: no_collision, give_way, red_light"),
         (["--agents", "63"], "63 cars"),
