@@ -166,7 +166,7 @@ class WorldRef:
 
     path: Path
     name: str
-    span: Span = field(compare=False, repr=False)
+    span: Span = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +182,7 @@ class JudgeRef:
 
     path: Path
     written: str
-    span: Span = field(compare=False, repr=False)
+    span: Span = field(compare=False)
 
 
 @reads({"type": ["string", "null"]})
