@@ -53,6 +53,12 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(*GARBAGE)
 
 
+def pytest_unconfigure() -> None:
+    """What is left is searched once, and not again by pytest and by the end of the process."""
+    gc.collect()
+    gc.freeze()
+
+
 SMALL = {
     "stlc.controller.training.learner.MARGIN_STATES": 8,
     "stlc.controller.training.learner.EFFORTS": (1000, 2000, 4000),

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import typer
+from helpers.sources import tree
 
 from benchmarks.__main__ import PROGRAM as MEASURE
 from stlc.cli.framework.app import PROGRAM as STLC
@@ -400,7 +401,7 @@ def test_every_file_is_listed_with_its_first_line(regenerate):
 
 
 def first_line(path: Path) -> str:
-    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    text = ast.get_docstring(tree(path)) or ""
     return escaped(text.partition("\n")[0])
 
 

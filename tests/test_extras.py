@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from helpers.sources import tree
 
 from stlc import extras
 from stlc.diagnostics import MissingError
@@ -35,7 +36,7 @@ def test_what_is_imported_is_declared():
     declared |= {name for brought in EXTRAS.values() for name in brought} | {"stlc"}
     other = {"yaml": "pyyaml", "pybullet_utils": "pybullet"} | extras._PACKAGES
     for path in (ROOT / "stlc").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree(path)):
             names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             for name in {each.split(".")[0] for each in names} - sys.stdlib_module_names:

@@ -11,6 +11,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from helpers.sources import tree
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = (ROOT / "stlc", ROOT / "benchmarks")
@@ -122,7 +123,7 @@ MODULES = {module_name(path): path for package in PACKAGES for path in sorted(pa
 def nodes_of(name: str) -> list[ast.AST]:
     """The nodes of a module that may import something, guard an import or call a function."""
     found: list[ast.AST] = []
-    queue: list[object] = [ast.parse(MODULES[name].read_text(encoding="utf-8"))]
+    queue: list[object] = [tree(MODULES[name])]
     while queue:  # ast.walk takes twice as long
         each = queue.pop()
         if isinstance(each, list):

@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 _BLOCK = re.compile(r"^```(python|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
+@pytest.mark.apart
 def test_the_notebook_runs(tmp_path, monkeypatch, capsys):
     pytest.importorskip("torch")
     pytest.importorskip("pandas")

@@ -60,6 +60,7 @@ def hold(pins: ModuleType, name: str, found: Any, regenerate: bool) -> None:
     assert not different, "\n".join(map(str, different[:20]))
 
 
+@pytest.mark.apart
 def test_random_formulas(pins: ModuleType, regenerate: bool) -> None:
     """Cases of the golden file, judged anew: they do not depend on the generator."""
     path = GOLDEN / "formulas.json"
@@ -81,6 +82,7 @@ def trace(start: dict[str, float], samples: int = 60) -> dict[str, list[float]]:
     }
 
 
+@pytest.mark.apart
 def test_verdicts(pins: ModuleType, place: Any, regenerate: bool) -> None:
     found = {}
     for spec, start in SPECS.items():
@@ -94,6 +96,7 @@ def test_verdicts(pins: ModuleType, place: Any, regenerate: bool) -> None:
     hold(pins, "verdicts", found, regenerate)
 
 
+@pytest.mark.apart
 def test_documents(pins: ModuleType, place: Any, regenerate: bool) -> None:
     def words() -> Iterator[str]:
         for spec in SPECS:
@@ -117,6 +120,7 @@ class Held(Policy):
         return (low + (high - low) * share)[:, None, None].expand(-1, 1, self.task.horizon, -1).clone()
 
 
+@pytest.mark.apart
 def test_decisions_of_guards(pins: ModuleType, place: Any, regenerate: bool) -> None:
     """By the paper's rule what, how and how well; of the full guard, which climbs, only what it comes to."""
     found = {}

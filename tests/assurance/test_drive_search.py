@@ -180,6 +180,7 @@ def test_a_counterexample_of_a_drive_is_replayed_checked_and_plotted(
         assert main(["plot", trace, "-o", "drive.png"]) == 0
 
 
+@pytest.mark.apart
 def test_a_training_with_falsification_notes_its_rounds(
     cart: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -64,6 +64,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.apart
 def test_resonance_is_found_at_half_the_step_too_and_shrunk():
     simulator = ModelSimulator.load("oscillator.stl", None, {})
     (block,) = simulator.space.blocks

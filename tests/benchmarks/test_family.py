@@ -82,6 +82,7 @@ def test_what_is_published_is_complete() -> None:
             assert re.search(rf"^\| \*?{value:g} {family.unit}\*? \|", page, re.MULTILINE)
 
 
+@pytest.mark.apart
 def test_from_training_to_the_page_and_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

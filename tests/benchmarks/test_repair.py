@@ -33,6 +33,7 @@ require near: eventually[0 s, 3 s] always[0 s, 1 s] abs(p - 1) < 0.3
 """
 
 
+@pytest.mark.apart
 def test_ways_are_counted_and_the_page_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

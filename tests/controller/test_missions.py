@@ -147,6 +147,7 @@ def test_followed_plans_carry_missions_on(task: Task) -> None:
     assert float(supply.pool[row, task.system.names.index("clock")]) in (1, 2, 3, 4)
 
 
+@pytest.mark.apart
 def test_training_with_memory_resumes_bit_for_bit(task: Task) -> None:
     engine = resolve_config(task, TrainConfig(batch=32))
 

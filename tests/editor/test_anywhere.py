@@ -35,6 +35,7 @@ def ask_everything(text: str, offset: int) -> None:
         assert rename(document, offset, "another_name")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("name", TEXTS)
 def test_in_every_line_of_a_finished_text(name):
     text = TEXTS[name]

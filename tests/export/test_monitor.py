@@ -89,6 +89,7 @@ def test_a_monitor_is_built_without_warnings_and_says_what_python_says(
 X, Y = (typed.Predicate(random_formulas.SPAN, ir.Signal(name), strict=False) for name in ("x", "y"))
 
 
+@pytest.mark.apart
 @settings(max_examples=EXAMPLES, deadline=None)
 @example(
     [typed.Edge(random_formulas.SPAN, "rise", X), Y], {name: np.ones((2, 1)) for name in ("x", "y", "z")}

@@ -27,6 +27,7 @@ from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 
 
+@pytest.mark.apart
 def test_promises_deepen_as_the_task_says() -> None:
     run, folder = mission()
     x = run.task.sample(80, seed=1, dtype=torch.float64)

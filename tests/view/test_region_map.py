@@ -73,6 +73,7 @@ def test_places_are_strong_while_they_matter(region_map):
     assert seen[0] == seen[2] < seen[1]
 
 
+@pytest.mark.apart
 def test_the_film_moves(region_map, tmp_path):
     path = tmp_path / "walk.gif"
     save_animation(map_animation(region_map), path, max_frames=3)

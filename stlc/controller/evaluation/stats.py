@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from statistics import fmean, stdev
+from typing import Any
 
 from stlc.jsontext import Num
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,12 @@ class MeanInterval:
         return None if self.high is None else self.high - self.mean
 
 
+@cache
 def student(freedom: int) -> float:
     """97.5 % quantile of Student's t distribution with `freedom` degrees of freedom."""
     from mpmath import betainc, findroot  # torch brings it
 
-    def above(t: float) -> float:
-        share: float = betainc(freedom / 2, 0.5, 0, freedom / (freedom + t * t), regularized=True)
-        return share - 1.0 + CONFIDENCE
+    def above(t: float) -> Any:
+        return betainc(freedom / 2, 0.5, 0, freedom / (freedom + t * t), regularized=True) - 0.05
 
     return float(findroot(above, (1.0, 20.0), solver="anderson"))

@@ -182,6 +182,7 @@ def other_verifier(spec: str, system: str) -> Verifier:
     return Verifier(ProposedPlans(task, BestOfKPolicy(task, network)), seed=1)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(("spec", "system", "width"), OTHERS)
 def test_bounds_on_other_benchmarks_are_below_the_robustness(spec: str, system: str, width: float) -> None:
     found, rng = other_verifier(spec, system), np.random.default_rng(4)

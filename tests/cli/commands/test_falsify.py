@@ -66,6 +66,7 @@ def found(capsys: pytest.CaptureFixture[str], *args: str) -> dict:
     return json.loads(capsys.readouterr().out)["result"]
 
 
+@pytest.mark.apart
 def test_gusts_that_push_the_cart_out_are_found_and_replayed(capsys, tmp_path):
     assert main(["falsify", "latest", "--simulations", "32", "-o", str(tmp_path)]) == 1
     text = capsys.readouterr().out

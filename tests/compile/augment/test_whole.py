@@ -55,6 +55,7 @@ def planned(found: Compiled, signals: dict[str, np.ndarray]) -> np.ndarray:
     return np.broadcast_to(margins, (END + 1, BATCH)) >= -TOLERANCE
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("requirement", [*ON_WINDOWS, *FROM_START])
 @pytest.mark.parametrize("tag", ["", "@safety"])
 @settings(max_examples=6)

@@ -118,6 +118,7 @@ CALLS = {
 """Calls of the methods that read a point."""
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(("name", "args"), [(name, args) for name, calls in CALLS.items() for args in calls])
 def test_numpy_draws_are_distributed_as_numpys(name: str, args: tuple[Any, ...]) -> None:
     points, shown = np.random.default_rng(1).random((400, 8)), []

@@ -129,6 +129,7 @@ def test_a_thousand_drives_keep_their_plans(task: Task) -> None:
         assert known[:, 0].mean() > 0.9
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("seeds", [1, pytest.param(50, marks=pytest.mark.slow)])
 def test_drives_that_lose_a_requirement_keep_the_others(tmp_path: Path, seeds: int) -> None:
     held = {}
@@ -182,6 +183,7 @@ def test_remainders_of_a_plan_satisfy_from_the_states_on_its_way(task: Task) -> 
     assert clock[:6].tolist() == [0.0, 10.0, 20.0, 30.0, 40.0, 50.0]
 
 
+@pytest.mark.apart
 def test_the_first_plan_of_a_mission_may_take_longer(task: Task) -> None:
     hard = task_of(Path(task.system.decl.path).parent, text=ERRAND.replace("x > 5 m", "x > 6.9 m"))
     policy = PlannerPolicy(hard, planner_named("search"), PlanBudget(0.001, target=torch.inf))

@@ -54,6 +54,7 @@ def test_plans_are_mended(car_task: Task, by_torch: bool, monkeypatch: pytest.Mo
     assert (car_task.judge(x, refined[:, 0]).rho >= -1e-6).double().mean() >= 0.5
 
 
+@pytest.mark.apart
 def test_it_is_never_worse_than_what_it_begins_with(car_task: Task, rover_task: Task) -> None:
     for task in (car_task, rover_task):
         x = task.sample(60, seed=4, dtype=F64)

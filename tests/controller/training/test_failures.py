@@ -102,6 +102,7 @@ def test_a_round_grows_with_the_steps_since_the_one_before(car_task: Task) -> No
     assert known.simulations(run, 1000, 640) == pytest.approx(many / 2, abs=1.0)
 
 
+@pytest.mark.apart
 def test_a_resumed_run_with_rounds_equals_an_uninterrupted_one(car_task: Task, tmp_path: Path) -> None:
     config = TrainConfig(held_out=50, method="guided", steps=STEPS, seed=3, batch=32, drives=0, falsify=True)
     search = Found()

@@ -216,6 +216,7 @@ def grown(push: Callable[[int], object], samples: int) -> int:
     return sizes[1] - sizes[0]
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("samples", [600, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_memory_does_not_grow(samples: int) -> None:
     online = monitor_of("bounded", "past").online(How(at="all"))
