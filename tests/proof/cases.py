@@ -67,4 +67,5 @@ class Case:
 
     def same(self, found: Any, wanted: Any, about: str) -> None:
         """Equal within 1e-9, infinities and NaN included."""
-        np.testing.assert_allclose(found, wanted, atol=1e-9, rtol=0, err_msg=f"{about}\n{self}")
+        if not np.allclose(found, wanted, rtol=0, atol=1e-9, equal_nan=True):
+            np.testing.assert_allclose(found, wanted, atol=1e-9, rtol=0, err_msg=f"{about}\n{self}")
