@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from stlc.monitor.judgement import RequirementVerdict, Verdict
     from stlc.monitor.linted import lint
     from stlc.monitor.verdict import Monitor
+    from stlc.tabular import plot
     from stlc.trace import Trace
-    from stlc.view.plotted import plot
     from stlc.view.report import report
     from stlc.view.simulated import simulate
     from stlc.view.trained import train
@@ -98,7 +98,7 @@ _HOMES = {
     "explain": "stlc.controller.explain:explain",
     "falsify": "stlc.assurance.falsification:falsify",
     "plan": "stlc.controller.search.planner:plan",
-    "plot": "stlc.view.plotted:plot",
+    "plot": "stlc.tabular:plot",
     "report": "stlc.view.report:report",
     "simulate": "stlc.view.simulated:simulate",
     "train": "stlc.view.trained:train",

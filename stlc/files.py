@@ -312,16 +312,15 @@ def _specs_below(name: str) -> Iterator[str]:
         yield name
         return
     found = sorted(
-        path for path in folder.rglob("*") if path.suffix in SPEC_SUFFIXES and _in_sight(path, folder)
+        path
+        for path in folder.rglob("*")
+        if path.suffix in SPEC_SUFFIXES
+        and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)  # hidden
     )
     if not found:
         raise UsageError(Diagnostic("U102", f"there is no specification in `{name}`"))
     yield from map(str, found)
-
-
-def _in_sight(path: Path, folder: Path) -> bool:
-    """True if `path` is not hidden: no file or folder name below `folder` begins with a dot."""
-    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
 def find_trace(name: str, runs: Path = Path("runs")) -> Path:

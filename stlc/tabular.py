@@ -1,4 +1,4 @@
-"""Results as small tables: HTML for notebooks, and data frames of pandas or polars."""
+"""Results in notebooks: small tables as HTML, data frames of pandas or polars, and figures of matplotlib."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from importlib import import_module
 from itertools import zip_longest
 from typing import Any
 
+from stlc.diagnostics import usage
 from stlc.escape import html
 from stlc.extras import not_installed
 
+_PICTURES = {"Verdict": "stlc.view.plotted"}
+"""Type of a result -> module above whose function `plot` draws it."""
 _RED = ' style="color:#c0261c"'
 
 
@@ -38,3 +41,19 @@ def frame(columns: Mapping[str, Any]) -> Any:
         except ModuleNotFoundError:
             continue
     raise not_installed("pandas", need="a data frame needs")
+
+
+def plot(result: object) -> Any:
+    """Return the picture of a result as a figure of matplotlib.
+
+    A verdict shows the judged signals, with thresholds and deciding values, and the robustness at each
+    sample; of several traces, the worst and a typical one.
+
+    Raises:
+        MissingError: R301, matplotlib is not installed.
+        UsageError: U101, a result of this type has no picture.
+    """
+    name = type(result).__name__
+    if name not in _PICTURES:
+        raise usage(f"a `{name}` has no picture", "a Verdict has one")
+    return import_module(_PICTURES[name]).plot(result)

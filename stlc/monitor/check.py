@@ -116,7 +116,7 @@ def check(
     from stlc.trace import Trace
 
     if isinstance(trace, str | Path):
-        swapped = Path(trace).suffix == ".stl"
+        swapped = str(trace).endswith(".stl")
     else:
         swapped = spec is None or isinstance(trace, ast.Spec)
     if swapped or not isinstance(spec, ast.Spec | str | Path | None):

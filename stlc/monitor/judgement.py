@@ -24,7 +24,7 @@ from stlc.monitor.signals import Gap
 from stlc.provenance import sha256
 from stlc.registry import closest
 from stlc.source import Source
-from stlc.tabular import frame, html_table
+from stlc.tabular import frame, html_table, plot
 from stlc.trace.recording import Clock
 from stlc.trace.resample import TimeRange
 
@@ -472,6 +472,8 @@ class Verdict:
         header = ("requirement", "verdict", "robustness", "where", "why")
         bad = [row.overall == "violated" for row in self]
         return html_table(f"{self.about.spec_name} on {self.about.trace}: {self.scoped}", header, rows, bad)
+
+    plot = plot
 
     def to_frame(self) -> Any:
         """Return a data frame of pandas or polars with a row for each requirement and trace.

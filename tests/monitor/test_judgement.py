@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import stlc
+from stlc.diagnostics import UsageError
 from stlc.jsontext import plain
+from stlc.signature import Column, Signature
 
 TEXT = "spec tank\nsignal level [m]\nrequire low: always level < 3 m\nrequire `a<b>`: always level > 0 m\n"
 BATCH = {"level": np.array([[1.0, 2.0, 4.0], [1.0, 2.0, 2.5]])}
@@ -39,6 +41,15 @@ def test_a_notebook_shows_a_table_whose_texts_are_escaped(verdict):
     assert "a&lt;b&gt;" in shown
     assert shown.count('style="color') == 1
     assert "level &lt; 3 m` is false where level = 4 m" in shown
+
+
+def test_a_verdict_draws_itself_and_other_results_have_no_picture(verdict):
+    pytest.importorskip("matplotlib")
+    assert [axes.get_ylabel() for axes in verdict.plot().axes] == [
+        axes.get_ylabel() for axes in stlc.plot(verdict).axes
+    ]
+    with pytest.raises(UsageError, match="a `Trace` has no picture\n  help: a Verdict has one"):
+        stlc.plot(stlc.Trace(Signature((Column("x"),)), 1.0, {"x": np.ones((1, 3))}))
 
 
 def test_a_frame_has_a_row_for_each_requirement_and_trace():

@@ -65,13 +65,9 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> None:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    writer.writerows(map(_cell, row) for row in rows)
+    for row in rows:  # no spreadsheet program runs their texts
+        writer.writerow([spreadsheet(each) if isinstance(each, str) else each for each in row])
     write_atomic(path, text.getvalue())
-
-
-def _cell(value: Any) -> Any:
-    """Content of a cell: numbers as they are, and texts so that no spreadsheet program runs them."""
-    return spreadsheet(value) if isinstance(value, str) else "" if value is None else value
 
 
 def _rows(outcome: Outcome) -> Iterator[tuple[Any, ...]]:
