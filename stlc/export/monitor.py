@@ -150,19 +150,11 @@ def _about(online: Online) -> list[str]:
     return lines
 
 
-def _table(name: str, rows: Sequence[Any]) -> str:
+def _table(name: str, rows: Sequence[Sequence[Any]]) -> str:
     kind = next(kind for kind, each in TABLES.items() if each == name)
-    found = [_braced(row) if kind != "int32_t" else str(row[0]) for row in rows] or [_blank(kind)]
-    return "\n".join([f"static const {kind} {name}_[] = {{", *(f"  {row}," for row in found), "};"])
-
-
-def _blank(kind: str) -> str:
-    counts = {"node": 20, "operand": 2, "entry": 6, "graph": 11}
-    return "0" if kind == "int32_t" else "{" + ", ".join("0" * counts[kind]) + "}"
-
-
-def _braced(row: Any) -> str:
-    return "{" + ", ".join(_braced(each) if isinstance(each, tuple) else str(each) for each in row) + "}"
+    texts = [", ".join(map(str, row)) for row in rows or [(0,)]]
+    braced = [text if kind == "int32_t" else f"{{{text}}}" for text in texts]
+    return "\n".join([f"static const {kind} {name}_[] = {{", *(f"  {text}," for text in braced), "};"])
 
 
 def _single(text: str) -> str:

@@ -75,7 +75,8 @@ class StreamKernel:
         self, library: ctypes.CDLL, program: Streams, predicates: ctypes.CDLL, asked: Sequence[Asked]
     ) -> None:
         self.library, self._predicates = library, predicates
-        self._arrays = {name: np.array(_flat(rows) or [0], np.int32) for name, rows in program.tables.items()}
+        tables = {name: [number for row in rows for number in row] for name, rows in program.tables.items()}
+        self._arrays = {name: np.array(table or [0], np.int32) for name, table in tables.items()}
         places = {name: array.ctypes.data for name, array in self._arrays.items()}
         function = ctypes.cast(predicates.predicates, ctypes.c_void_p)
         self._tables = _Tables(**places, predicates=function, **program.sizes)
@@ -146,10 +147,6 @@ class StreamKernel:
         out = np.zeros(3, dtype=np.int64)
         self.library.stlc_gap(self.at, signal, out.ctypes.data)
         return Gap(*out.tolist())
-
-
-def _flat(row: Any) -> list[int]:
-    return [number for each in row for number in (_flat(each) if isinstance(each, tuple) else (each,))]
 
 
 @final

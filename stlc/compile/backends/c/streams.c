@@ -12,7 +12,7 @@ typedef struct { real lo, hi; } span;
 enum { SAMPLE, OPEN, GROWING, ENDED, CLIPPED };
 enum { TRUTH, PREDICATE, JOIN, FUTURE, PAST, SHIFT, BEGUN, UNTIL, SINCE };
 enum { NO = 1, YES = 2 };
-enum { DUAL = 1, WEAK = 2, UNCUT = 4, ENDLESS = 8, LASTS = 16, ROOT = 32 };
+enum { DUAL = 1, WEAK = 2, UNCUT = 4, ENDLESS = 8, LASTS = 16, ROOT = 32, AHEAD = 64 };
 
 /* A sub-formula. `lo` and `hi` are its window, the truth of a constant, or the steps of a shift and the truth
    outside of the trace (0: unknown). `delay` is the time until a value is known; `age` and `ahead` are the times
@@ -22,13 +22,19 @@ typedef struct {
   int32_t kind, flags, lo, hi, delay, age, ahead, operands, count, readers, reading;
   int32_t ring, ring_mask, window, place, truth, truth_mask, skip, ends, from;
 } node;
-typedef struct { int32_t node, late; } operand; /* `late`: samples since the value that is read */
+/* An operand, where its values are, and the samples since the instant of the one that is read; a constant has no
+   place: -1 (no) or -2 (yes). */
+typedef struct { int32_t node, ring, mask, since; } operand;
 /* Part of a formula with windows to the end of the trace; `later`: instants after that of the formula. */
 typedef struct { int32_t kind, flags, first, count, later, bit; } entry;
-typedef struct { int32_t first, count, root, late, lag, far, coefficients, bits, neutral, entries, entered; } graph;
-/* Graphs of the robustness and of the verdict, often the same one, and where their values are, also those of a trace
-   that cuts windows; where the starts that the latest step decided are. */
-typedef struct { int32_t values, truths, spans[2], ints[2], own[2], own_ints[2], news, news_mask; } rule;
+/* Nodes: predicates up to `leaves`, others with values up to `steps`, and those with windows to the end; how many have a
+   truth that may be known ahead (AHEAD). */
+typedef struct {
+  int32_t first, leaves, steps, count, root, lag, far, foreseen, coefficients, bits, neutral, entries, entered;
+  int32_t spans, span_count, ints, int_count; /* its parts of the state; another follows for a trace that cuts windows */
+} graph;
+/* Graphs of the robustness and of the verdict, often the same one; where the starts that the latest step decided are. */
+typedef struct { int32_t values, truths, news, news_mask; } rule;
 typedef struct { at known; real *first, *x; } samples; /* first values; the latest `rows` of each signal */
 typedef struct { at instants, holds, fails, low_at, high_at; real low, high; } tally;
 typedef struct { at begin; real slack; int32_t everywhere, cut, said, over, waiting; tally sum; span last[2]; } verdicts;
@@ -63,6 +69,7 @@ static inline span least(span a, span b) {
 static inline span most(span a, span b) {
   return spanned(b.lo > a.lo ? b.lo : a.lo, b.hi > a.hi ? b.hi : a.hi);
 }
+static inline span pick(span a, span b, int dual) { return dual ? least(a, b) : most(a, b); }
 static inline at later(at a, at b) { return a > b ? a : b; }
 static inline at sooner(at a, at b) { return a < b ? a : b; }
 
@@ -86,20 +93,19 @@ static span shifted(span x, int mode, int weak, int outside) {
   return weak ? spanned(x.lo, INF) : spanned(-INF, x.hi);
 }
 
-/* Maximum over the last `width` operands: suffixes of the block before, and the prefix of this one. */
-static span maximum(span *v, int32_t *place, at q, int32_t width, span x) {
+/* Extremum over the last `width` operands: suffixes of the block before, and the prefix of this one. */
+INLINED span extremum(span *v, int32_t *place, at q, int32_t width, span x, int dual) {
   const int32_t k = *place;
-  span out, *sum = v + width;
+  span *sum = v + width;
+  *place = k + 1 == width ? 0 : k + 1;
   if (k == 0) {
-    if (q >= width) for (int32_t i = width - 2; i > 0; --i) v[i] = most(v[i], v[i + 1]);
+    if (q >= width) for (int32_t i = width - 2; i > 0; --i) v[i] = pick(v[i], v[i + 1], dual);
     *sum = x;
   } else {
-    *sum = most(*sum, x);
+    *sum = pick(*sum, x, dual);
   }
-  out = q >= width && k + 1 < width ? most(*sum, v[k + 1]) : *sum;
   v[k] = x;
-  *place = k + 1 == width ? 0 : k + 1;
-  return out;
+  return q >= width && k + 1 < width ? pick(*sum, v[k + 1], dual) : *sum;
 }
 
 /* The same for `until`, which is a composition of functions x -> min(f[1], max(f[0], x)), the oldest outermost. */
@@ -127,13 +133,17 @@ static span composition(span *v, int32_t *place, at q, int32_t width, span floor
   return out;
 }
 
-static span value_of(const tables *t, const span *v, const operand *from, at n) {
-  const node *o = t->nodes + from->node;
-  return o->kind == TRUTH ? certain(o->lo == YES) : v[o->ring + ((n - o->delay - from->late) & o->ring_mask)];
+static inline span value_of(const span *v, const operand *from, at n) {
+  if (from->ring < 0) return certain(from->ring == -2);
+  return v[from->ring + ((n - from->since) & from->mask)];
+}
+static inline span value_at(const span *v, const node *o, at t) {
+  if (o->kind == TRUTH) return certain(o->lo == YES);
+  return v[o->ring + (t & o->ring_mask)];
 }
 
 /* Value of a node at the instant that the latest step makes known; none before the first one. */
-static void advance(const tables *t, const node *o, const samples *x, at n, int mode, int clip, span *v, int32_t *ints) {
+INLINED void advance(const tables *t, const node *o, const samples *x, at n, int mode, int clip, span *v, int32_t *ints) {
   const operand *in = t->operands + o->operands;
   const int dual = o->flags & DUAL;
   const at now = n - o->delay;
@@ -142,20 +152,16 @@ static void advance(const tables *t, const node *o, const samples *x, at n, int 
   switch (o->kind) {
   case JOIN:
     if (now < 0) return;
-    out = value_of(t, v, in, n);
-    for (int32_t i = 1; i < o->count; ++i) {
-      right = value_of(t, v, in + i, n);
-      out = dual ? least(out, right) : most(out, right);
-    }
+    out = value_of(v, in, n);
+    for (int32_t i = 1; i < o->count; ++i) out = pick(out, value_of(v, in + i, n), dual);
     break;
   case FUTURE:
     q = now + o->hi;
     if (q < 0) return;
-    out = value_of(t, v, in, n);
-    if (dual) out = minus(out);
-    if (q >= x->known && (!(o->flags & UNCUT) || mode == CLIPPED)) out = beyond(out, mode, 0);
-    out = maximum(v + o->window, ints + o->place, q, o->hi - o->lo + 1, out);
-    if (dual) out = minus(out);
+    out = value_of(v, in, n);
+    if (q >= x->known && (!(o->flags & UNCUT) || mode == CLIPPED))
+      out = dual ? minus(beyond(minus(out), mode, 0)) : beyond(out, mode, 0);
+    out = extremum(v + o->window, ints + o->place, q, o->hi - o->lo + 1, out, dual);
     break;
   case PAST:
     if (now < 0) return;
@@ -163,9 +169,7 @@ static void advance(const tables *t, const node *o, const samples *x, at n, int 
     if (q < 0) {
       out = certain(dual);
     } else {
-      out = value_of(t, v, in, n);
-      out = maximum(v + o->window, ints + o->place, q, o->hi - o->lo + 1, dual ? minus(out) : out);
-      if (dual) out = minus(out);
+      out = extremum(v + o->window, ints + o->place, q, o->hi - o->lo + 1, value_of(v, in, n), dual);
     }
     break;
   case SHIFT:
@@ -174,15 +178,15 @@ static void advance(const tables *t, const node *o, const samples *x, at n, int 
     if (q < 0) {
       out = o->hi ? certain(o->hi == YES) : clip ? certain(o->flags & WEAK) : spanned(-INF, INF);
     } else {
-      out = value_of(t, v, in, n);
+      out = value_of(v, in, n);
       if (o->lo > 0 && q >= x->known) out = shifted(out, mode, o->flags & WEAK, o->hi);
     }
     break;
   case UNTIL:
     q = now + o->hi;
     if (q < 0) return;
-    left = o->count == 2 ? value_of(t, v, in, n) : certain(!dual);
-    right = value_of(t, v, in + o->count - 1, n);
+    left = o->count == 2 ? value_of(v, in, n) : certain(!dual);
+    right = value_of(v, in + o->count - 1, n);
     if (dual) { left = minus(left); right = minus(right); }
     if (q >= x->known) right = beyond(right, mode, 0);
     if (q >= x->known && mode == CLIPPED) left = certain(1);
@@ -191,11 +195,11 @@ static void advance(const tables *t, const node *o, const samples *x, at n, int 
     break;
   case SINCE:
     if (now < 0) return;
-    right = value_of(t, v, in + o->count - 1, n);
+    right = value_of(v, in + o->count - 1, n);
     if (dual) right = minus(right);
     if (now > 0) right = most(right, v[o->window]);
     if (o->count == 2) {
-      left = value_of(t, v, in, n);
+      left = value_of(v, in, n);
       right = least(dual ? minus(left) : left, right);
     }
     v[o->window] = right;
@@ -213,7 +217,14 @@ static void coefficients(const tables *t, const graph *g, const samples *x, at n
   const at f = n - g->lag;
   span e[ENTRIES], rest[BITS], next[1 << BITS], *c = v + g->coefficients;
   const int sets = 1 << g->bits;
+  const entry *last = t->entries + g->entries + g->entered - 1;
   if (f < begin) return;
+  if (g->entered == 2 && last->count == 1 && f + last->later < x->known) { /* one extremum to the end */
+    const span all = value_of(v, t->operands + (last - 1)->first, n);
+    c[!g->neutral] = certain(!g->neutral);
+    c[g->neutral] = f == begin ? all : pick(c[g->neutral], all, g->neutral);
+    return;
+  }
   for (int s = 0; s < sets; ++s) {
     for (int32_t i = 0; i < g->entered; ++i) {
       const entry *o = t->entries + g->entries + i;
@@ -221,7 +232,7 @@ static void coefficients(const tables *t, const graph *g, const samples *x, at n
       const int dual = o->flags & DUAL;
       span out;
       if (o->kind == PREDICATE) { /* any part without windows to the end */
-        out = value_of(t, v, t->operands + o->first, n);
+        out = value_of(v, t->operands + o->first, n);
       } else if (o->kind == JOIN) {
         out = e[t->operands[o->first].node];
         for (int32_t k = 1; k < o->count; ++k) {
@@ -263,18 +274,20 @@ static void coefficients(const tables *t, const graph *g, const samples *x, at n
 }
 
 /* Take a step; return bounds at the instant `lag` samples before, or of the formula with windows to the end. */
-static span valued(const tables *t, const graph *g, const samples *x, at n, int mode, int clip, at begin, span *v, int32_t *ints) {
-  operand root;
-  t->predicates((int32_t)(g - t->graphs), x, n, mode, clip, v);
-  for (int32_t i = g->first; i < g->first + g->count; ++i)
-    if (!(t->nodes[i].flags & ENDLESS)) advance(t, t->nodes + i, x, n, mode, clip, v, ints);
+INLINED span stepped(const monitor *m, const graph *g, at n, int mode, int clip, at begin) {
+  const tables *t = m->t;
+  span *v = m->spans + g->spans + (clip ? g->span_count : 0);
+  int32_t *ints = m->ints + g->ints + (clip ? g->int_count : 0);
+  t->predicates((int32_t)(g - t->graphs), &m->s, n, mode, clip, v);
+  for (int32_t i = g->leaves; i < g->steps; ++i) advance(t, t->nodes + i, &m->s, n, mode, clip, v, ints);
   if (g->bits) {
-    coefficients(t, g, x, n, mode, begin, v);
+    coefficients(t, g, &m->s, n, mode, begin, v);
     return n - g->lag >= begin ? v[g->coefficients + g->neutral] : spanned(-INF, INF);
   }
-  root.node = g->root;
-  root.late = g->late;
-  return n >= g->lag ? value_of(t, v, &root, n) : spanned(-INF, INF);
+  return n >= g->lag ? value_at(v, t->nodes + g->root, n - g->lag) : spanned(-INF, INF);
+}
+static span valued(const monitor *m, const graph *g, at n, int mode, int clip, at begin) {
+  return stepped(m, g, n, mode, clip, begin);
 }
 
 /* ------------------------------------------------------------------------------------------------ truths */
@@ -294,11 +307,16 @@ static int truth_at(const monitor *m, const node *o, at t) {
   return 0;
 }
 
-static void decide(monitor *m, int32_t r, at t, int truth) {
+/* Decide the starts from `first` to `last` that exist. */
+static void decide(monitor *m, int32_t r, at first, at last, int truth) {
   verdicts *of = m->of + r;
-  if (t >= m->s.known || (of->everywhere ? t < of->begin : t != of->begin || of->said)) return;
+  int32_t *news = m->ints + m->t->rules[r].news;
+  const int32_t mask = m->t->rules[r].news_mask;
+  first = later(first, of->begin);
+  last = sooner(last, of->everywhere ? m->s.known - 1 : sooner(of->begin, m->s.known - 1));
+  if (of->said || first > last) return;
   if (!of->everywhere) of->said = truth;
-  m->ints[m->t->rules[r].news + (of->waiting++ & m->t->rules[r].news_mask)] = (int32_t)(m->s.known - t);
+  for (at t = first; t <= last; ++t) news[of->waiting++ & mask] = (int32_t)(m->s.known - t);
 }
 
 /* Add the instants `first` to `last` to runs of the same truth: both ends of a run hold its length - 1. */
@@ -373,10 +391,15 @@ static int unseen(const monitor *m, int32_t r, const node *o) {
 /* Make the truth of a node known at instants at which it was not. */
 static void settle(monitor *m, int32_t r, int32_t i, at first, at last, int truth) {
   const node *o = m->t->nodes + i;
-  for (at t = first; t <= last; ++t) m->truths[o->truth + (t & o->truth_mask)] = (unsigned char)truth;
-  if (o->kind == FUTURE || o->kind == PAST)
-    for (at t = first; t <= last; ++t) m->ints[o->skip + (t & o->truth_mask)] = 1;
-  if (o->flags & ROOT) for (at t = first; t <= last; ++t) decide(m, r, t, truth);
+  unsigned char *known = m->truths + o->truth;
+  int32_t *skip = m->ints + o->skip;
+  const at mask = o->truth_mask;
+  const int windows = o->kind == FUTURE || o->kind == PAST;
+  for (at t = first; t <= last; ++t) {
+    known[t & mask] = (unsigned char)truth;
+    if (windows) skip[t & mask] = 1;
+  }
+  if (o->flags & ROOT) decide(m, r, first, last, truth);
   if (unseen(m, r, o)) last = sooner(last, m->s.known - 1);
   for (int32_t k = 0; k < o->reading && first <= last; ++k) react(m, r, m->t->readers[o->readers + k], i, first, last, truth);
   if (o->kind == SINCE) { /* it stays true while the left side does, and false while the right side does */
@@ -407,7 +430,9 @@ static void mark(monitor *m, int32_t r, int32_t i, at first, at last, int truth)
   const at oldest = later(m->s.known - 1 - o->age, 0), newest = m->s.known - 1 + o->ahead;
   unsigned char *known = m->truths + o->truth;
   const at mask = o->truth_mask;
-  first = later(first, oldest);
+  at *done = o->kind == FUTURE || o->kind == PAST ? m->times + o->from + 2 : 0; /* before it, all are known */
+  const at from = done ? later(*done, oldest) : oldest;
+  first = later(first, from);
   last = sooner(last, newest);
   if (first > last) return;
   if (o->kind == UNTIL || o->kind == SINCE) {
@@ -419,9 +444,10 @@ static void mark(monitor *m, int32_t r, int32_t i, at first, at last, int truth)
     }
     return;
   }
+  if (done && first == from) *done = last + 1;
   for (at t = first; t <= last;) {
     const at begin = t;
-    if (known[t & mask] && (o->kind == FUTURE || o->kind == PAST)) { /* on to the next that is unknown */
+    if (known[t & mask] && done) { /* on to the next that is unknown */
       int32_t *skip = m->ints + o->skip;
       const at next = t + skip[t & mask];
       if (next <= last && known[next & mask]) skip[t & mask] += skip[next & mask];
@@ -505,10 +531,12 @@ static void begin(monitor *m, int32_t r, const graph *g) {
   {
     const node *root = m->t->nodes + g->root;
     const int truth = root->kind == TRUTH ? root->lo : m->truths[root->truth + (n & root->truth_mask)];
-    if (truth) decide(m, r, n, truth);
+    if (truth) decide(m, r, n, n, truth);
   }
+  if (!g->foreseen && !cut) return;
   for (int32_t i = g->first + g->count - 1; i >= g->first; --i) { /* what was known of instants without room or samples */
     const node *o = m->t->nodes + i;
+    if (!(o->flags & AHEAD)) continue;
     const int truth = unseen(m, r, o) && o->ahead ? m->truths[o->truth + (n & o->truth_mask)] : 0;
     for (int32_t k = 0; k < o->reading && truth; ++k) react(m, r, m->t->readers[o->readers + k], i, n, n, truth);
     for (int32_t j = 0; o->kind == JOIN && j < o->count; ++j) {
@@ -520,6 +548,7 @@ static void begin(monitor *m, int32_t r, const graph *g) {
   }
   for (int32_t i = g->first; i < g->first + g->count; ++i) {
     const node *o = m->t->nodes + i;
+    if (!(o->flags & AHEAD) && !cut) continue;
     const node *part = m->t->nodes + (o->count ? m->t->operands[o->operands].node : i);
     const int yes = o->flags & DUAL ? NO : YES;
     const at top = n + o->ahead;
@@ -563,7 +592,7 @@ static void decide_endless(monitor *m, int32_t r, const graph *g, const span *v)
     holds |= every && c[s].lo >= m->of[r].slack;
     fails &= none;
   }
-  if (holds || fails) decide(m, r, m->of[r].begin, fails ? NO : YES);
+  if (holds || fails) decide(m, r, m->of[r].begin, m->of[r].begin, fails ? NO : YES);
 }
 
 /* ---------------------------------------------------------------------------------------------- monitors */
@@ -584,31 +613,27 @@ static void judged(monitor *m, int32_t r) {
   verdicts *of = m->of + r;
   const at n = m->s.known - 1, t = n - truths->lag;
   const int apart = a->values != a->truths;
-  span *live = m->spans + a->spans[0], value, deciding;
-  operand root;
+  span *live = m->spans + truths->spans, value, deciding;
+  const node *root = m->t->nodes + truths->root;
   at there;
   begin(m, r, truths);
-  deciding = valued(m->t, truths, &m->s, n, SAMPLE, 0, of->begin, live, m->ints + a->ints[0]);
-  for (int32_t i = truths->first; i < truths->first + truths->count; ++i)
-    if (m->t->nodes[i].kind == PREDICATE && n >= m->t->nodes[i].delay) {
-      const int truth = truth_of(live[m->t->nodes[i].ring + ((n - m->t->nodes[i].delay) & m->t->nodes[i].ring_mask)], of->slack);
-      there = n - m->t->nodes[i].delay;
-      if (truth) settle(m, r, i, there, there, truth);
-    }
-  if (of->cut) deciding = valued(m->t, truths, &m->s, n, SAMPLE, 1, of->begin, m->spans + a->spans[1], m->ints + a->ints[1]);
+  deciding = stepped(m, truths, n, SAMPLE, 0, of->begin);
+  for (int32_t i = truths->first; i < truths->leaves; ++i) {
+    const node *o = m->t->nodes + i;
+    const int truth = n < o->delay ? 0 : truth_of(value_at(live, o, n - o->delay), of->slack);
+    if (truth) settle(m, r, i, n - o->delay, n - o->delay, truth);
+  }
+  if (of->cut) deciding = valued(m, truths, n, SAMPLE, 1, of->begin);
   value = deciding;
-  for (int clip = 0; apart && clip <= of->cut; ++clip)
-    value = valued(m->t, values, &m->s, n, SAMPLE, clip, of->begin, m->spans + a->own[clip], m->ints + a->own_ints[clip]);
+  for (int clip = 0; apart && clip <= of->cut; ++clip) value = valued(m, values, n, SAMPLE, clip, of->begin);
   if (truths->bits) {
     decide_endless(m, r, truths, live);
     return;
   }
-  root.node = truths->root;
-  root.late = 0;
-  there = n - m->t->nodes[root.node].delay;
-  if (there >= 0 && !truth_at(m, m->t->nodes + root.node, there)) {
-    const int truth = truth_of(value_of(m->t, m->spans + a->spans[of->cut], &root, n), of->slack);
-    if (truth) settle(m, r, root.node, there, there, truth);
+  there = n - root->delay;
+  if (there >= 0 && !truth_at(m, root, there)) {
+    const int truth = truth_of(value_at(live + (of->cut ? truths->span_count : 0), root, there), of->slack);
+    if (truth) settle(m, r, truths->root, there, there, truth);
   }
   if (t < of->begin) return;
   counted(of, t, value, deciding);
@@ -714,10 +739,9 @@ API void stlc_look(monitor *m, int32_t r, int mode, int clip, int64_t start, int
   const at far = values->bits ? m->s.known - 1 + values->far : start + count - 1 + truths->lag;
   for (at n = m->s.known; n <= far; ++n) {
     const at t = values->bits ? start : n - truths->lag;
-    const span deciding = valued(m->t, truths, &m->s, n, mode, clip, m->of[r].begin, m->spans + a->spans[clip], m->ints + a->ints[clip]);
+    const span deciding = valued(m, truths, n, mode, clip, m->of[r].begin);
     span value = deciding;
-    if (a->values != a->truths)
-      value = valued(m->t, values, &m->s, n, mode, clip, m->of[r].begin, m->spans + a->own[clip], m->ints + a->own_ints[clip]);
+    if (a->values != a->truths) value = valued(m, values, n, mode, clip, m->of[r].begin);
     if (t < start || t >= start + count) continue;
     out[4 * (t - start)] = (real)value.lo; out[4 * (t - start) + 1] = (real)value.hi;
     out[4 * (t - start) + 2] = (real)deciding.lo; out[4 * (t - start) + 3] = (real)deciding.hi;

@@ -137,6 +137,21 @@ class Node:
         return PICKS.get(getattr(self.form, "op", "")) == "min"
 
     @property
+    def ends(self) -> bool:
+        """True if its own window extends to the end of the trace."""
+        return isinstance(self.form, ir.Until) and self.form.window.hi is None
+
+    @property
+    def since(self) -> int:
+        """Samples between the instant at which it reads its operands, and the latest one."""
+        return self.delay - self.far
+
+    @property
+    def foreseen(self) -> bool:
+        """True if its truth at an instant may be known before the samples up to there."""
+        return self.lasts or self.ahead > 0 or self.far < 0 or isinstance(self.form, ir.Shift)
+
+    @property
     def rows(self) -> int:
         """Length of the ring of its truths, a power of 2."""
         return _ring(self.age + self.ahead + 3)
@@ -179,20 +194,21 @@ class Graph:
     """
 
     def __init__(self, formula: ir.Formula, lag: int, signals: Mapping[str, int]) -> None:
-        self.signals, self.spans, self.ints = signals, 0, 0
+        self.signals = signals
         self.rings: dict[int, int] = {}
         self.nodes: list[Node] = []
         self._known: dict[ir.Formula, int] = {}
         self.root = self._place(normal(formula))
+        self._sort()
         top = self.nodes[self.root]
-        self.coefficients: list[tuple[int, int]] = []
-        """Windows to the end: number of the node, and instants after that of the requirement."""
-        self.parts: dict[tuple[int, int], None] = {}
+        self.skeleton: dict[tuple[int, int], list[int]] = {}
+        """Part of a formula with windows to the end, and instants after the formula's -> its operands."""
         if top.endless:
             self._skeleton(self.root, 0)
-            if len(self.coefficients) > _MOST:
-                raise Untranslatable("too many windows to the end")
-            lag = max([lag, *(self.nodes[part].delay + later for part, later in self.parts)])
+            lag = max(lag, *(self.nodes[part].delay + later for part, later in self.skeleton))
+        self.coefficients = [key for key in self.skeleton if self.nodes[key[0]].ends]
+        if len(self.coefficients) > _MOST:
+            raise Untranslatable("too many windows to the end")
         self.lag = max(lag, top.delay)
         self._sizes()
 
@@ -209,37 +225,33 @@ class Graph:
         near, far = _reads(form)
         delay = max(max((self.nodes[arg].delay for arg in args), default=0) + far, 0)
         node = Node(len(self.nodes), form, args, near, far, delay)
-        endless = isinstance(form, ir.Until) and form.window.hi is None
-        node.endless = endless or any(self.nodes[arg].endless for arg in args)
+        node.endless = node.ends or any(self.nodes[arg].endless for arg in args)
         self.nodes.append(node)
-        for arg in args:
-            self.nodes[arg].readers.append(node.index)
         self._known[form] = node.index
         return node.index
 
-    def _skeleton(self, index: int, later: int) -> None:
-        """Find the operators with windows to the end, and the nodes without that these read."""
-        node = self.nodes[index]
-        if not node.endless:
-            self.parts[index, later] = None
-            return
-        match node.form:
-            case ir.BoolOp():
-                pass
-            case Begun():
-                pass
-            case ir.Shift(steps, _, None) if steps >= 0:
-                later += steps
-            case ir.Until(window=ir.Window(hi=None)):
-                if (index, later) not in self.coefficients:
-                    for arg in node.args:
-                        self._skeleton(arg, later)
-                    self.coefficients.append((index, later))
-                return
-            case _:
+    def _sort(self) -> None:
+        """Number predicates first, nodes with windows to the end last; operands stay before their readers."""
+        self.nodes.sort(key=lambda node: (node.endless, not isinstance(node.form, ir.Predicate)))
+        place = {node.index: i for i, node in enumerate(self.nodes)}
+        for i, node in enumerate(self.nodes):
+            node.index, node.args = i, tuple(place[arg] for arg in node.args)
+            for arg in dict.fromkeys(node.args):
+                self.nodes[arg].readers.append(i)
+        self.root = place[self.root]
+
+    def _skeleton(self, index: int, later: int) -> int:
+        """Add operators with windows to the end, and the nodes without that they read; return the number."""
+        node, key = self.nodes[index], (index, later)
+        if node.endless:
+            steps = getattr(node.form, "steps", 0)
+            fixed = isinstance(node.form, ir.Windowed) and not node.ends
+            if fixed or steps < 0 or getattr(node.form, "outside", None) is not None:
                 raise Untranslatable("a window to the end inside of another operator")
-        for arg in node.args:
-            self._skeleton(arg, later)
+        if key not in self.skeleton:
+            args = node.args if node.endless else ()
+            self.skeleton[key] = [self._skeleton(arg, later + node.near) for arg in args]
+        return [*self.skeleton].index(key)
 
     def _sizes(self) -> None:
         for node in self.nodes:
@@ -258,20 +270,18 @@ class Graph:
             for part in (self.nodes[arg] for arg in node.args):
                 part.ahead = max(part.ahead, node.ahead if isinstance(node.form, ir.BoolOp) else 0)
                 part.age = max(part.age, node.age - node.near)
-        for node in self.nodes:
-            for arg in () if node.endless else node.args:
-                self._keep(arg, self._late(node, arg))
-        for index, later in self.parts:
-            self._keep(index, self.lag - later - self.nodes[index].delay)
-        if not self.nodes[self.root].endless:
-            self._keep(self.root, self.lag - self.nodes[self.root].delay)
+        reads = [(arg, node.since) for node in self.nodes if not node.endless for arg in node.args]
+        reads += [(index, self.lag - later) for index, later in self.skeleton or {(self.root, 0)}]
+        for index, since in reads:
+            part = self.nodes[index]
+            part.kept = max(part.kept, since - part.delay)
 
-    def _keep(self, index: int, late: int) -> None:
-        self.nodes[index].kept = max(self.nodes[index].kept, late)
-
-    def _late(self, node: Node, arg: int) -> int:
-        """Samples between the value of an operand and the one that reads it."""
-        return node.delay - node.far - self.nodes[arg].delay
+    def _read(self, first: int, index: int, since: int) -> Row:
+        """Row of an operand whose value is read at the instant `since` samples ago."""
+        part = self.nodes[index]
+        if isinstance(part.form, ir.Truth):
+            return (first + index, -2 if part.form.value else -1, 0, 0)
+        return (first + index, self.rings[index], _ring(part.kept + 1) - 1, since)
 
     @property
     def samples(self) -> int:
@@ -286,7 +296,7 @@ class Graph:
 
     # ------------------------------------------------------------------------- tables
 
-    def tables(self, out: _Tables) -> int:
+    def tables(self, out: _Tables, *, cut: bool) -> int:
         """Add the tables of the graph; return its number."""
         first, spans, ints = len(out.nodes), 0, 0
 
@@ -310,9 +320,9 @@ class Graph:
                     lo, hi = around.lo, around.hi or 0
             flags |= _DUAL * node.dual
             flags |= _UNCUT * isinstance(form, Lasting) | _ENDLESS * node.endless
-            flags |= _LASTS * node.lasts | _ROOT * (node.index == self.root)
-            operands = out.add(out.operands, [(first + arg, self._late(node, arg)) for arg in node.args])
-            readers = out.add(out.readers, [(first + reader,) for reader in dict.fromkeys(node.readers)])
+            flags |= _LASTS * node.lasts | _ROOT * (node.index == self.root) | _AHEAD * node.foreseen
+            operands = out.add(out.operands, [self._read(first, arg, node.since) for arg in node.args])
+            readers = out.add(out.readers, [(first + reader,) for reader in node.readers])
             rows, kept = node.rows, _ring(node.kept + 1)
             window = ends = place = skip = 0
             ring = self.rings[node.index] = 0 if node.endless else room(kept)
@@ -329,7 +339,8 @@ class Graph:
                 skip, ends = out.room("ints", rows), out.room("ints", self.nodes[node.args[0]].rows)
             elif isinstance(form, ir.BoolOp):
                 skip = out.room("ints", rows)
-            since = out.room("times", 2) if node.lasts else 0
+            lasting, windows = 2 * node.lasts, isinstance(form, (ir.Temporal, ir.PastTemporal))
+            since = out.room("times", 3 if windows else lasting)
             sizes = (
                 node.delay,
                 node.age,
@@ -337,7 +348,7 @@ class Graph:
                 operands,
                 len(node.args),
                 readers,
-                len(dict.fromkeys(node.readers)),
+                len(node.readers),
             )
             places = (ring, kept - 1, window, place, truth, rows - 1, skip, ends, since)
             out.nodes.append((kind, flags, lo, hi, *sizes, *places))
@@ -346,44 +357,44 @@ class Graph:
         if bits:
             coefficients = room(1 << bits)
         neutral = sum(1 << i for i, (index, _) in enumerate(self.coefficients) if self.nodes[index].dual)
-        late = self.lag - self.nodes[self.root].delay
-        shape = (first, len(self.nodes), first + self.root, late, self.lag, self.far)
-        out.graphs.append((*shape, coefficients, bits, neutral, len(out.entries), len(entries)))
+        steps = sum(not node.endless for node in self.nodes)
+        leaves = sum(isinstance(node.form, ir.Predicate) for node in self.nodes)
+        shape = (first, first + leaves, first + steps, len(self.nodes), first + self.root, self.lag, self.far)
+        out.graphs.append(
+            (
+                *shape,
+                sum(node.foreseen for node in self.nodes),
+                coefficients,
+                bits,
+                neutral,
+                len(out.entries),
+                len(entries),
+                out.room("spans", spans * (1 + cut)),
+                spans,
+                out.room("ints", ints * (1 + cut)),
+                ints,
+            )
+        )
         out.entries += entries
         if len(entries) > _ENTRIES:
             raise Untranslatable("too many operators around windows to the end")
-        self.spans, self.ints = spans, ints
         return len(out.graphs) - 1
 
-    def _entries(self, first: int, out: _Tables) -> list[tuple[int, ...]]:
+    def _entries(self, first: int, out: _Tables) -> list[Row]:
         """Parts of a formula with windows to the end, operands first."""
-        entries: list[tuple[int, ...]] = []
-        done: dict[tuple[int, int], int] = {}
-        bits = {key: bit for bit, key in enumerate(self.coefficients)}
-
-        def place(index: int, later: int) -> int:
-            if (index, later) in done:
-                return done[index, later]
-            node, form = self.nodes[index], self.nodes[index].form
-            flags, kind, there, bit = 0, _KINDS[type(form)], later, 0
+        entries: list[Row] = []
+        for (index, later), args in self.skeleton.items():
+            node = self.nodes[index]
             if not node.endless:
-                kind, operands = _KINDS[ir.Predicate], [(first + index, self.lag - later - node.delay)]
-            else:
-                if isinstance(form, ir.Shift):
-                    flags, there = _WEAK * form.weak, later + form.steps
-                flags |= _DUAL * node.dual
-                below = there if not isinstance(form, Begun) else later
-                operands = [(place(arg, below), 0) for arg in node.args]
-                if isinstance(form, ir.Until):
-                    bit = bits[index, later]
-                    operands.append((first + index, 0))
-            count = len(operands) - isinstance(form, ir.Until) * node.endless
-            entries.append((kind, flags, out.add(out.operands, operands), count, there, bit))
-            done[index, later] = len(entries) - 1
-            return done[index, later]
-
-        if self.nodes[self.root].endless:
-            place(self.root, 0)
+                operands = out.add(out.operands, [self._read(first, index, self.lag - later)])
+                entries.append((_KINDS[ir.Predicate], 0, operands, 1, later, 0))
+                continue
+            own = [(first + index, 0, 0, 0)] if node.ends else []
+            operands = out.add(out.operands, [(arg, 0, 0, 0) for arg in args] + own)
+            flags = _WEAK * getattr(node.form, "weak", False) | _DUAL * node.dual
+            bit = self.coefficients.index((index, later)) if node.ends else 0
+            there = later + getattr(node.form, "steps", 0)
+            entries.append((_KINDS[type(node.form)], flags, operands, len(args), there, bit))
         return entries
 
     def predicates(self, number: int) -> Lines:
@@ -457,7 +468,7 @@ class Graph:
         ]
 
 
-_DUAL, _WEAK, _UNCUT, _ENDLESS, _LASTS, _ROOT = 1, 2, 4, 8, 16, 32
+_DUAL, _WEAK, _UNCUT, _ENDLESS, _LASTS, _ROOT, _AHEAD = 1, 2, 4, 8, 16, 32, 64
 _KINDS: dict[type, int] = {
     ir.Truth: 0,
     ir.Predicate: 1,
@@ -552,7 +563,7 @@ def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> S
 
     def added(graph: Graph) -> int:
         nonlocal rows
-        number = graph.tables(out)
+        number = graph.tables(out, cut=cut)
         bodies.append(graph.predicates(number))
         rows = max(rows, graph.samples)
         return number
@@ -564,13 +575,8 @@ def streams_of(rules: Sequence[Rule], signals: Sequence[str], *, cut: bool) -> S
             values = Graph(rule.formula, deciding.lag, index)
         truths = added(deciding)
         numbers = (truths if values is deciding else added(values), truths)
-        places = []
-        for graph in (deciding, values):
-            for part, count in (("spans", graph.spans), ("ints", graph.ints)):
-                one = out.room(part, count)
-                places.append((one, out.room(part, count) if cut else one))
         root = deciding.nodes[deciding.root].rows
-        out.rules.append((*numbers, *places, out.room("ints", root), root - 1))
+        out.rules.append((*numbers, out.room("ints", root), root - 1))
     if any(size >= _LARGEST for size in out.sizes.values()):
         raise Untranslatable("windows of more samples than memory holds")
     sizes = {"signals": len(signals), "rows": _ring(rows), "judged": len(rules)}
@@ -604,6 +610,11 @@ HEAD = """
 typedef REAL real;
 typedef int64_t at;
 #define INF ((real)INFINITY)
+#if defined(__GNUC__)
+#define INLINED static inline __attribute__((always_inline))
+#else
+#define INLINED static inline
+#endif
 #define MIN(a, b) ((b) < (a) ? (b) : (a)) /* a where it is NaN */
 #define MAX(a, b) ((b) > (a) ? (b) : (a))
 #define LEAST(a, b) ((b) < (a) || (b) != (b) ? (b) : (a)) /* NaN where either is */
