@@ -9,7 +9,6 @@ from itertools import zip_longest
 from textwrap import wrap
 from typing import Literal, TypeAlias
 
-from stlc.compile.augment.timers import Timer
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import Grid, duration, in_words
 from stlc.compile.ir.support import columns_in
@@ -124,11 +123,6 @@ def _rule(rule: CompiledRequirement, kind: str, compiled: Compiled, part: Part) 
             yield f"    {label:<8}  {line}"
 
 
-def _added(timer: Timer) -> str:
-    """Return the line about an added state: its kind, name and meaning."""
-    return f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
-
-
 def _instants(rule: CompiledRequirement, grid: Grid) -> list[str]:
     return list(_times(rule, grid)) or ["the first sample alone"]
 
@@ -159,7 +153,8 @@ def _states(compiled: Compiled) -> Iterator[str]:
     yield "  columns   " + " ".join(map(shown, read)) + (f" | {' '.join(map(shown, added))}" if added else "")
     for each in compiled.parameters:
         yield f"  + param   {shown(each.column.name)}  {each.text}, drawn for every trajectory"
-    yield from (_added(timer) for timer in compiled.timers)
+    for timer in compiled.timers:
+        yield f"  + {timer.kind:<6}  {shown(timer.name)}  {timer.about}".rstrip()
     if compiled.mission is not None:
         yield f"  mission   {duration(compiled.mission, compiled.grid)}"
     safe = ", ".join(show_name(rule.name) for rule in compiled.safety)

@@ -86,7 +86,7 @@ class Question:
     strict: bool = False
 
 
-OF_TABLES = frozenset({"names", "resample", "dt", "max_gap", "between", "clock", "group", "columns"})
+OF_TABLES = {"names", "resample", "dt", "max_gap", "between", "clock", "group", "columns"}
 """Options on how a table is read: a file, a data frame, or arrays by name; a `Trace` has been read."""
 
 
@@ -116,18 +116,19 @@ def check(
     from stlc.trace import Trace
 
     if isinstance(trace, str | Path):
-        swapped = str(trace).endswith(".stl")
+        odd = str(trace).endswith(".stl")
     else:
-        swapped = spec is None or isinstance(trace, ast.Spec)
-    if swapped or not isinstance(spec, ast.Spec | str | Path | None):
-        raise usage("a specification comes first, then the recording", "stlc.check(spec, trace)")
+        odd = spec is None or not (isinstance(trace, Mapping | Trace) or is_frame(trace))
+    if odd or not isinstance(spec, ast.Spec | str | Path | None):
+        advice = "stlc.check(spec, trace), with a path, a data frame, a `Trace` or arrays by name"
+        raise usage("a specification comes first, then the recording", advice)
     question = Question(**options)
     known = None if spec is None else Monitor(spec, system=question.system, overrides=question.overrides)
     if not isinstance(trace, str | Path):
         assert known is not None
-        reading = sorted(options.keys() & OF_TABLES)
+        reading = options.keys() & OF_TABLES
         if reading and isinstance(trace, Trace):
-            raise usage(f"`{reading[0]}` says how a table is read, and a `Trace` has been read")
+            raise usage(f"`{min(reading)}` says how a table is read, and a `Trace` has been read")
         if reading or is_frame(trace):
             trace = trace_of_table(trace, reading_options(known, question))
         return judged_by(known, trace, question)
@@ -223,7 +224,7 @@ def too_large(path: Path) -> bool:
 
     A file of less than `SMALL` bytes is never too large, however well it is compressed.
     """
-    if path.stat().st_size < SMALL:
+    if not path.is_file() or path.stat().st_size < SMALL:
         return False
     from stlc.trace.chunks import LARGE, size_of
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,3 +61,12 @@ def test_arguments_in_the_other_order_are_told_so() -> None:
             stlc.check(recording, spec)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=r"stlc\.check\(spec, trace\)"):
         stlc.check("drive.csv", "drive.stl")
+    for odd in ([1.0, 2.0], None):
+        with pytest.raises(UsageError, match="or arrays by name"):
+            stlc.check(SPEC, odd)  # type: ignore[arg-type]
+
+
+def test_a_file_that_is_not_there_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match=r"U102.*`driv\.csv`"):
+        stlc.check(SPEC, "driv.csv")
