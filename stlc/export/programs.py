@@ -19,10 +19,10 @@ from torch import Tensor, nn
 
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.tolerance import satisfied
-from stlc.controller.guard.candidates import finite, first, grid_of
+from stlc.controller.guard.candidates import completed, finite, first, grid_of
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.problem.task import PlanVerdicts, Task
-from stlc.runtime.decision import acceptable, continued, longest
+from stlc.runtime.decision import prefix_shooting
 from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
@@ -124,8 +124,9 @@ _NOTHING: tuple[Tensor, ...] = ()
 class _Tried:
     """Plans that the guard tries with prefixes (first actions) of one length T0, and their verdicts.
 
-    The arrays are (states, choices, …), with one choice for each prefix. `falls` is the robustness of the
-    safety requirements on every first part of a plan. It is computed for the longest prefixes only.
+    There is one choice for each prefix. `plans` and `each` are (states, choices, …); `rho`, `safe` and `cost`
+    are (choices, states). `falls`, (time, choices, states), is the robustness of the safety requirements on
+    every first part of a plan. It is computed for the longest prefixes only.
     """
 
     plans: Tensor
@@ -160,7 +161,9 @@ class Guarding(nn.Module):
         self.grid = grid or grid_of(task)
         self._task = task
         self._formulas = [rule.formula for rule in task.compiled.safety]
-        self._prefixes = [torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths]
+        self._prefixes = {
+            length: torch.from_numpy(self.grid.prefixes(length)) for length in self.grid.lengths
+        }
 
     def forward(self, x: Tensor, plan: Tensor) -> tuple[Tensor, ...]:
         """Return the outputs of the guard for states `x` and the policy's plans `plan`.
@@ -173,38 +176,35 @@ class Guarding(nn.Module):
             judged = judged_by_torch(self._task, x, own)
             return own, judged.rho, judged.safe, judged.requirements, nobody.long() + 2, nobody.long()
         decided, found = torch.zeros_like(nobody, dtype=torch.bool), _NOTHING
-        for length, prefixes in zip(self.grid.lengths, self._prefixes, strict=True):
-            last = length == self.grid.lengths[-1]
-            tried = self._tried(x, own, prefixes, falls=last)
-            rho, safe, cost = tried.rho.t(), tried.safe.t(), tried.cost.t()
-            done = acceptable(rho, safe, TORCH).any(0)
-            pick = first(continued(rho, safe, cost, TORCH))
-            if tried.falls is not None:
-                pick = torch.where(done, pick, first(longest(tried.falls.permute(2, 1, 0), rho, cost, TORCH)))
-            rows = (tried.plans, tried.rho, tried.safe, tried.each)
-            here = (*_picked(rows, pick), torch.where(done, 1, 2), torch.full_like(pick, length))
+        for shot in prefix_shooting(self.grid.lengths, lambda length: [self._tried(x, own, length)], TORCH):
+            tried = shot.plans
+            pick = first(shot.chosen(tried.falls))
+            rows = (tried.plans, tried.rho.t(), tried.safe.t(), tried.each)
+            source = torch.where(shot.found, 1, 2)
+            here = (*_picked(rows, pick), source, torch.full_like(pick, shot.length))
             if found:  # decided by a shorter prefix
                 here = tuple(
                     torch.where(decided.view(-1, *[1] * (old.dim() - 1)), old, new)
                     for old, new in zip(found, here, strict=True)
                 )
-            found, decided = here, decided | done
+            found, decided = here, decided | shot.found
         return found
 
-    def _tried(self, x: Tensor, own: Tensor, prefixes: Tensor, *, falls: bool) -> _Tried:
-        """All plans that the guard tries with `prefixes`, (choices, T0, m), and their verdicts.
+    def _tried(self, x: Tensor, own: Tensor, length: int) -> _Tried:
+        """All plans that the guard tries with prefixes of `length` actions, and their verdicts.
 
         A prefix consists of the first T0 actions of a plan. The policy plans the later actions, from the
         state that the prefix reaches when it starts in `x`. One more plan is tried first: its prefix is that
-        of the policy's own plan `own`. If `falls` is True, the robustness of the safety requirements is
+        of the policy's own plan `own`. For the longest prefixes, the robustness of the safety requirements is
         also computed on every initial segment of each plan.
         """
-        heads = torch.cat((own[:, None, : prefixes.shape[1]], prefixes.expand(x.shape[0], -1, -1, -1)), 1)
+        prefixes = self._prefixes[length].expand(x.shape[0], -1, -1, -1)
+        heads = torch.cat((own[:, None, :length], prefixes), 1)
         size = max(AT_ONCE // self.deciding.network.plans, 1)
+        falls = length == self.grid.lengths[-1]
         pieces = [self._finished(x, some, falls=falls) for some in torch.split(heads, size, 1)]
-        columns = [torch.cat(column, 1) for column in zip(*pieces, strict=True)]
-        plans, rho, safe, each, cost = columns[:5]
-        return _Tried(plans, rho, safe, each, cost, columns[5] if falls else None)
+        plans, rho, safe, each, cost, *rest = (torch.cat(column, 1) for column in zip(*pieces, strict=True))
+        return _Tried(plans, rho.t(), safe.t(), each, cost.t(), rest[0].permute(2, 1, 0) if falls else None)
 
     def _finished(self, x: Tensor, heads: Tensor, *, falls: bool) -> list[Tensor]:
         """Complete the prefixes `heads` to plans, and judge the plans.
@@ -215,15 +215,13 @@ class Guarding(nn.Module):
         Returns plans, rho, safe, requirements and cost, (B, C, …) each. If `falls` is True, a last entry
         follows: the robustness of the safety requirements on every first part of each plan.
         """
-        count, length = heads.shape[1:3]
+        plans = completed(
+            x, heads, self._task, self._task.system.rollout, lambda ends: self.deciding.proposed(ends)[0]
+        )
+        count, flat = plans.shape[1], plans.flatten(0, 1)
         starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
-        head = heads.reshape(-1, *heads.shape[2:])
-        ends = self._task.system.rollout_columns(starts, head)
-        reached = torch.stack([ends[name][-1].expand(starts.shape[0]) for name in self._task.system.names], 1)
-        tail = finite(self.deciding.proposed(reached)[0], self._task)
-        plans = torch.cat((head, tail[:, : self._task.horizon - length]), 1)
-        judged = judged_by_torch(self._task, starts, plans)
-        rows = [plans, judged.rho, judged.safe, judged.requirements, self._task.cost(judged)]
+        judged = judged_by_torch(self._task, starts, flat)
+        rows = [flat, judged.rho, judged.safe, judged.requirements, self._task.cost(judged)]
         if falls:
             rows.append(prefix_robustness(self._formulas, judged.columns).t())
         return [row.reshape(-1, count, *row.shape[1:]) for row in rows]

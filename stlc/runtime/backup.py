@@ -1,7 +1,6 @@
 """Search for a plan in place of one that violates the specification, without torch.
 
-This is the search of Meng and Fan (2023), on the ONNX graphs of an exported controller. In torch,
-`prefix_shooting` and `longest_safe_prefix` of `stlc.controller.guard.stages` do the same.
+This is the search of Meng and Fan (2023), on the ONNX graphs of an exported controller.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.runtime.decision import acceptable, continued, longest
+from stlc.runtime.decision import prefix_shooting
 from stlc.runtime.facts import ControllerQuantity
 from stlc.runtime.graphs import Graphs, JudgedPlans, Numbers, joined
 
@@ -52,15 +51,16 @@ def search(graphs: Graphs, x: Numbers, plan: Numbers, rest: Numbers | None = Non
     """
     own, grid = finite(plan, graphs.facts.controls), graphs.facts.grid
     previous = [] if rest is None else [graphs.judged(x[None], finite(rest, graphs.facts.controls)[None])[0]]
-    candidates = None
-    for length in grid.lengths:
-        candidates = joined([_candidates(graphs, x, own, length), *previous])
-        if acceptable(candidates.rho, candidates.safe, NUMPY).any():
-            pick = int(continued(candidates.rho, candidates.safe, candidates.cost, NUMPY).argmax())
-            return Found(candidates.of([pick]), BACKUP, length)
-    if candidates is None:
-        return Found(graphs.judged(x[None], own[None])[0], SAFEST, 0)
-    return Found(candidates.of([_safest(graphs, x, candidates)]), SAFEST, grid.lengths[-1])
+
+    def tried(length: int) -> Sequence[JudgedPlans]:
+        return [joined([_candidates(graphs, x, own, length), *previous])]
+
+    for shot in prefix_shooting(grid.lengths, tried, NUMPY):
+        if shot.found or shot.last:
+            source = BACKUP if shot.found else SAFEST
+            chosen = shot.chosen(None if shot.found else _falls(graphs, x, shot.plans.plan))
+            return Found(shot.plans.of([int(chosen.argmax())]), source, shot.length)
+    return Found(graphs.judged(x[None], own[None])[0], SAFEST, 0)
 
 
 def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> JudgedPlans:
@@ -84,20 +84,11 @@ def _candidates(graphs: Graphs, x: Numbers, own: Numbers, length: int) -> Judged
     return joined(parts)
 
 
-def _safest(graphs: Graphs, x: Numbers, candidates: JudgedPlans) -> int:
-    """Index of the plan that keeps the safety requirements for the longest time.
-
-    Among plans that keep them equally long, the one of highest robustness is taken, then the one with the
-    least violation (mean over the samples), then the one of least cost. `x` is the state, (n,).
-    """
+def _falls(graphs: Graphs, x: Numbers, plans: Numbers) -> Numbers:
+    """Robustness of the safety requirements on first parts of plans from the state `x`, (time, plans)."""
     size = max(graphs.facts.grid.batch // graphs.facts.horizon, 1)
-    falls = np.concatenate(
-        [
-            graphs.falls(np.repeat(x[None], len(plans), 0), plans)
-            for plans in (candidates.plan[at : at + size] for at in range(0, len(candidates.plan), size))
-        ]
-    )
-    return int(longest(falls.T, candidates.rho, candidates.cost, NUMPY).argmax())
+    parts = [plans[at : at + size] for at in range(0, len(plans), size)]
+    return np.concatenate([graphs.falls(np.repeat(x[None], len(part), 0), part) for part in parts]).T
 
 
 def finite(plans: Numbers, controls: Sequence[ControllerQuantity]) -> Numbers:

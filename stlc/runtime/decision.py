@@ -1,14 +1,15 @@
-"""Order of plans, and the choices of the backup policy, over arrays of any library.
+"""Order of plans, and the search and choices of the backup policy, over arrays of any library.
 
 Axis 0 of all arrays is that of the plans to choose from. A choice is a mask of the plans that are equally
-good; the first of them is taken. The C header has the same in `decision.c.txt`.
+good; the first of them is taken. The C header has the same in `decision.c.txt` and in its `fall_back`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
 
@@ -87,3 +88,71 @@ def longest(falls: Array, rho: Array, cost: Array, ops: Ops) -> Mask:
     samples = ops.sum(ops.number(satisfied(falls), falls))[0]
     depth = ops.sum(ops.clamp(falls, None, 0.0))[0] / len(falls)
     return best(ops.ge(samples, 0.0), (samples, rho, depth, -cost), ops)
+
+
+class JudgedChoices(Protocol):
+    """Plans to choose from, with their verdicts: robustness, that of phi_safe, and cost, (plans, …)."""
+
+    @property
+    def rho(self) -> Array:
+        """Robustness of the specification."""
+
+    @property
+    def safe(self) -> Array:
+        """Robustness of phi_safe."""
+
+    @property
+    def cost(self) -> Array:
+        """Performance terms."""
+
+
+Choices = TypeVar("Choices", bound=JudgedChoices)
+
+
+@dataclass(frozen=True, slots=True)
+class Shot(Generic[Choices]):
+    """Plans with prefixes of one length, for a group of states.
+
+    Attributes:
+        length: T0, the length of the prefixes.
+        last: True if no longer prefixes follow.
+        plans: the plans that were tried.
+        found: mask of the states with an acceptable plan, (…).
+        ops: library of the arrays.
+    """
+
+    length: int
+    last: bool
+    plans: Choices
+    found: Mask
+    ops: Ops
+
+    def chosen(self, falls: Array | None = None) -> Mask:
+        """Mask of the best plans, (plans, …): to continue where one is acceptable, else by `longest`.
+
+        `falls`: see `longest`; without it, the choice has a meaning only where a plan is acceptable.
+        """
+        plans, ops = self.plans, self.ops
+        chosen = continued(plans.rho, plans.safe, plans.cost, ops)
+        if falls is None:
+            return chosen
+        return ops.where(self.found, chosen, longest(falls, plans.rho, plans.cost, ops))
+
+
+def prefix_shooting(
+    lengths: Sequence[int], tried: Callable[[int], Iterable[Choices]], ops: Ops
+) -> Iterator[Shot[Choices]]:
+    """Plans that the backup policy of Meng and Fan (2023) tries, with prefixes of growing length T0.
+
+    The first length with an acceptable plan decides: the caller leaves out the states that are decided, or
+    their later choices. If there is none, the plans with the longest prefixes decide, by `Shot.chosen`.
+
+    Args:
+        lengths: lengths of the prefixes, in the order in which they are tried.
+        tried: length -> the plans with such prefixes, in groups of states.
+        ops: library of the arrays.
+    """
+    for length in lengths:
+        for plans in tried(length):
+            found = acceptable(plans.rho, plans.safe, ops).any(0)
+            yield Shot(length, length == lengths[-1], plans, found, ops)

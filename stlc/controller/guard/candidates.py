@@ -5,7 +5,7 @@ A guard judges each plan of the policy at run time. If it rejects a plan, it cho
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from time import perf_counter
@@ -137,17 +137,9 @@ class Candidates(Rows):
         self.put(rows[better], other.of(better))
 
     @classmethod
-    def concatenated(cls, parts: Sequence[Candidates]) -> Candidates:
-        """Concatenate sets of plans along the dimension of the agents."""
-        return cls(*map(torch.cat, zip(*(part.parts for part in parts), strict=True)))
-
-    def view(self, agents: int) -> Candidates:
-        """Reshape the leading dimension of all fields from (agents * choices,) to (agents, choices)."""
-        return self.each(lambda part: part.view(agents, -1, *part.shape[1:]))
-
-    def beside(self, other: Candidates) -> Candidates:
-        """Join two sets of plans of the same agents: (agents, j) and (agents, k) -> (agents, j + k)."""
-        return Candidates(*(torch.cat(pair, 1) for pair in zip(self.parts, other.parts, strict=True)))
+    def concatenated(cls, parts: Sequence[Candidates], dim: int = 0) -> Candidates:
+        """Join sets of plans along the dimension of the agents, 0, or that of the choices, 1."""
+        return cls(*(torch.cat(pieces, dim) for pieces in zip(*(part.parts for part in parts), strict=True)))
 
 
 def first(chosen: Tensor) -> Tensor:
@@ -159,6 +151,33 @@ def finite(plan: Tensor, task: Task) -> Tensor:
     """Return plans (B, T, m) in which each non-finite entry is replaced by the admissible value nearest 0."""
     low, high = task.system.control_low.to(plan), task.system.control_high.to(plan)
     return torch.where(torch.isfinite(plan), plan, torch.zeros_like(plan).clamp(low, high))
+
+
+def completed(
+    x: Tensor,
+    heads: Tensor,
+    task: Task,
+    rollout: Callable[[Tensor, Tensor], Tensor],
+    continuation: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """Return plans that begin with prefixes, and that the policy continues from where a prefix leads.
+
+    Args:
+        x: states, (B, n).
+        heads: prefixes of each state, (B, C, T0, m).
+        task: specification and system.
+        rollout: (states, controls) -> trajectories, (rows, T0 + 1, n).
+        continuation: states (rows, n) -> plans of the policy, (rows, T, m).
+
+    Returns:
+        Plans, (B, C, T, m), in the dtype of `x`; all of their later controls are finite.
+    """
+    count, length = heads.shape[1:3]
+    starts = x[:, None].expand(-1, count, -1).reshape(-1, x.shape[1])
+    head = heads.reshape(-1, *heads.shape[2:])
+    tail = finite(continuation(rollout(starts, head)[:, -1]).to(x.dtype), task)
+    plans = torch.cat((head, tail[:, : task.horizon - length]), 1)
+    return plans.reshape(-1, count, *plans.shape[1:])
 
 
 # ------------------------------------------------------------------------------------ limits of a search

@@ -98,6 +98,21 @@ class Tried:
     rows: Tensor
     candidates: Candidates
 
+    @property
+    def rho(self) -> Tensor:
+        """Robustness of the specification, (choices, k)."""
+        return self.candidates.rho.t()
+
+    @property
+    def safe(self) -> Tensor:
+        """Robustness of phi_safe (the requirements tagged `@safety`), (choices, k)."""
+        return self.candidates.safe.t()
+
+    @property
+    def cost(self) -> Tensor:
+        """Performance costs, (choices, k)."""
+        return self.candidates.cost.t()
+
 
 class GuardStage(ABC):
     """Stage of a guard: one method to find a better plan."""

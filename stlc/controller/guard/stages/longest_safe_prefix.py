@@ -67,8 +67,8 @@ class LongestSafePrefix(GuardStage):
         if len(todo) and lengths:
             every = torch.arange(len(todo), device=rows.device)
             again = Deadline() if self._shooting.last_resort else deadline
-            for group, candidates in self._shooting.candidates(rejected, todo, every, lengths[-1], again):
-                yield Tried(todo[group], candidates)
+            for tried in self._shooting.candidates(rejected, todo, every, lengths[-1], again):
+                yield Tried(todo[tried.rows], tried.candidates)
 
     def _safest(self, x: Tensor, candidates: Candidates) -> Candidates:
         agents, choices = candidates.rho.shape

@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, finite, first
+from stlc.controller.guard.candidates import BACKUP, Candidates, Deadline, completed, first
 from stlc.controller.guard.stages import GuardStage, Rejected, Setup, Tried
-from stlc.runtime.decision import continued
+from stlc.runtime.decision import prefix_shooting
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
 HANDED_ON = 65_536
 """Maximum number of trajectories stored for the next stage, which recomputes the others."""
@@ -60,27 +60,27 @@ class PrefixShooting(GuardStage):
         """
         deadline = Deadline() if self.last_resort else deadline
         found, room = Candidates.unjudged(rejected.plan[rows]), HANDED_ON
-        todo = torch.arange(len(rows), device=rows.device)
-        for length in self.grid.lengths:
-            left = []
-            for group, candidates in self.candidates(rejected, rows, todo, length, deadline):
-                done = (candidates.satisfies | candidates.is_safe).any(1)
-                some = candidates.of(done)
-                choice = continued(some.rho.t(), some.safe.t(), some.cost.t(), TORCH)
-                found.put(group[done], some.pick(first(choice)))
-                left.append(group[~done])
-                if deadline.over or length == self.grid.lengths[-1]:
-                    room -= int((~done).sum()) * candidates.rho.shape[1]
-                    if room >= 0 and not bool(done.all()):
-                        rejected.tried.append(Tried(rows[group[~done]], candidates.of(~done)))
-            todo = torch.cat(left) if left else todo
-            if deadline.over or not len(todo):
-                break
+        undecided = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+
+        def tried(length: int) -> Iterable[Tried]:
+            todo = undecided.nonzero()[:, 0]
+            stopped = not len(todo) or (length != self.grid.lengths[0] and deadline.over)
+            return () if stopped else self.candidates(rejected, rows, todo, length, deadline)
+
+        for shot in prefix_shooting(self.grid.lengths, tried, TORCH):
+            group, candidates, done = shot.plans.rows, shot.plans.candidates, shot.found
+            if bool(done.any()):
+                found.put(group[done], candidates.pick(first(shot.chosen())).of(done))
+            undecided[group] = ~done
+            if deadline.over or shot.last:
+                room -= int((~done).sum()) * candidates.rho.shape[1]
+                if room >= 0 and not bool(done.all()):
+                    rejected.tried.append(Tried(rows[group[~done]], candidates.of(~done)))
         return found
 
     def candidates(
         self, rejected: Rejected, rows: Tensor, todo: Tensor, length: int, deadline: Deadline
-    ) -> Iterator[tuple[Tensor, Candidates]]:
+    ) -> Iterator[Tried]:
         """Yield candidate plans with prefixes of `length` actions, for one group of agents at a time.
 
         Args:
@@ -92,9 +92,9 @@ class PrefixShooting(GuardStage):
             deadline: once it is over, no further prefixes are tried.
 
         Yields:
-            The part of `todo` that forms the group, (k,), and the candidate plans of its agents, (k,
-            choices). Choice 0 has the prefix of the policy's own plan. If there are previous plans, the last
-            choice is the remainder of the previous plan.
+            The part of `todo` that forms the group, and the candidate plans of its agents. Choice 0 has the
+            prefix of the policy's own plan. If there are previous plans, the last choice is the remainder of
+            the previous plan.
         """
         prefixes = torch.from_numpy(self.grid.prefixes(length)).to(rejected.x)
         for group in torch.split(todo, max(self.grid.batch // (len(prefixes) + 1), 1)):
@@ -103,10 +103,9 @@ class PrefixShooting(GuardStage):
             found = self._finished(rejected.x[agents], rejected.plan[agents], tried, deadline)
             if rejected.previous is not None:
                 before = rejected.previous[agents][:, None]
-                found = found.beside(
-                    Candidates.judged(self.task, rejected.x[agents], before, BACKUP, length, cost=True)
-                )
-            yield group, found
+                rest = Candidates.judged(self.task, rejected.x[agents], before, BACKUP, length, cost=True)
+                found = Candidates.concatenated((found, rest), 1)
+            yield Tried(group, found)
 
     def _finished(self, x: Tensor, own: Tensor, prefixes: Tensor, deadline: Deadline) -> Candidates:
         """Judge plans that begin with M + 1 different prefixes: (agents, M + 1).
@@ -117,19 +116,15 @@ class PrefixShooting(GuardStage):
         others are `prefixes`, (M, T0, m). At most `grid.batch` trajectories are computed at a time. For a
         single agent, the computation ends early, after a batch, if the deadline is over.
         """
-        agents, (count, length, _) = len(x), prefixes.shape
-        heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1).flatten(0, 1)
-        starts = x.repeat_interleave(count + 1, 0)
+        agents, length = len(x), prefixes.shape[1]
+        heads = torch.cat((own[:, None, :length], prefixes.expand(agents, -1, -1, -1)), 1)
         parts = []
-        size = self.grid.batch
-        for start, head in zip(torch.split(starts, size), torch.split(heads, size), strict=True):
-            reached = self.task.rollout(start, head)[:, -1]
-            tail = finite(self.policy.continuation(reached).to(x.dtype), self.task)
-            plans = torch.cat((head, tail[:, : self.task.horizon - length]), 1)
-            parts.append(Candidates.judged(self.task, start, plans, BACKUP, length, cost=True))
+        for some in torch.split(heads, self.grid.batch, 1):
+            plans = completed(x, some, self.task, self.task.rollout, self.policy.continuation)
+            parts.append(Candidates.judged(self.task, x, plans, BACKUP, length, cost=True))
             if agents == 1 and deadline.over:
                 break
-        return Candidates.concatenated(parts).view(agents)
+        return Candidates.concatenated(parts, 1)
 
 
 STAGE = PrefixShooting
