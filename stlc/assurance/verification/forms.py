@@ -558,6 +558,22 @@ def ranges(forms: Sequence[Forms]) -> Intervals:
     return Intervals(np.stack([each.low for each in found]), np.stack([each.high for each in found]))
 
 
+def over_time(forms: Sequence[Forms]) -> Forms:
+    """A sequence of forms (batch,) over time as one: (time, batch)."""
+    if len(forms) == 1:  # no copy
+        only = forms[0]
+        ends = (None if end is None else end[None] for end in (only.floor, only.ceiling))
+        return Forms(only.centre[None], only.generators[:, None], only.rest[None], *ends)
+    generators = np.zeros((in_use(forms), len(forms), *forms[0].shape))
+    for time, form in enumerate(forms):
+        generators[: len(form.generators), time] = form.generators
+    bound = (
+        ranges(forms) if any(form.floor is not None or form.ceiling is not None for form in forms) else None
+    )
+    centre, rest = (np.stack([getattr(form, name) for form in forms]) for name in ("centre", "rest"))
+    return Forms(centre, generators, rest, *(() if bound is None else (bound.low, bound.high)))
+
+
 def in_use(forms: Iterable[Forms]) -> int:
     """Number of symbols in forms: the number of the next new one, if these are all forms of a computation."""
     return max(len(form.generators) for form in forms)
@@ -574,14 +590,14 @@ def together(parts: Sequence[Forms]) -> Forms:
     return Forms(centre, generators, rest)
 
 
-def spread(form: Forms, batch: int) -> Forms:
-    """The form with one element per box; forms of a constant have a single one."""
-    if form.shape == (batch,):
+def spread(form: Forms, *shape: int) -> Forms:
+    """The form in a shape, such as one element per box; forms of a constant have a single element."""
+    if form.shape == shape:
         return form
     rows = len(form.generators)
-    generators = np.broadcast_to(form.generators.reshape(rows, -1), (rows, batch))
-    ends = (None if end is None else np.broadcast_to(end, batch) for end in (form.floor, form.ceiling))
-    return Forms(np.broadcast_to(form.centre, batch), generators, np.broadcast_to(form.rest, batch), *ends)
+    generators = np.broadcast_to(form.generators.reshape(rows, *(1,) * len(shape)), (rows, *shape))
+    ends = (None if end is None else np.broadcast_to(end, shape) for end in (form.floor, form.ceiling))
+    return Forms(np.broadcast_to(form.centre, shape), generators, np.broadcast_to(form.rest, shape), *ends)
 
 
 FORMS: Ops = cast("Ops", FormOps())

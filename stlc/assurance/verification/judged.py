@@ -1,8 +1,9 @@
 """Bounds on robustness from affine forms of the signals.
 
 The numbers in the predicates are evaluated over the forms of each sample, so that the distance of two
-positions that depend on the same symbols is as narrow as it is. The formulas are then evaluated over
-intervals, by the evaluator of `stlc check --uncertain` (`docs/decisions/0051-intervals.md`).
+positions that depend on the same symbols is as narrow as it is, and over their ranges; the intersection is
+taken. The formulas are then evaluated over intervals, by the evaluator of `stlc check --uncertain`
+(`docs/decisions/0051-intervals.md`).
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stlc.assurance.verification.forms import FORMS, Floats, Forms, ranges, spread
+from stlc.assurance.verification.forms import FORMS, Floats, Forms, in_use, over_time, ranges, spread
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.graph import evaluate
+from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.backends.schedule import Boundary
 from stlc.compile.ir import nodes as ir
@@ -25,6 +27,9 @@ PROVED = 0.5 * TOLERANCE
 """A lower bound on robustness of at least -`PROVED` is a proof: the monitor takes -1e-6 as satisfied."""
 
 _NAME = "#predicate{}"
+
+_ROOM = 1 << 18
+"""Numbers of a form over time: the samples that are evaluated at once are as many as have so many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,12 +54,18 @@ class Judge:
         formulas: the formulas.
         end: treatment of instants beyond the last sample.
         apart: whether the symbols of different samples have nothing in common.
+        shifts: whether numbers that read several samples are evaluated over forms, or over ranges alone.
     """
 
     def __init__(
-        self, formulas: Sequence[ir.Formula], *, end: Boundary = "strict", apart: bool = False
+        self,
+        formulas: Sequence[ir.Formula],
+        *,
+        end: Boundary = "strict",
+        apart: bool = False,
+        shifts: bool = True,
     ) -> None:
-        self._end, self._apart = end, apart
+        self._end, self._apart, self._shifts = end, apart, shifts
         self._numbers: dict[ir.Num, str] = {}
         self._formulas = [self._named(formula) for formula in formulas]
         self._program = ArrayProgram({name: num for num, name in self._numbers.items()})
@@ -66,9 +77,10 @@ class Judge:
         )
 
     def _named(self, formula: ir.Formula) -> ir.Formula:
-        """The formula with a signal for the number of each predicate that reads no frozen value."""
+        """The formula with a signal for the number of each predicate that is evaluated over forms."""
         if isinstance(formula, ir.Predicate):
-            if frozen_in(formula.num):
+            shifted = any(isinstance(leaf, ir.ShiftedSignal) for leaf in leaves(formula))
+            if frozen_in(formula.num) or (shifted and not self._shifts):
                 return formula
             name = self._numbers.setdefault(formula.num, _NAME.format(len(self._numbers)))
             return replace(formula, num=ir.Signal(name))
@@ -76,48 +88,79 @@ class Judge:
         return found
 
     def __call__(self, history: Mapping[str, Sequence[Forms]], symbols: int) -> BoxVerdicts:
-        """Bounds for signals, name -> one form (batch,) per sample; `symbols` is the number of effects."""
-        samples = len(next(iter(history.values())))
-        plain = {name: ranges(forms) for name, forms in history.items()}
-        numbers = [self._program(self._sample(history, at), FORMS) for at in range(samples)]
-        batch = (
-            len(numbers[0][_NAME.format(0)].centre) if self._numbers else plain[next(iter(plain))].shape[1]
-        )
-        effects = np.full((symbols, batch), 1e-12)
-        env = {name: plain[name] for name in plain if name in self._read or not self._numbers}
-        for name in self._numbers.values():
-            forms = [spread(each[name], batch) for each in numbers]
-            env[name] = ranges(forms)
-            for row, form in enumerate(forms):  # shares in the radius of forms that may have both signs
-                crossing = ~((env[name].low[row] >= 0.0) | (env[name].high[row] <= 0.0))
-                if crossing.any():
-                    share = np.abs(form.generators[: len(effects)]) / np.maximum(form.radius, 1e-300)
-                    effects[: len(share)] += np.where(crossing, np.nan_to_num(share), 0.0)
+        """Bounds on all formulas together; `symbols` is the number of effects. See `bounds`."""
+        effects = np.full((symbols, *next(iter(history.values()))[0].shape), 1e-12)
+        found = self.bounds(history, effects)
+        return BoxVerdicts(found.low.min(0), found.high.min(0), effects.T)
+
+    def bounds(self, history: Mapping[str, Sequence[Forms]], effects: Floats | None = None) -> Intervals:
+        """Bounds on the robustness of each formula, (formulas, batch).
+
+        Args:
+            history: name of a signal -> one form (batch,) per sample.
+            effects: effects of the first symbols on the undecided predicates, (symbols, batch), to which
+                those of these signals are added.
+        """
+        first = next(iter(history.values()))
+        samples, batch = len(first), len(first[0].centre)
+        env = {
+            name: ranges(forms) for name, forms in history.items() if name in self._read or not self._numbers
+        }
+        if self._numbers:
+            width = max(in_use(forms) for forms in history.values()) * batch
+            size = max(_ROOM // max(width, 1), 1)
+            parts = [
+                self._margins(history, range(at, min(at + size, samples)), batch, effects)
+                for at in range(0, samples, size)
+            ]
+            for name in self._numbers.values():
+                low, high = (
+                    np.concatenate([getattr(part[name], end) for part in parts]) for end in ("low", "high")
+                )
+                env[name] = Intervals(low, high)
         found = evaluate(self._formulas, env, ops=INTERVALS, end=self._end)
         low, high = (
-            np.min([np.broadcast_to(end[0], batch) for end in ends], axis=0)
+            np.stack([np.broadcast_to(end[0], batch) for end in ends])
             for ends in zip(*((each.low, each.high) for each in found), strict=True)
         )
-        return BoxVerdicts(low, high, effects.T)
+        return Intervals(low, high)
 
-    def _sample(self, history: Mapping[str, Sequence[Forms]], at: int) -> dict[str, Forms]:
-        """Forms that the numbers read at a sample; what lies outside of the signals is undefined."""
+    def _margins(
+        self, history: Mapping[str, Sequence[Forms]], at: range, batch: int, effects: Floats | None
+    ) -> dict[str, Intervals]:
+        """Intervals of the numbers at the samples `at`, (samples, batch); their effects are added."""
+        forms = {
+            name: over_time([self._form(history, name, i) for i in at]) for name in self._program.columns
+        }
+        forms = forms or {"": Forms.point(np.zeros((len(at), batch)))}
+        linear = self._program(forms, FORMS)
+        plain = self._program({name: form.range for name, form in forms.items()}, INTERVALS)
+        found = {}
+        for name in self._numbers.values():
+            form, bound = spread(linear[name], len(at), batch), plain[name]
+            own = form.range
+            low = np.fmax(bound.low, own.low)  # one is NaN where it alone cannot exclude undefined values
+            high = np.maximum(np.fmin(bound.high, own.high), low)
+            found[name] = Intervals(low, high)
+            crossing = ~((low >= 0.0) | (high <= 0.0))
+            if effects is not None and crossing.any():  # shares in the radius where both signs may occur
+                share = np.abs(form.generators[: len(effects)]) / np.maximum(form.radius, 1e-300)
+                effects[: len(share)] += np.where(crossing, np.nan_to_num(share), 0.0).sum(1)
+        return found
+
+    def _form(self, history: Mapping[str, Sequence[Forms]], name: str, at: int) -> Forms:
+        """Form that the numbers read as `name` at a sample; what lies outside of the signals is undefined."""
         like = next(iter(history.values()))[0].centre
-        env: dict[str, Forms] = {}
-        for name in self._program.columns:
-            if name == ir.ELAPSED:
-                env[name] = Forms.point(np.full(like.shape, float(at)))
-                continue
-            shifted = self._program.shifted.get(name)
-            forms = history[name if shifted is None else shifted.name]
-            place = at if shifted is None else at + shifted.steps
-            if shifted is not None and shifted.clamped:
-                place = min(max(place, 0), len(forms) - 1)
-            if not 0 <= place < len(forms):
-                env[name] = Forms.between(like * np.nan, like * np.nan)
-            elif self._apart and place != at:
-                bound = forms[place].range
-                env[name] = Forms.between(bound.low, bound.high)
-            else:
-                env[name] = forms[place]
-        return env or {"": Forms.point(np.zeros_like(like))}
+        if name == ir.ELAPSED:
+            return Forms.point(np.full(like.shape, float(at)))
+        shifted = self._program.shifted.get(name)
+        if shifted is None:
+            return history[name][at]
+        forms, place = history[shifted.name], at + shifted.steps
+        if shifted.clamped:
+            place = min(max(place, 0), len(forms) - 1)
+        if not 0 <= place < len(forms):
+            return Forms.between(like * np.nan, like * np.nan)
+        if self._apart and place != at:
+            return Forms.between(forms[place].range.low, forms[place].range.high)
+        return forms[place]

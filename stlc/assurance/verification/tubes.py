@@ -23,12 +23,12 @@ import torch
 from torch import Tensor
 
 from stlc.assurance.verification.forms import FORMS, Floats, Forms, ranges, spread
+from stlc.assurance.verification.judged import Judge
 from stlc.compile.backends.array.arith import ArrayProgram
-from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.interval import Intervals
 from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.ir import nodes as ir
-from stlc.compile.ir.traverse import map_children, numbers, subexpressions
+from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.diagnostics import usage
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.samplers import Drawing
@@ -107,7 +107,7 @@ class TubeModel:
         _refuse_functions(self._truth, task)
         self._scale = 1.0 if decl.discrete else system.dt
         self._clock = 0.0, (decl.test.steps + decl.horizon) * system.dt
-        self._judge = _Judge(task)
+        self._judge = Judge([rule.formula for rule in task.rules], end=task.graph.end, shifts=False)
         self._safe = [task.rules.index(rule) for rule in task.compiled.safety]
 
     @property
@@ -178,9 +178,8 @@ class TubeModel:
         u = torch.where(torch.isfinite(plans), plans, 0.0).numpy()
         with FORMS.quiet():
             history = self._history(x.numpy(), u, min(steps, u.shape[1]), start)
-            found = self._judge(history)
-        low = torch.from_numpy(np.stack([each.low for each in found], 1))
-        high = torch.from_numpy(np.stack([each.high for each in found], 1))
+            found = self._judge.bounds(history)
+        low, high = (torch.from_numpy(end.T.copy()) for end in (found.low, found.high))
         low[broken], high[broken] = -torch.inf, torch.inf
         return Tube({name: INTERVALS.margin(ranges(forms)) for name, forms in history.items()}, low, high)
 
@@ -332,58 +331,6 @@ class _Motion:
         now = {**env, **dict(zip(self._controls, acted, strict=True)), **factors}
         later = self._stepper.step(now, FORMS).items()
         return {**env, **{name: spread(form, symbols.batch) for name, form in later}}
-
-
-class _Judge:
-    """Bounds on the robustness of requirements over forms of the states.
-
-    The margin of a predicate is computed by affine forms and by intervals, and the intersection of both is
-    taken. Predicates that read several samples are computed by intervals alone.
-    """
-
-    def __init__(self, task: Task) -> None:
-        self._names = frozenset(task.system.names)
-        self._programs: dict[ir.Num, tuple[str, ArrayProgram]] = {}
-        self._formulas = [self._with_columns(rule.formula) for rule in task.rules]
-        self._end = task.graph.end
-
-    def _with_columns(self, formula: ir.Formula) -> ir.Formula:
-        """Replace the number of each predicate by a column, which `__call__` computes."""
-        if not isinstance(formula, ir.Predicate):
-            return map_children(formula, formulas=self._with_columns)
-        if formula.num not in self._programs:
-            program = ArrayProgram({"margin": formula.num})
-            if program.shifted or not program.columns or not program.columns <= self._names:
-                return formula
-            self._programs[formula.num] = f"#{len(self._programs)}", program
-        return replace(formula, num=ir.Signal(self._programs[formula.num][0]))
-
-    def __call__(self, history: Mapping[str, list[Forms]]) -> list[Intervals]:
-        """Bounds on the robustness of each requirement, (B,) each."""
-        env = {name: ranges(forms) for name, forms in history.items()}
-        over_time = {name: _over_time(forms) for name, forms in history.items()} if self._programs else {}
-        for name, program in self._programs.values():
-            env[name] = _margins(program, env, over_time)
-        found = evaluate(self._formulas, env, ops=INTERVALS, end=self._end)
-        batch = next(iter(env.values())).shape[1]
-        return [each[0].each(lambda end: np.broadcast_to(end, batch).copy()) for each in found]
-
-
-def _margins(program: ArrayProgram, env: Mapping[str, Intervals], forms: Mapping[str, Forms]) -> Intervals:
-    """Intervals that contain the values of a program, (T+1, B): those by forms within those by intervals."""
-    plain: Intervals = program({name: env[name] for name in program.columns}, INTERVALS)["margin"]
-    linear = program({name: forms[name] for name in program.columns}, FORMS)["margin"].range
-    low: Floats = np.fmax(plain.low, linear.low)  # one is NaN where it alone cannot exclude undefined values
-    return Intervals(low, np.maximum(np.fmin(plain.high, linear.high), low))
-
-
-def _over_time(forms: Sequence[Forms]) -> Forms:
-    count = max(len(form.generators) for form in forms)
-    generators = np.zeros((count, len(forms), *forms[0].shape))
-    for time, form in enumerate(forms):
-        generators[: len(form.generators), time] = form.generators
-    centre, rest = (np.stack([getattr(form, name) for form in forms]) for name in ("centre", "rest"))
-    return Forms(centre, generators, rest)
 
 
 def _refuse_functions(motion: _Motion, task: Task) -> None:

@@ -11,6 +11,7 @@ from helpers import formula_strategies as random_formulas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stlc.assurance.verification import judged
 from stlc.assurance.verification.forms import FORMS, Forms, ranges, tanh
 from stlc.assurance.verification.judged import Judge
 from stlc.compile.backends.array.arith import ArrayProgram
@@ -169,3 +170,18 @@ def test_a_choice_without_the_undefined_branch_is_known() -> None:
 def test_a_margin_that_may_be_undefined_proves_nothing(num: ir.Num) -> None:
     verdicts = Judge([ir.Predicate(num)], end="truncate")({"x": [symbol(-0.5, 1.0)]}, 1)
     assert verdicts.low.tolist() == [-np.inf]
+
+
+def test_formulas_over_many_samples_are_bounded_in_parts_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    history = {"x": [symbol(0.1 * i - 1.0, 1.5) for i in range(12)]}
+    read = ir.Op("sub", (ir.Signal("x"), ir.ShiftedSignal("x", 1)))
+    formulas = [ir.Predicate(read), ir.Predicate(ir.Op("abs", (ir.Signal("x"),)))]
+    judge = Judge(formulas, end="truncate")
+    whole = judge.bounds(history)
+    monkeypatch.setattr(judged, "_ROOM", 2)
+    parts, alone = judge.bounds(history), Judge(formulas, end="truncate", shifts=False).bounds(history)
+    np.testing.assert_array_equal(parts.low, whole.low)
+    np.testing.assert_array_equal(parts.high, whole.high)
+    assert whole.low[:, 0].tolist() == pytest.approx([-0.1, 0.0], abs=1e-6)  # one symbol: a known difference
+    assert alone.low[0, 0] < -2.0
+    assert alone.low[1, 0] == whole.low[1, 0]
