@@ -17,6 +17,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -71,6 +72,7 @@ INDICATORS = tuple(
 )
 
 _LEVELS = "levels of a control in prefixes"
+_LENGTHS = "order of the lengths of prefixes"
 ABS = """
         {},
         "{}",
@@ -228,6 +230,27 @@ PROBES = (
         "actions = 0.5 * np.array(list(product(*self.values)), dtype=np.float64)",
         BACKUPS,
     ),
+    Probe(
+        _LENGTHS,
+        "runtime/decision.py",
+        "    for length in lengths:\n",
+        "    for length in lengths[1:]:\n",
+        BACKUPS,
+    ),
+    Probe(
+        "title of a guard",
+        "controller/guard/kinds/paper.py",
+        'title="paper\'s guard"',
+        'title="guard of the paper"',
+        ("simulation as text", "simulation in the report", "closed loop of a training"),
+    ),
+    Probe(
+        "help of a guard",
+        "controller/guard/kinds/full.py",
+        'help="also repairs plans"',
+        'help="also mends plans"',
+        ("help of simulate",),
+    ),
 )
 
 _IN_C = "tests/runtime/test_decision.py::test_rank_and_choices_are_the_same_in_every_library_and_in_c"
@@ -243,6 +266,7 @@ _WRITE, _ONNX, _EXTREMA = (
     f"{_BACKENDS}/test_ops_onnx.py",
     f"{_BACKENDS}/test_torch_extrema.py",
 )
+_BACKUP = f"{_WRITE}::test_the_c_controller_decides_as_the_guard"
 APART: Mapping[tuple[str, str], str] = {
     ("choice of the backup", "backup by the header"): _IN_C,
     ("rank of plans", "policy by the header"): _IN_C,
@@ -266,7 +290,8 @@ APART: Mapping[tuple[str, str], str] = {
     ("derivative of a function", "symbolic derivative"): (
         "tests/dynamics/model/test_derivative.py::test_every_function_has_its_derivative"
     ),
-    (_LEVELS, "backup by the header"): f"{_WRITE}::test_the_c_controller_decides_as_the_guard",
+    (_LEVELS, "backup by the header"): _BACKUP,
+    (_LENGTHS, "backup by the header"): _BACKUP,
 }
 """Meaning and face -> the test that holds the face to the meaning."""
 
@@ -403,11 +428,11 @@ def header(spec: str = "cart") -> Callable[[str], Any]:
 
 
 def stlc(words: str) -> list[Any]:
-    """Exit codes and output of a command for each recording; `{}` stands for its name."""
+    """Exit codes and output of a command, for each recording if `{}` stands for its name."""
     from stlc.cli.framework.app import main
 
     said: list[Any] = []
-    for i in range(RECORDINGS):
+    for i in range(RECORDINGS if "{}" in words else 1):
         out, code = io.StringIO(), 0
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), contextlib.chdir(work()):
             try:
@@ -626,6 +651,50 @@ def symbolic_derivative() -> list[float]:
     return ArrayProgram({"out": found})({"x": np.linspace(-3.0, 3.0, 7)}, NUMPY)["out"].tolist()
 
 
+@cache
+def trained() -> Path:
+    """Folder of a run that was trained for two steps."""
+    words = "--method gradient --steps 2 --held-out 20 --drives 0 --no-pictures --threads 1 --seed 1"
+    stlc(f"train cart.stl --system cart.yaml {words} --name guarded --runs trained")
+    return next((work() / "trained").glob("**/config.resolved.yaml")).parent
+
+
+@cache
+def simulated() -> str:
+    """Text about a simulation with the guard `paper`."""
+    return stlc(f"simulate {trained()} --guard paper --seeds 0..1 --steps 4 --no-pictures")[0][1]
+
+
+def reported() -> str:
+    """The report of a simulated run."""
+    stlc(f"report {trained()}")
+    return (trained() / "report.html").read_text(encoding="utf-8")
+
+
+def about_guard(text: str) -> list[str]:
+    """The parts of a text that name the guard `paper`; other parts hold times."""
+    return [part for part in re.split(r"[<>\n]", text) if "paper" in part]
+
+
+def closed_loop() -> list[str]:
+    """Lines about the simulations that end a training."""
+    from stlc.view.learning import driven_lines
+
+    guards = [
+        {
+            "guard": name,
+            "drives": 9,
+            "satisfied": 5,
+            "share": 0.5,
+            "interval": (0.2, 0.8),
+            "gained": 2,
+            "lost": 1,
+        }
+        for name in ("none", "paper")
+    ]
+    return driven_lines({"closed_loop": {"guards": guards, "recommended": "paper"}})
+
+
 FACES: Mapping[str, Callable[[], Any]] = {
     "check": lambda: documented("check cart.stl {} --json"),
     "check as text": lambda: stlc("check cart.stl {}"),
@@ -662,6 +731,10 @@ FACES: Mapping[str, Callable[[], Any]] = {
     "gradient by torch": gradient_in_torch,
     "symbolic derivative": symbolic_derivative,
     "gymnasium": gymnasium,
+    "simulation as text": lambda: about_guard(simulated()),
+    "simulation in the report": lambda: about_guard((simulated(), reported())[1]),
+    "closed loop of a training": closed_loop,
+    "help of simulate": lambda: stlc("simulate --help"),
 }
 
 
@@ -750,6 +823,8 @@ def main() -> int:
     if given.faces:
         answer_all(given.faces)
         return 0
+    if unknown_names := set(given.meanings) - {probe.meaning for probe in PROBES}:
+        parser.error(f"no such meaning: {', '.join(sorted(unknown_names))}")
     chosen = [probe for probe in PROBES if not given.meanings or probe.meaning in given.meanings]
     plain, unknown = unaltered(), 0
     for probe in chosen:
