@@ -49,7 +49,7 @@ class _TextLoader(SourceFileLoader):
         super().__init__(name, str(path))
         self.text = text
 
-    def get_code(self, fullname: str) -> CodeType:  # noqa: ARG002
+    def get_code(self, _fullname: str) -> CodeType:
         return self.source_to_code(self.text, self.path)
 
 

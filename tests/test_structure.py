@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463239
+NODES = 463230
 CROSSINGS = 5.79
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {

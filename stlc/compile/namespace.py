@@ -279,13 +279,17 @@ class FloatConstants:
         """Return the library itself."""
         return self
 
-    def kind(self, like: Array) -> Hashable:  # noqa: ARG002
+    def kind(self, _like: Array) -> Hashable:
         """Return None for every array, so that all arrays share converted constants."""
         return None
 
-    def constant(self, value: float, like: Array) -> float:  # noqa: ARG002
+    def constant(self, value: float, _like: Array) -> float:
         """Return the float itself."""
         return value
+
+    def straight_through(self: Ops, rho: Array, strict: bool, _slope: float) -> Array:
+        """Return 1 where the condition holds, else 0: there are no gradients."""
+        return self.number(self.gt(rho, 0.0) if strict else self.ge(rho, 0.0), rho)
 
     def margin(self, x: Array) -> Array:
         """Return `x` itself."""

@@ -215,7 +215,7 @@ class _OnModel:
         self._x = self._episodes.states
         return self._x
 
-    def advance(self, x: Tensor, plan: Tensor, step: int) -> Tensor:  # noqa: ARG002
+    def advance(self, _x: Tensor, plan: Tensor, _step: int) -> Tensor:
         """State after step number `step` under the controls `plan`, (1, m)."""
         self._x = self._episodes.step(plan).states
         return self._x
@@ -224,7 +224,7 @@ class _OnModel:
         """Arrays from which a picture of the present instant is drawn, name -> array."""
         return snapshot(self._episodes.task, self._x)
 
-    def seen(self, x: Tensor, step: int) -> Tensor:  # noqa: ARG002
+    def seen(self, x: Tensor, _step: int) -> Tensor:
         """State `x` as the agent measures it at `step`, with sensor noise if there is any."""
         return x
 

@@ -434,7 +434,7 @@ class FormOps(FloatConstants):
         """Disjunction."""
         return INTERVALS.either(a, b)  # type: ignore[no-any-return]
 
-    def number(self, mask: Belief, like: Forms) -> Forms:  # noqa: ARG002
+    def number(self, mask: Belief, _like: Forms) -> Forms:
         """1 where `mask` is true, 0 where it is false, else [0, 1]."""
         return Forms.between(mask.sure.astype(np.float64), mask.possible.astype(np.float64))
 
@@ -454,7 +454,7 @@ class FormOps(FloatConstants):
         found = x.times(factor)
         return Forms(found.centre, found.generators, np.where(factor == 0.0, 0.0, found.rest))
 
-    def full(self, shape: tuple[int, ...], value: float, like: Forms) -> Forms:  # noqa: ARG002
+    def full(self, shape: tuple[int, ...], value: float, _like: Forms) -> Forms:
         """Array of a constant."""
         return Forms.point(np.full(shape, value))
 

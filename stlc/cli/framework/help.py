@@ -63,7 +63,7 @@ class ProgramHelp(TyperGroup):
 
     titles: Mapping[str, Iterable[str]] = {}
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+    def format_commands(self, _ctx: Any, formatter: Any) -> None:
         """Write a section for each group of commands, with the first sentence of each."""
         left = dict(self.commands)
         grouped = {

@@ -342,7 +342,7 @@ class Scheduler:
         args = tuple(self.place(part, its) for part, its in operands(node, run, self.domain))
         return self.add(ScheduleStep(node, run, args, number=self.number(run)))
 
-    def number(self, run: IndexRange) -> int:  # noqa: ARG002 - back ends allocate memory for it
+    def number(self, run: IndexRange) -> int:  # noqa: ARG002
         """Return the next free step number.
 
         `run` holds the instants of the step. It is unused here; a back end may reserve memory for them.

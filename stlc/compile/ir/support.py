@@ -186,7 +186,7 @@ class _History(Analysis[int]):
         firsts = [-_EVERYTHING if first is None else first for first, _ in offsets]
         return max(0, *(part - first for part, first in zip(parts, firsts, strict=True)))
 
-    def at_start(self, body: int) -> int:  # noqa: ARG002
+    def at_start(self, _body: int) -> int:
         return _EVERYTHING
 
 
@@ -214,7 +214,7 @@ class _Earliest(Analysis[tuple[int, int]]):
         later = max(part[0] + first for part, first in zip(parts, firsts, strict=True))
         return later, max(part[1] for part in parts)
 
-    def shift(self, body: tuple[int, int], node: ir.Shift) -> tuple[int, int]:  # noqa: ARG002
+    def shift(self, body: tuple[int, int], _node: ir.Shift) -> tuple[int, int]:
         return body
 
     def at_start(self, body: tuple[int, int]) -> tuple[int, int]:
@@ -287,7 +287,7 @@ class _Tail(Analysis[int | None]):
     samples: int
     length: int
 
-    def predicate(self, num: ir.Num) -> int | None:  # noqa: ARG002
+    def predicate(self, _num: ir.Num) -> int | None:
         return self.samples
 
     def constant(self) -> int | None:
@@ -310,8 +310,8 @@ class _Tail(Analysis[int | None]):
         least = min(each.first or 0 for each in offsets)
         return max(whole - least, 0 if last is not None else self.length - first, 0)
 
-    def freeze(self, bound: Sequence[int | None], body: int | None) -> int | None:  # noqa: ARG002
+    def freeze(self, _bound: Sequence[int | None], _body: int | None) -> int | None:
         return None
 
-    def at_start(self, body: int | None) -> int | None:  # noqa: ARG002
+    def at_start(self, _body: int | None) -> int | None:
         return None

@@ -234,11 +234,11 @@ class _Once(torch.autograd.Function):
     """Autograd function: the gradient of `_NativeRobustness` by plans `u`, which has no gradient in turn."""
 
     @staticmethod
-    def forward(ctx: Any, gradient: Tensor, u: Tensor) -> Tensor:  # noqa: ARG004
+    def forward(_ctx: Any, gradient: Tensor, _u: Tensor) -> Tensor:
         return gradient
 
     @staticmethod
-    def backward(ctx: Any, by_gradient: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG004
+    def backward(_ctx: Any, _by_gradient: Tensor) -> tuple[Tensor, Tensor]:
         raise usage(
             "compiled code gives no second derivatives", "take them in torch: `task.graph.robustness`"
         )

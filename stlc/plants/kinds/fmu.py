@@ -147,7 +147,7 @@ class Fmu:
         self._solver: _Integrator | None = None
         self._steps = 0
 
-    def start(self, initial: Floats, param: Floats, inputs: Floats, seed: int) -> list[float]:  # noqa: ARG002
+    def start(self, initial: Floats, param: Floats, inputs: Floats, _seed: int) -> list[float]:
         """Instantiate the FMU, set its start values, and initialise it."""
         from fmpy.simulation import instantiate_fmu
 

@@ -106,7 +106,7 @@ class GymEnvironment:
         state = getattr(self._environment.unwrapped, "state", None)
         return observation, () if state is None else state
 
-    def start(self, initial: Floats, param: Floats, inputs: Floats, seed: int) -> Floats:  # noqa: ARG002
+    def start(self, initial: Floats, param: Floats, _inputs: Floats, seed: int) -> Floats:
         """Reset the environment with a seed, then set its parameters and its state."""
         inner = self._environment.unwrapped
         for port, value in zip(self._layout.param, param, strict=True):

@@ -123,7 +123,7 @@ class PythonObject:
             raise UnfitError("the constructor has no argument `dt`, so its time step is fixed", "time.halves")
         self._object: Any = None
 
-    def start(self, initial: Floats, param: Floats, inputs: Floats, seed: int) -> Floats:  # noqa: ARG002
+    def start(self, initial: Floats, param: Floats, _inputs: Floats, _seed: int) -> Floats:
         """Make an object and reset it."""
         layout = self._layout
         self._object = self._make(**self._options)
@@ -162,7 +162,7 @@ class StateFunction:
         self._param: tuple[Floats, ...] = ()
         self._steps = 0
 
-    def start(self, initial: Floats, param: Floats, inputs: Floats, seed: int) -> Floats:  # noqa: ARG002
+    def start(self, initial: Floats, param: Floats, _inputs: Floats, _seed: int) -> Floats:
         """Take the start values as the state."""
         self._x, self._steps = np.array(initial), 0
         self._param = (param,) if self._with_params else ()

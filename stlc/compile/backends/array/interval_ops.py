@@ -228,7 +228,7 @@ class IntervalOps(FloatConstants):
         shape = weight.shape
         return self.number(mask, weight).each(lambda end: np.broadcast_to(end, shape))
 
-    def number(self, mask: Belief, like: Intervals) -> Intervals:  # noqa: ARG002
+    def number(self, mask: Belief, _like: Intervals) -> Intervals:
         """1 where `mask` is true, 0 where it is false, else [0, 1]."""
         return Intervals(np.asarray(mask.sure, np.float64), np.asarray(mask.possible, np.float64))
 
@@ -250,13 +250,9 @@ class IntervalOps(FloatConstants):
         bound = hull(no, yes)
         return Intervals(np.maximum(mixed.low, bound.low), np.minimum(mixed.high, bound.high))
 
-    def infinite(self, mask: Belief, like: Intervals) -> Intervals:  # noqa: ARG002
+    def infinite(self, mask: Belief, _like: Intervals) -> Intervals:
         """+inf where `mask` is true, -inf where it is false, else all numbers."""
         return Intervals(_infinite(mask.sure), _infinite(mask.possible))
-
-    def straight_through(self, rho: Intervals, strict: bool, slope: float) -> Intervals:  # noqa: ARG002
-        """1 where `rho > 0` (if `strict`) or `rho >= 0` (otherwise), 0 where not, else [0, 1]."""
-        return self.number(self.gt(rho, 0.0) if strict else self.ge(rho, 0.0), rho)
 
     # ---------------------------------------------------------------------------- along time
 
@@ -279,7 +275,7 @@ class IntervalOps(FloatConstants):
     def cummax(self, x: Intervals) -> Intervals:
         return x.selected(NUMPY.cummax)
 
-    def softmax(self, x: Intervals, k: float) -> Intervals:  # noqa: ARG002
+    def softmax(self, *_operands: Any) -> Intervals:
         """Not available.
 
         Raises:
@@ -287,9 +283,7 @@ class IntervalOps(FloatConstants):
         """
         raise usage("intervals have exact extrema only", "--semantics exact")
 
-    def softmax2(self, a: Intervals, b: Intervals, k: float) -> Intervals:  # noqa: ARG002
-        """Not available; see `softmax`."""
-        return self.softmax(a, k)
+    softmax2 = softmax
 
     def join(self, items: Sequence[Intervals], pick: Pick) -> Intervals:
         return extremum(partial(NUMPY.join, pick=pick), items)
@@ -301,14 +295,14 @@ class IntervalOps(FloatConstants):
 
     # ------------------------------------------------------------------- constants and shapes
 
-    def full(self, shape: tuple[int, ...], value: float, like: Intervals) -> Intervals:  # noqa: ARG002
+    def full(self, shape: tuple[int, ...], value: float, _like: Intervals) -> Intervals:
         return Intervals.point(np.full(shape, value))
 
     def counted(self, first: int, count: int, like: Intervals) -> Intervals:
         """Array with the numbers `first`, `first + 1`, …, `first + count - 1` along time."""
         return Intervals.point(NUMPY.counted(first, count, like.low))
 
-    def empty(self, shape: tuple[int, ...], like: Intervals) -> Intervals:  # noqa: ARG002
+    def empty(self, shape: tuple[int, ...], _like: Intervals) -> Intervals:
         """Array without defined values."""
         return Intervals(np.empty(shape), np.empty(shape))
 

@@ -78,13 +78,6 @@ class NumpyOps(FloatConstants, ScanByRows):
     def infinite(self, mask: Mask, like: Array) -> Array:
         return np.where(mask, np.inf, -np.inf).astype(like.dtype)
 
-    def straight_through(self, rho: Array, strict: bool, slope: float) -> Array:  # noqa: ARG002
-        """Array that is 1 where `rho > 0` (if `strict`) or `rho >= 0` (otherwise), and 0 elsewhere.
-
-        `slope` belongs to gradients, which NumPy does not have.
-        """
-        return self.number(rho > 0 if strict else rho >= 0, rho)
-
     def amin(self, x: Array) -> Array:
         return np.minimum.reduce(x, axis=0, keepdims=True)
 

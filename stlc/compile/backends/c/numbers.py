@@ -71,7 +71,7 @@ class NumberWriter(NumberEvaluator[str]):
     def _load(self, place: str) -> str:
         return self._register(place)
 
-    def _indicator(self, cond: ir.Formula, sharpness: float | None) -> str:  # noqa: ARG002 - it is exact
+    def _indicator(self, cond: ir.Formula, _sharpness: float | None) -> str:
         return self._register(f"(double){self.truth(cond)}")
 
     def _choice(self, cond: ir.Formula, yes: str, no: str) -> str:

@@ -143,7 +143,7 @@ class OnnxOps(FloatConstants, ScanByRows):
         parts = [each if isinstance(each, Value) else mask.graph.constant(each, kind) for each in (yes, no)]
         return mask.apply("Where", *parts, kind=kind)
 
-    def infinite(self, mask: Value, like: Value) -> Value:  # noqa: ARG002
+    def infinite(self, mask: Value, _like: Value) -> Value:
         return self.where(mask, math.inf, -math.inf)
 
     def clamp(self, x: Value, low: float | None, high: float | None) -> Value:

@@ -21,11 +21,11 @@ class _Sifted(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, clear: bool) -> Tensor:  # noqa: ARG004
+    def forward(_ctx: Any, x: Tensor, clear: bool) -> Tensor:
         return torch.nan_to_num(x, 0.0, 0.0, 0.0) if clear else x.view_as(x)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ARG004
+    def backward(_ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         if not torch.is_grad_enabled():
             return torch.nan_to_num(grad, 0.0, 0.0, 0.0), None
         return _Sifted.apply(grad, True), None  # type: ignore[no-untyped-call]

@@ -108,7 +108,7 @@ class _Accumulated(torch.autograd.Function):
     """Autograd function: running sum of `start` (1, …) and `x` (count, …). Faster than `cumsum`."""
 
     @staticmethod
-    def forward(ctx: Any, start: Tensor, x: Tensor) -> Tensor:  # noqa: ARG004
+    def forward(_ctx: Any, start: Tensor, x: Tensor) -> Tensor:
         out = x.new_empty(len(x) + 1, *x.shape[1:])
         rows = out.unbind(0)
         rows[0].copy_(start[0])
@@ -117,7 +117,7 @@ class _Accumulated(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG004
+    def backward(_ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
         if torch.is_grad_enabled():  # the gradient is to be differentiated in turn
             below = grad.flip(0).cumsum(0).flip(0)
         else:
