@@ -9,7 +9,7 @@ import re
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 from stlc.source import Range, Span
 
@@ -149,6 +149,20 @@ class StlcError(Exception):
         super().__init__(*diagnostics)
         self.diagnostics = diagnostics
 
+    @classmethod
+    def of(
+        cls,
+        code: str,
+        message: str,
+        span: Span | None = None,
+        label: str = "",
+        labels: tuple[Label, ...] = (),
+        help: tuple[str, ...] = (),
+        note: tuple[str, ...] = (),
+    ) -> Self:
+        """Return the error with one finding, whose parts are those of `Diagnostic`."""
+        return cls(Diagnostic(code, message, span, label, labels, help, note))
+
     def __str__(self) -> str:
         return "\n".join(
             line
@@ -192,7 +206,7 @@ class UsageError(StlcError):
 
 def usage(message: str, *advice: str) -> UsageError:
     """Return the error U101 (wrong command line) with a message and advice; the caller raises it."""
-    return UsageError(Diagnostic("U101", message, help=advice))
+    return UsageError.of("U101", message, help=advice)
 
 
 class MissingError(StlcError):

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import MissingError
 
 EXTRAS = {
     "train": ("torch", "safetensors", "mpmath"),
@@ -55,7 +55,7 @@ def not_installed(*packages: str, need: str = "this needs") -> NotInstalledError
     message = f"{need} {names}{extra and f' of the extra `{extra}`'}, which is not installed"
     advice = [CPU_BUILD] if "torch" in packages else []
     advice.append(installation(extra) if extra else f"pip install {packages[0]}")
-    error = NotInstalledError(Diagnostic("R301", message, help=tuple(advice)))
+    error = NotInstalledError.of("R301", message, help=tuple(advice))
     error.name = packages[0]
     return error
 

@@ -61,11 +61,11 @@ def read_source(path: Path | str, root: str = "") -> Source:
     except FileNotFoundError:
         near = closest(path.name, _siblings(path.parent))
         advice = (f"did you mean `{path.parent / near}`?",) if near else ()
-        raise UsageError(Diagnostic("U102", f"there is no file `{path}`", help=advice)) from None
+        raise UsageError.of("U102", f"there is no file `{path}`", help=advice) from None
     except OSError as error:
         raise (_too_large(name) if error.errno == errno.EFBIG else unreadable(path, error)) from None
     except ValueError:  # a zero byte in the name
-        raise UsageError(Diagnostic("U102", f"no file can be called {name!r}")) from None
+        raise UsageError.of("U102", f"no file can be called {name!r}") from None
     return decoded(name, data, root)
 
 
@@ -113,11 +113,11 @@ def require_regular(path: Path) -> None:
 def unreadable(path: Path, error: OSError) -> UsageError:
     """Return the error U102 for a file that cannot be read."""
     advice = ("`-` stands for the standard input",) if error.errno == errno.EINVAL else ()
-    return UsageError(Diagnostic("U102", f"cannot read `{path}`: {os_reason(error)}", help=advice))
+    return UsageError.of("U102", f"cannot read `{path}`: {os_reason(error)}", help=advice)
 
 
 def _too_large(name: str) -> SpecError:
-    return SpecError(Diagnostic("E005", f"`{name}` is larger than {MAX_BYTES // 1_000_000} MB"))
+    return SpecError.of("E005", f"`{name}` is larger than {MAX_BYTES // 1_000_000} MB")
 
 
 def _siblings(folder: Path) -> list[str]:
@@ -137,7 +137,7 @@ def decoded(name: str, data: bytes, root: str = "") -> Source:
     except UnicodeDecodeError as error:
         raise SpecError(_not_utf8(name, data, error)) from None
     if "\0" in text:
-        raise SpecError(Diagnostic("E003", f"`{name}` is a binary file, not a text"))
+        raise SpecError.of("E003", f"`{name}` is a binary file, not a text")
     source = Source(name, text, root)
     if _MESH.match(text):
         raise SpecError(_mesh(name, source))
@@ -237,7 +237,7 @@ def reported(action: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise MissingError(Diagnostic("R201", f"cannot {action}: {os_reason(error)}")) from error
+        raise MissingError.of("R201", f"cannot {action}: {os_reason(error)}") from error
 
 
 # ----------------------------------------------------------------------- finding
@@ -319,7 +319,7 @@ def _specs_below(name: str) -> Iterator[str]:
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)  # hidden
     )
     if not found:
-        raise UsageError(Diagnostic("U102", f"there is no specification in `{name}`"))
+        raise UsageError.of("U102", f"there is no specification in `{name}`")
     yield from map(str, found)
 
 
@@ -337,7 +337,7 @@ def find_trace(name: str, runs: Path = Path("runs")) -> Path:
             return of_run(path)
     if Path(name).is_dir():
         advice = f"name its traces: '{Path(name) / '*'}'"
-        raise UsageError(Diagnostic("U102", f"`{name}` is a folder, not a trace", help=(advice,)))
+        raise UsageError.of("U102", f"`{name}` is a folder, not a trace", help=(advice,))
     raise UsageError(_no_such("trace", name, folders))
 
 
@@ -374,13 +374,13 @@ def matching_traces(pattern: str) -> list[str]:
     try:
         paths = [path for path in start.glob(str(Path(*rest))) if not _hidden(path.relative_to(start), rest)]
     except OSError as error:
-        raise UsageError(Diagnostic("U102", f"cannot look up `{pattern}`: {os_reason(error)}")) from None
+        raise UsageError.of("U102", f"cannot look up `{pattern}`: {os_reason(error)}") from None
     found = {path for path in paths if path.is_file() or _is_bag(path)}
     bags = {path for path in found if path.is_dir()}
     names = sorted(str(path) for path in found if bags.isdisjoint(path.parents))
     if not names:
         advice = () if "**" in parts else ("`**` stands for any number of folders, as in 'logs/**/*.csv'",)
-        raise UsageError(Diagnostic("U102", f"no file matches `{pattern}`", help=advice))
+        raise UsageError.of("U102", f"no file matches `{pattern}`", help=advice)
     return names
 
 
@@ -508,7 +508,7 @@ def place(root: Path, name: str) -> Path:
 def refused(path: Path, why: str) -> RunError:
     """Return the error R110: a file of a run is not read or written."""
     advice = ("a run has regular files and folders alone: remove it, or copy what it leads to",)
-    return RunError(Diagnostic("R110", f"`{path}` is not a file of the run: {why}", help=advice))
+    return RunError.of("R110", f"`{path}` is not a file of the run: {why}", help=advice)
 
 
 @contextmanager

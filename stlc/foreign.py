@@ -11,7 +11,7 @@ from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
 
-from stlc.diagnostics import Diagnostic, RunError
+from stlc.diagnostics import RunError
 from stlc.files import MAX_BYTES, read_regular
 from stlc.source import Span
 
@@ -39,7 +39,7 @@ def require_driving(place: Span | None) -> None:
     if place is not None and place.source.root and not _DRIVING.get():
         message = "this command does not run the Python that a run names"
         help_ = ("if you trust the run: `stlc simulate` runs it, and `--python` where a command has it",)
-        raise RunError(Diagnostic("R111", message, place, label="names Python", help=help_))
+        raise RunError.of("R111", message, place, label="names Python", help=help_)
 
 
 class _TextLoader(SourceFileLoader):

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from stlc.diagnostics import Diagnostic, PluginError, StlcError, UsageError
+from stlc.diagnostics import PluginError, StlcError, UsageError
 
 PREFIX = "stlc."
 """Beginning of the names of groups of entry points."""
@@ -62,7 +62,7 @@ class Plugin:
     def refused(self, why: str) -> PluginError:
         """Return the error S206: the plugin cannot be used, for the reason `why`."""
         message = f"`{self.name}` of {self.source} cannot be loaded ({self.group})"
-        return PluginError(Diagnostic("S206", message, note=(why,)))
+        return PluginError.of("S206", message, note=(why,))
 
 
 def plugins(group: str, attribute: str = "") -> dict[str, tuple[Plugin, ...]]:
@@ -96,7 +96,7 @@ def name_path(group: str, path: Path) -> str:
         UsageError: U102, there is no such file.
     """
     if not path.exists():
-        raise UsageError(Diagnostic("U102", f"there is no file `{path}`"))
+        raise UsageError.of("U102", f"there is no file `{path}`")
     before = [each for each in os.environ.get(variable(group), "").split(os.pathsep) if each]
     os.environ[variable(group)] = os.pathsep.join(dict.fromkeys((*before, str(path.absolute()))))
     return path.stem

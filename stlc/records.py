@@ -23,7 +23,7 @@ from typing import (
     get_type_hints,
 )
 
-from stlc.diagnostics import Diagnostic, RunError
+from stlc.diagnostics import RunError
 from stlc.jsontext import Json, Key, data_of, keys_of
 
 R = TypeVar("R")
@@ -151,7 +151,7 @@ def from_json(kind: type[R], document: str | bytes | Json, file: Path | str, *, 
         found: R = read(kind, data_of(document))
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
-        raise RunError(Diagnostic(code, f"`{file}` is damaged", note=(reason,))) from None
+        raise RunError.of(code, f"`{file}` is damaged", note=(reason,)) from None
     return found
 
 

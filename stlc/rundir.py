@@ -188,7 +188,7 @@ class RunDir:
         runs = sorted(every_run(root), key=lambda run: run.path.stat().st_mtime)
         if not runs:
             help_ = ("train one: stlc train specs/traffic.stl --system car.yaml",)
-            raise UsageError(Diagnostic("R101", f"there is no run in `{root}`", help=help_))
+            raise UsageError.of("R101", f"there is no run in `{root}`", help=help_)
         return runs[-1]
 
     @classmethod
@@ -447,10 +447,10 @@ def _by_name(where: str, root: Path) -> RunDir:
         return fitting[0]
     if fitting:
         choices = tuple(f"{run.path.parent.name}/{run.name}" for run in fitting)
-        raise UsageError(Diagnostic("R101", f"several runs are called `{where}`", help=choices))
+        raise UsageError.of("R101", f"several runs are called `{where}`", help=choices)
     names = {name for run in runs for name in (run.name, _names(run)[-1], run.path.parent.name)}
     advice = did_you_mean(where, names)
-    raise UsageError(Diagnostic("R101", f"there is no run `{where}` in `{root}`", help=advice))
+    raise UsageError.of("R101", f"there is no run `{where}` in `{root}`", help=advice)
 
 
 def _of_spec(path: Path, root: Path) -> RunDir:
@@ -466,7 +466,7 @@ def _of_spec(path: Path, root: Path) -> RunDir:
     found = trained or [run for run in runs if run.path.parent.name == _slug(path.stem)]
     if not found:
         help_ = (f"train one: {shell(('stlc', 'train', str(path)))}",)
-        raise UsageError(Diagnostic("R101", f"there is no run of `{path}` in `{root}`", help=help_))
+        raise UsageError.of("R101", f"there is no run of `{path}` in `{root}`", help=help_)
     return found[-1]
 
 
@@ -604,6 +604,6 @@ def recorded_trace(what: str, runs: Path) -> Path:
         folder = RunDir.open(what, runs)
     if not folder.has(RunDir.TRACE):
         advice = (f"record one: {shell(('stlc', 'simulate', folder.name))}",)
-        raise UsageError(Diagnostic("U102", f"`{folder.shown}` has no trace", help=advice))
+        raise UsageError.of("U102", f"`{folder.shown}` has no trace", help=advice)
     folder.file(RunDir.TRACE, RunDir.MOST_ARRAYS)
     return Path(folder.shown) / RunDir.TRACE

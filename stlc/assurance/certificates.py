@@ -19,7 +19,7 @@ from stlc.assurance.campaign import (
 from stlc.assurance.certificate import FORMAT, Assessment, Claim
 from stlc.assurance.draws import CertifiedDraws, ModelDraws, PlantDraws, verify_draws
 from stlc.assurance.options import CertifyOptions
-from stlc.diagnostics import Diagnostic, RunError, notice, usage
+from stlc.diagnostics import RunError, notice, usage
 from stlc.escape import file_part
 from stlc.files import find_spec, of_run, read_source, write_atomic
 from stlc.foreign import driving
@@ -242,6 +242,4 @@ def _verified(path: Path, name: str | None, options: CertifyOptions) -> Certific
     except (ValueError, ArithmeticError, RecursionError) as error:
         advice = "stlc certify RUN  writes one"
         why = str(error)[:200] or type(error).__name__
-        raise RunError(
-            Diagnostic("R108", f"`{path}` is no certificate", note=(why,), help=(advice,))
-        ) from error
+        raise RunError.of("R108", f"`{path}` is no certificate", note=(why,), help=(advice,)) from error

@@ -25,7 +25,7 @@ from stlc.assurance.falsified import (
 from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 from stlc.assurance.options import FalsifyOptions
 from stlc.compile.semantics.tolerance import violated as is_violated
-from stlc.diagnostics import Diagnostic, SpecError, UsageError, usage
+from stlc.diagnostics import SpecError, UsageError, usage
 from stlc.escape import file_part
 from stlc.files import SPEC_SUFFIXES, read_source, require_folder, write_atomic
 from stlc.jsontext import data_of, dumps
@@ -324,7 +324,7 @@ def _stored(path: Path) -> StoredCounterexample | StoredFinding:
     except (SpecError, ValueError, RecursionError) as error:
         help_, why = ("a file that `stlc falsify` wrote",), str(error)[:200]
         message = f"`{path}` is not a counterexample"
-        raise UsageError(Diagnostic("U101", message, help=help_, note=(why,))) from None
+        raise UsageError.of("U101", message, help=help_, note=(why,)) from None
     return stored
 
 

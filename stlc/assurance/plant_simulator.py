@@ -17,7 +17,7 @@ from stlc.assurance.simulation import Simulations, Simulator
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.traverse import nodes
-from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.diagnostics import SystemFileError
 from stlc.monitor.verdict import Monitor
 from stlc.plants.plant import Plant, PlantFinding, PlantRun
 
@@ -191,7 +191,7 @@ class PlantSimulator(Simulator):
             decl = self.plant.decl
             message = f"`{decl.name}` gave a trace, and fails when it is simulated again at the same point"
             note = (f"{found.reason}: {found.message}",)
-            raise SystemFileError(Diagnostic("S401", message, decl.places.get(decl.kind), note=note))
+            raise SystemFileError.of("S401", message, decl.places.get(decl.kind), note=note)
         return self.judge.stored([found])
 
 

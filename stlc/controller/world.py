@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stlc.controller.sketch import DECIDED, Scene, deciders
-from stlc.diagnostics import Diagnostic, RunError, SystemFileError
+from stlc.diagnostics import RunError, SystemFileError
 from stlc.dynamics.uncertainty.disturbance import Events
 from stlc.foreign import module_at
 from stlc.registry import closest
@@ -230,13 +230,11 @@ def _load(reference: WorldRef) -> WorldType:
 
 
 def _refused(reference: WorldRef, message: str, note: str = "", advice: str = "") -> SystemFileError:
-    return SystemFileError(
-        Diagnostic(
-            "S206",
-            message,
-            reference.span,
-            label="named here",
-            note=(note,) if note else (),
-            help=(advice,) if advice else (),
-        )
+    return SystemFileError.of(
+        "S206",
+        message,
+        reference.span,
+        label="named here",
+        note=(note,) if note else (),
+        help=(advice,) if advice else (),
     )

@@ -19,7 +19,7 @@ import torch
 from stlc.compile.backends.array.arith import ArrayProgram
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
-from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.kinematics import Doubles, read_urdf
 
@@ -75,14 +75,12 @@ def compared(function: FunctionDecl, *, seed: int = 0) -> Comparison:
     ours = _by_body(function.body, q)
     far = float(np.abs(ours - theirs).max())
     if not far <= _NEAR * max(1.0, float(np.abs(ours).max())):
-        raise SystemFileError(
-            Diagnostic(
-                "S208",
-                f"`{function.name}` is up to {far:.2g} m from where {LIBRARY} puts `{function.attribute}`",
-                function.span,
-                "named here",
-                note=("one of the two reads the description otherwise; compare origins, axes and `base`",),
-            )
+        raise SystemFileError.of(
+            "S208",
+            f"`{function.name}` is up to {far:.2g} m from where {LIBRARY} puts `{function.attribute}`",
+            function.span,
+            "named here",
+            note=("one of the two reads the description otherwise; compare origins, axes and `base`",),
         )
     return Comparison(function.name, far)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from stlc.compile.frontend.interface import InterfaceFunction
 from stlc.compile.namespace import Array
-from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.functions import FunctionDecl
 from stlc.dynamics.declaration.init import FileDecl
@@ -75,7 +75,7 @@ def _refused(
     decl: FunctionDecl, message: str, note: str = "", help_: tuple[str, ...] = ()
 ) -> SystemFileError:
     notes = (note,) if note else ()
-    return SystemFileError(Diagnostic("S208", message, decl.span, "named here", help=help_, note=notes))
+    return SystemFileError.of("S208", message, decl.span, "named here", help=help_, note=notes)
 
 
 @final

@@ -486,14 +486,12 @@ class System:
         hit = [name for name, column in zip(self.names, bad.unbind(-1), strict=True) if bool(column.any())]
         place = self.decl.places.get(hit[0])
         listed = ", ".join(f"`{name}`" for name in hit)
-        raise SystemFileError(
-            Diagnostic(
-                "S302",
-                f"the dynamics of {self.decl.name} give NaN or infinity in {listed}",
-                place,
-                label="declared here",
-                help=("clamp the state, shorten the step, or keep divisors away from 0",),
-            )
+        raise SystemFileError.of(
+            "S302",
+            f"the dynamics of {self.decl.name} give NaN or infinity in {listed}",
+            place,
+            label="declared here",
+            help=("clamp the state, shorten the step, or keep divisors away from 0",),
         )
 
     def probe(self, n: int = 256, *, seed: int = 0) -> tuple[Diagnostic, ...]:

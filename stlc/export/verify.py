@@ -335,9 +335,7 @@ def by_c(folder: Path, task: Task, built: Path) -> Callable[[str], Decide]:
         broken = toolchain.works(using)
         if broken:
             raise Unchecked(f"the C compiler `{using}` {broken}")
-        raise RunError(
-            Diagnostic("R105", "the exported C does not compile", note=tuple(done.errors.splitlines()[:5]))
-        )
+        raise RunError.of("R105", "the exported C does not compile", note=tuple(done.errors.splitlines()[:5]))
     rules, shape = len(task.rules), (task.horizon, len(task.system.decl.controls))
 
     def decide(mode: str, x: Tensor) -> Answer:

@@ -12,7 +12,7 @@ from typing import Any
 
 from lark import Tree, UnexpectedInput
 
-from stlc.diagnostics import Diagnostic, SpecError
+from stlc.diagnostics import SpecError
 from stlc.grammar import ast
 from stlc.grammar.builder import BuildContext
 from stlc.grammar.declarations import Item, assemble
@@ -103,7 +103,7 @@ def _check_text(source: Source, start: int, end: int) -> None:
 
 def _too_large(source: Source, what: str) -> SpecError:
     help_ = ("split it into several specifications, and `import` what they share",)
-    return SpecError(Diagnostic("E005", f"`{source.name}` {what}", help=help_))
+    return SpecError.of("E005", f"`{source.name}` {what}", help=help_)
 
 
 def _build(piece: Piece, context: BuildContext) -> Any:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from lark import Token as LarkToken
 from lark import Tree, UnexpectedInput
 
-from stlc.diagnostics import Diagnostic, SpecError
+from stlc.diagnostics import SpecError
 from stlc.grammar.scan import declaration_starts
 from stlc.grammar.tables import load_parser
 from stlc.source import Source
@@ -116,7 +116,7 @@ def _read_piece(
     except UnexpectedInput as error:
         offset = start + (error.pos_in_stream or 0)
         place = source.span(offset, offset)
-        raise SpecError(Diagnostic("E010", "this cannot be read", place)) from None
+        raise SpecError.of("E010", "this cannot be read", place) from None
     assert isinstance(tree, Tree)
     found = [item for item in tree.children if isinstance(item, Tree)]
     places += [(str(item.data), start + item.meta.start_pos, start + item.meta.end_pos) for item in found]

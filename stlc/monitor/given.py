@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.trace import Reading, Trace, trace_of
 from stlc.trace.clocks import ClockSetting, clocked
 from stlc.trace.enums import Words, in_numbers
@@ -132,4 +132,4 @@ def _is_missing(value: object) -> bool:
 
 def _refused(name: str, what: str) -> TraceError:
     help_ = ("give an array of numbers, of truth values, or of the words of an enum",)
-    return TraceError(Diagnostic("E603", f"`{name}` of {UNNAMED} {what}", help=help_))
+    return TraceError.of("E603", f"`{name}` of {UNNAMED} {what}", help=help_)

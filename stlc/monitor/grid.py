@@ -14,7 +14,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.ir.traverse import nodes
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.diagnostics import Diagnostic, TraceError, UsageError, usage
+from stlc.diagnostics import TraceError, UsageError, usage
 from stlc.files import find_system
 from stlc.grammar import ast
 from stlc.source import Source
@@ -63,7 +63,7 @@ class Times:
                 finer = f"--resample {horizon / next(fits, least):.6g}s"
                 help_ = (f"{finer}  puts the signals on a grid of which T is a whole number of steps",)
                 message = f"`{self.trace}` has dt {dt:g} s, and T = {horizon:g} s is no whole number of steps"
-                raise TraceError(Diagnostic("E602", message, help=help_))
+                raise TraceError.of("E602", message, help=help_)
             message = f"the horizon {horizon:g} s is not a whole number of steps of {dt:g} s"
             raise usage(message)
         return Grid(self.dt, whole)
@@ -140,7 +140,7 @@ def require_windows(trace: Trace, rules: Sequence[CompiledRequirement]) -> None:
                 f"--resample {length / 10:.3g}s  judges on a finer grid",
             )
             span = node.interval.span or last.span or rule.span
-            raise TraceError(Diagnostic("E602", message, span, help=help_))
+            raise TraceError.of("E602", message, span, help=help_)
     _require_seconds(trace, rules)
 
 
@@ -184,7 +184,7 @@ def _require_seconds(trace: Trace, rules: Sequence[CompiledRequirement]) -> None
         f"Its step of {step:.6g} is long beside {length:.6g} s"
     )
     help_ = (f"--clock {name}:{unit}  if it is in {unit}", f"--clock {name}:s  if it is in seconds")
-    raise TraceError(Diagnostic("E607", message, longest.span, help=help_))
+    raise TraceError.of("E607", message, longest.span, help=help_)
 
 
 def agreed_times(name: str, step: float, horizon: int | None, given: Times) -> Times:
@@ -195,5 +195,5 @@ def agreed_times(name: str, step: float, horizon: int | None, given: Times) -> T
     dt = as_fraction(step)
     if given.dt is not None and abs(given.dt - dt) > Fraction(1, 1000) * dt:
         message = f"`{name}` has dt {float(dt):g} s, the monitor was told {float(given.dt):g} s"
-        raise TraceError(Diagnostic("E602", message))
+        raise TraceError.of("E602", message)
     return Times(dt, None if horizon is None else horizon * dt, name)

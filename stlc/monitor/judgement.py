@@ -731,7 +731,7 @@ def unknown_requirement(name: str, names: Sequence[str]) -> UsageError:
     near = closest(name, names)
     help_ = (f"did you mean `{near}`?",) if near else ()
     note = (f"requirements: {', '.join(names)}",)
-    return UsageError(Diagnostic("U101", f"there is no requirement `{name}`", help=help_, note=note))
+    return UsageError.of("U101", f"there is no requirement `{name}`", help=help_, note=note)
 
 
 def _known(status: Status) -> bool | None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stlc.compile.ir.support import columns_in
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.monitor.facts.fact import Fact
 from stlc.monitor.signals import Signals
 from stlc.monitor.values import Record
@@ -125,7 +125,7 @@ class Prepared:
                 for name, x in spans.items()
             ]
             message = f"the signals of `{rule.name}` in `{self.signals.name}` have no time in common"
-            raise TraceError(Diagnostic("E602", message, rule.span, note=("; ".join(told),)))
+            raise TraceError.of("E602", message, rule.span, note=("; ".join(told),))
         return None if found == whole else found
 
     def part(self, rule: CompiledRequirement) -> Part:

@@ -367,7 +367,7 @@ def _common_shape(arrays: Mapping[str, Any], name: str) -> tuple[tuple[int, ...]
     """Shape of the arrays without their time axis, and number of samples; single numbers fit any."""
 
     def unfit(what: str) -> TraceError:
-        return TraceError(Diagnostic("E605", f"{name}: {what}"))
+        return TraceError.of("E605", f"{name}: {what}")
 
     lengths = {key: int(values.shape[-1]) for key, values in arrays.items() if values.ndim}
     if not lengths:

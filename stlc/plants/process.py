@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.diagnostics import SystemFileError
 from stlc.extras import not_installed
 from stlc.plants.declaration import OutputDecl, PlantDecl, PlantInput, VariableDecl
 from stlc.plants.kind import Reason
@@ -245,7 +245,7 @@ def _refused(decl: PlantDecl, message: str, place: str, said: str) -> SystemFile
     """Return the error S401, located at the key `place` of the plant file, or else at the plant itself."""
     span = decl.places.get(place) or decl.places.get(place.partition(".")[0]) or decl.places.get(decl.kind)
     note = tuple(f"it printed: {line}" for line in said.splitlines()[-3:])
-    return SystemFileError(Diagnostic("S401", message, span, label="named here", note=note))
+    return SystemFileError.of("S401", message, span, label="named here", note=note)
 
 
 def _require_units(decl: PlantDecl, units: Mapping[str, Any]) -> None:
@@ -266,4 +266,4 @@ def _require_units(decl: PlantDecl, units: Mapping[str, Any]) -> None:
                 span = decl.places.get(f"{place}.unit") or decl.places.get(place)
                 message = f"`{each.name}` is in [{known}] in the plant, and the file declares [{each.unit}]"
                 advice = (f"{each.name}: {{unit: {text}}}",)
-                raise SystemFileError(Diagnostic("S401", message, span, label="declared here", help=advice))
+                raise SystemFileError.of("S401", message, span, label="declared here", help=advice)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stlc.compile.semantics.tolerance import satisfied
-from stlc.diagnostics import Diagnostic, RunError, usage
+from stlc.diagnostics import RunError, usage
 from stlc.registry import GUARDS
 from stlc.runtime.backup import POLICY, Found, search
 from stlc.runtime.facts import Facts, read_facts
@@ -174,7 +174,7 @@ class Controller:
                 found = search(self._graphs, x[row], fresh[row], left)
                 followed.put(int(row), found)
         if not np.isfinite(followed.judged.plan[:, 0]).all():
-            raise RunError(Diagnostic("R402", "the policy's plan is not a number"))
+            raise RunError.of("R402", "the policy's plan is not a number")
         self._previous = followed
         self._added = outputs.get("added")
         command = followed.judged.plan[:, 0].copy()
@@ -303,4 +303,4 @@ def _continued(plans: Numbers, steps: int) -> Numbers:
 
 
 def _invalid(message: str, advice: str) -> RunError:
-    return RunError(Diagnostic("R107", f"no decision: {message}", help=(advice,)))
+    return RunError.of("R107", f"no decision: {message}", help=(advice,))

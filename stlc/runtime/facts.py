@@ -143,7 +143,7 @@ def read_facts(where: Path | str) -> Facts:
     """
     path = Path(where)
     if not path.exists():
-        raise UsageError(Diagnostic("U102", f"there is no controller `{path}`"))
+        raise UsageError.of("U102", f"there is no controller `{path}`")
     folder = path if path.is_dir() else path.parent
     try:
         return _facts(json.loads(_content(folder / FACTS)), folder)

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, RunError
+from stlc.diagnostics import RunError
 from stlc.extras import needed
 from stlc.runtime.facts import Facts, GraphFile
 
@@ -175,7 +175,7 @@ class Graphs:
 def _misfit(what: str, why: str) -> RunError:
     note = (" ".join(why.split())[:300],)
     help_ = ("take all files of one `stlc export RUN --to onnx`",)
-    return RunError(Diagnostic("R106", f"{what} does not fit its description", note=note, help=help_))
+    return RunError.of("R106", f"{what} does not fit its description", note=note, help=help_)
 
 
 def _judged(plan: Numbers, found: Mapping[str, Numbers]) -> JudgedPlans:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.trace.clocks import SPELLINGS, ClockSetting, clocked
 from stlc.trace.formats.registry import format_of, suffix_of, unreadable
 from stlc.trace.formats.table import GROUPS
@@ -44,7 +44,7 @@ def pieces(path: Path, samples: int, reading: Reading) -> Iterator[Trace]:
     """
     found = format_of(path)
     if not found.chunked or suffix_of(path) not in found.suffixes:
-        raise TraceError(Diagnostic("E605", f"`{path}` is of a format that cannot be read in pieces"))
+        raise TraceError.of("E605", f"`{path}` is of a format that cannot be read in pieces")
     clock: _Clock | None = None
     only = OneTrace(str(path))
     for recording in found.function("chunks")(path, samples, reading.wanted):
@@ -107,4 +107,4 @@ class _Clock:
                 f"where {wanted[i]:.6g} s was expected"
             )
             first = "a larger --chunk  if the times are rounded: the first chunk determines their step"
-            raise TraceError(Diagnostic("E602", message, help=(first, resample_advice(self.dt))))
+            raise TraceError.of("E602", message, help=(first, resample_advice(self.dt)))

@@ -18,7 +18,7 @@ from itertools import permutations, takewhile
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.trace.formats.cells import value_of
 from stlc.trace.recording import (
     ROSTOPIC,
@@ -305,8 +305,8 @@ def best_of(trace: str, found: Iterable[Candidate]) -> Candidate:
 
 def _which(trace: str, names: list[str]) -> TraceError:
     message = f"which of {', '.join(f'`{name}`' for name in names)} is the clock of `{trace}`?"
-    return TraceError(
-        Diagnostic("E601", message, help=(f"--clock {names[0]}  or  --clock {names[-1]}:ms  with its unit",))
+    return TraceError.of(
+        "E601", message, help=(f"--clock {names[0]}  or  --clock {names[-1]}:ms  with its unit",)
     )
 
 
@@ -429,7 +429,7 @@ def _require_one_pace(trace: str, clock: Candidate, others: list[Candidate]) -> 
                 f"`{other.name}` with {steps[1]:.6g} s"
             )
             help_ = (f"--clock {clock.name}  or  --clock {other.name}  names the one that counts",)
-            raise TraceError(Diagnostic("E606", message, help=help_))
+            raise TraceError.of("E606", message, help=help_)
 
 
 def _shared(one: str, other: str) -> int:
@@ -447,14 +447,14 @@ def _require_no_other(recording: Recording, group: ClockGroup, read: Read) -> No
                 first = str(values.flat[0])[:40]
                 message = f"the clock `{name}` in `{recording.name}` holds words (`{first}`)"
                 advice = ("seconds, or dates and times such as 2026-01-31T12:00:00.5",)
-                raise TraceError(Diagnostic("E603", message, help=advice))
+                raise TraceError.of("E603", message, help=advice)
 
 
 def _require_time(trace: str, name: str, stated: str) -> None:
     """Raise TraceError (E605) if the stated unit of a clock is not of time."""
     if stated and not unit_in(name, stated):
         message = f"the clock `{name}` of {trace} is in [{stated}], which is not a time"
-        raise TraceError(Diagnostic("E605", message))
+        raise TraceError.of("E605", message)
 
 
 # ------------------------------------------------------------------------------- streams

@@ -86,7 +86,7 @@ def _require_numbers(trace: str, name: str, values: NDArray[Any]) -> None:
     )
     if values.dtype.kind in "Mm":
         held, advice = "dates, not numbers", f"as the clock of the trace:  --clock {name}"
-    raise TraceError(Diagnostic("E603", f"`{name}` in `{trace}` holds {held}", help=(advice,)))
+    raise TraceError.of("E603", f"`{name}` in `{trace}` holds {held}", help=(advice,))
 
 
 def number_of_word(trace: str, name: str, word: str, words: Words) -> float:

@@ -16,7 +16,7 @@ from itertools import chain, islice
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.jsontext import loads
 from stlc.trace.clocks import StreamClock
 from stlc.trace.enums import number_of_word
@@ -188,7 +188,7 @@ class SampleStream:
         return None
 
     def _bad(self, what: str, code: str = "E603") -> TraceError:
-        return TraceError(Diagnostic(code, f"line {self._number} of the {self.name} {what}"))
+        return TraceError.of(code, f"line {self._number} of the {self.name} {what}")
 
     # ------------------------------------------------------------------------ names
 
@@ -345,7 +345,7 @@ def on_grid(samples: Iterator[Samples], reading: Reading, name: str) -> Uniform:
     """
     first = next(samples, None)
     if first is None:
-        raise TraceError(Diagnostic("E605", f"the {name} holds no samples"))
+        raise TraceError.of("E605", f"the {name} holds no samples")
     if reading.resample is None and reading.max_gap is None:
         return _steady(first, samples, reading.dt, name)
     gridded = Gridded(name, reading)
@@ -365,7 +365,7 @@ def _steady(first: Samples, rest: Iterator[Samples], dt: float | None, name: str
     step = snapped(times[1] - times[0]) if dt is None else dt
     if not step > 0:
         message = f"time in the {name} does not increase: {times[0]:g} s, {times[1]:g} s"
-        raise TraceError(Diagnostic("E602", message))
+        raise TraceError.of("E602", message)
     require_step(name, step)
     return Uniform(times[0], step, _checked(samples, times[0], step, name, measured=dt is None))
 
@@ -392,7 +392,7 @@ def _checked(
             help_ = [gap_advice(step)]
         elif measured:
             help_.append("--dt TIME  says what the step is; without it the first two samples do")
-        raise TraceError(Diagnostic("E602", message, help=tuple(help_)))
+        raise TraceError.of("E602", message, help=tuple(help_))
 
 
 @dataclass(slots=True)
@@ -462,7 +462,7 @@ class Gridded:
             elif self.reading.dt is not None:
                 times = self.reading.dt * np.arange(self._came, self._came + each.count, dtype=np.float64)
             else:
-                raise TraceError(Diagnostic("E601", f"the {self.name} has no `t`", help=(NO_CLOCK, NO_STEP)))
+                raise TraceError.of("E601", f"the {self.name} has no `t`", help=(NO_CLOCK, NO_STEP))
             self.t0 = self.t0 if self._came else float(times[0])
             before = np.append(self._last, times[:-1])
             with np.errstate(over="ignore"):
@@ -477,7 +477,7 @@ class Gridded:
             if bad < each.count:
                 if times[bad] < before[bad]:
                     message = f"time in the {self.name} runs backwards: {before[bad]:g} s, {times[bad]:g} s"
-                    raise TraceError(Diagnostic("E602", message))
+                    raise TraceError.of("E602", message)
                 require_span(self.name, self.t0, float(times[bad]))
 
     def _buffer(self, signal: str) -> _Buffer:
@@ -510,7 +510,7 @@ class Gridded:
         most = (min(stop, self._last) - self.t0 + slack) / self.dt + 1
         if most > MAX_SAMPLES:
             message = f"the {self.name} spans more than {MAX_SAMPLES:,} steps of {self.dt:g} s"
-            raise TraceError(Diagnostic("E605", message, help=("a larger step",)))
+            raise TraceError.of("E605", message, help=("a larger step",))
         while True:
             last = min(math.floor(most), self._done + _AT_ONCE)
             grid = self.t0 + self.dt * np.arange(self._done, last, dtype=np.float64)

@@ -230,7 +230,7 @@ def unit_of(path: Path | str, name: str, text: str) -> Unit:
         return parse_unit(text) if text else DIMENSIONLESS
     except ValueError as error:
         message = f"column `{name}` of `{path}`: {error}"
-        raise TraceError(Diagnostic("E605", message, help=celsius_advice(text))) from None
+        raise TraceError.of("E605", message, help=celsius_advice(text)) from None
 
 
 def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array]:
@@ -263,9 +263,9 @@ def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array
     if findings:
         raise TraceError(*findings)
     if not data:
-        raise TraceError(Diagnostic("E601", f"trace `{name}` has no signals"))
+        raise TraceError.of("E601", f"trace `{name}` has no signals")
     if not traces:
-        raise TraceError(Diagnostic("E605", f"the arrays of `{name}` hold no traces"))
+        raise TraceError.of("E605", f"the arrays of `{name}` hold no traces")
     return {signal: np.broadcast_to(values, (traces, samples)) for signal, values in data.items()}
 
 
@@ -297,7 +297,7 @@ def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = N
         message = f"`{column.name}` is in [{recorded}] in `{trace}`, the specification declares [{wanted}]"
         coulombs = wanted.dims == SYMBOLS["K"].dims and recorded.text == "C"
         help_ = (f"[C] is coulombs: name the column `{column.name} [degC]`",) if coulombs else ()
-        raise TraceError(Diagnostic("E605", message, span, help=help_))
+        raise TraceError.of("E605", message, span, help=help_)
     found = Conversion(
         float(recorded.ratio / wanted.ratio), float((recorded.offset - wanted.offset) / wanted.ratio)
     )

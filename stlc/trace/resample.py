@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.signature import Kind
 from stlc.trace.recording import ClockGroup, Recording, fit
 from stlc.trace.time_grid import NO_CLOCK, NO_STEP, check_finite, require_step, snapped, usual_step
@@ -234,7 +234,7 @@ def resampled(
     """
     groups = [_timed(recording, group, between, kinds) for group in recording.groups if group.arrays]
     if not groups:
-        raise TraceError(Diagnostic("E601", f"trace `{recording.name}` has no signals"))
+        raise TraceError.of("E601", f"trace `{recording.name}` has no signals")
     if dt is None:
         dt = snapped(min((step for s in groups if (step := usual_step(s.times))), default=0.0))
     require_step(recording.name, dt)
@@ -309,7 +309,7 @@ def _count(recording: Recording, start: float, stop: float, dt: float, recorded:
             f"--resample {nearest_step((stop - start) / most)}  takes a longer step",
             f"--clock {named}:us  says that the clock is in another unit than seconds",
         )
-        raise TraceError(Diagnostic("E605", message, help=help_))
+        raise TraceError.of("E605", message, help=help_)
     return math.floor(steps) + 1
 
 
@@ -325,14 +325,14 @@ def _timed(
     name = recording.name
     if group.clock is None:
         help_ = (NO_CLOCK, NO_STEP)
-        raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_))
+        raise TraceError.of("E601", f"trace `{name}` has no `t`", help=help_)
     times: Floats = group.clock.astype(np.float64).reshape(-1)
     check_finite(name, times)
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         i = int(back[0])
         message = f"time in `{name}` runs backwards: t[{i}] = {times[i]:g} s, t[{i + 1}] = {times[i + 1]:g} s"
-        raise TraceError(Diagnostic("E602", message))
+        raise TraceError.of("E602", message)
     signals = fit(name, group.arrays, len(times))
     between = {n: _between(n, values, recording, asked, kinds) for n, values in signals.items()}
     return _Timed(times, signals, between)
@@ -357,5 +357,5 @@ def _same_traces(name: str, data: dict[str, Floats]) -> dict[str, Floats]:
     counts: Sequence[int] = [len(values) for values in data.values()]
     traces = max(counts)
     if any(count not in (1, traces) for count in counts):
-        raise TraceError(Diagnostic("E605", f"the signals of `{name}` have different numbers of traces"))
+        raise TraceError.of("E605", f"the signals of `{name}` have different numbers of traces")
     return {key: np.ascontiguousarray(np.broadcast_to(x, (traces, x.shape[1]))) for key, x in data.items()}

@@ -85,18 +85,16 @@ def read_clock(
             help_ = (*frames[:1], NO_CLOCK, NO_STEP)
             known = ", ".join(names)
             note = (f"arrays in {name}: {known}",) if known else ()
-            raise TraceError(Diagnostic("E601", f"trace `{name}` has no `t`", help=help_, note=note))
+            raise TraceError.of("E601", f"trace `{name}` has no `t`", help=help_, note=note)
         return 0.0, dt, samples
     if clock.ndim != 1:
         shape = " x ".join(map(str, clock.shape)) or "a single number"
-        raise TraceError(Diagnostic("E605", f"`t` in `{name}` is {shape}; it has one value per sample"))
+        raise TraceError.of("E605", f"`t` in `{name}` is {shape}; it has one value per sample")
     times = clock.astype(np.float64, copy=False)
     check_finite(name, times)
     if len(times) == 1:
         if dt is None:
-            raise TraceError(
-                Diagnostic("E602", f"trace `{name}` has one sample, so its time step is unknown")
-            )
+            raise TraceError.of("E602", f"trace `{name}` has one sample, so its time step is unknown")
         return float(times[0]), dt, 1
     step = _step(name, times, dt)
     require_step(name, step)
@@ -107,14 +105,14 @@ def require_step(name: str, dt: float) -> None:
     """Raise TraceError (E602) if a time step is invalid or out of range."""
     if not SHORTEST <= dt <= LONGEST:
         help_ = (f"time is in seconds, and a step at least {SHORTEST:g} s and at most {LONGEST:g} s",)
-        raise TraceError(Diagnostic("E602", f"the time step of `{name}` is {dt:g} s", help=help_))
+        raise TraceError.of("E602", f"the time step of `{name}` is {dt:g} s", help=help_)
 
 
 def require_span(name: str, first: float, last: float) -> None:
     """Raise TraceError (E602) if the time between two samples is too long for a number."""
     if not math.isfinite(last - first):
         message = f"time in `{name}` runs from {first:g} s to {last:g} s, which is too long to be measured"
-        raise TraceError(Diagnostic("E602", message))
+        raise TraceError.of("E602", message)
 
 
 def check_finite(name: str, times: Floats) -> None:
@@ -124,10 +122,10 @@ def check_finite(name: str, times: Floats) -> None:
     far apart (E602).
     """
     if not len(times):
-        raise TraceError(Diagnostic("E605", f"trace `{name}` has no samples"))
+        raise TraceError.of("E605", f"trace `{name}` has no samples")
     bad = np.flatnonzero(~np.isfinite(times))
     if len(bad):
-        raise TraceError(Diagnostic("E604", f"time in `{name}` is {times[bad[0]]} at t[{bad[0]}]"))
+        raise TraceError.of("E604", f"time in `{name}` is {times[bad[0]]} at t[{bad[0]}]")
     require_span(name, float(times.min()), float(times.max()))
 
 
@@ -144,7 +142,7 @@ def _step(name: str, times: Floats, dt: float | None) -> float:
         message = (
             f"time in `{name}` is not uniform: t[{i}] = {times[i]:.6g} s is {drift[i]:.3g} s beside the grid"
         )
-        raise TraceError(Diagnostic("E602", message, help=(resample_advice(mean),)))
+        raise TraceError.of("E602", message, help=(resample_advice(mean),))
     return snapped(mean, dt)
 
 
@@ -158,7 +156,7 @@ def _require_even(name: str, times: Floats) -> None:
             f"time in `{name}` does not increase: t[{i}] = {times[i]:g} s, t[{i + 1}] = {times[i + 1]:g} s"
         )
         help_ = () if (gaps < 0).any() else (resample_advice(usual),)
-        raise TraceError(Diagnostic("E602", message, help=help_))
+        raise TraceError.of("E602", message, help=help_)
     odd = gaps - usual
     np.abs(odd, out=odd)
     if odd.max() > TOLERANCE * usual:

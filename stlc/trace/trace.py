@@ -276,7 +276,7 @@ def trace_of(recording: Recording, reading: Reading = AS_IT_IS) -> Trace:
     if len(traces) > 1:
         message = f"`{recording.name}` holds {len(traces)} objects of different times"
         help_ = ("stlc check  judges each of them; in Python:  stlc.trace.traces_of",)
-        raise TraceError(Diagnostic("E605", message, help=help_))
+        raise TraceError.of("E605", message, help=help_)
     return traces[0]
 
 
@@ -358,7 +358,7 @@ def _uniform(recording: Recording, step: float | None, read: Mapping[str, bool] 
         message = f"the signals of `{name}` follow {len(groups)} clocks"
         usual = [usual_step(s.clock.astype(np.float64).reshape(-1)) for s in groups if s.clock is not None]
         help_ = (resample_advice(min((each for each in usual if each > 0), default=0.0)),)
-        raise TraceError(Diagnostic("E602", message, help=help_))
+        raise TraceError.of("E602", message, help=help_)
     (group,) = groups
     known_step = recording.meta.dt if step is None else step
     others = (*group.arrays, *recording.others)
@@ -366,7 +366,7 @@ def _uniform(recording: Recording, step: float | None, read: Mapping[str, bool] 
     if step is not None and abs(dt - step) > 1e-3 * step:
         message = f"`{name}` has a sample every {dt:.6g} s, not every {step:.6g} s"
         help_ = ("leave out --dt: the file says what its step is",)
-        raise TraceError(Diagnostic("E602", message, help=help_))
+        raise TraceError.of("E602", message, help=help_)
     if not group.arrays and read:  # the monitor tells what is missing
         return _trace(recording, t0, dt, {})
     data = fit(name, group.arrays, samples)
@@ -403,7 +403,7 @@ def save_trace(path: Path | str, trace: Trace) -> None:
     check_writable(path)
     taken = [name for name in trace.data if name in RESERVED or name.startswith(EXTRA)]
     if taken:
-        raise TraceError(Diagnostic("E605", f"a recorded signal cannot be called `{taken[0]}`"))
+        raise TraceError.of("E605", f"a recorded signal cannot be called `{taken[0]}`")
     format_of(Path(path)).function("write")(path, trace)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.trace.clocks import Candidate, ClockSetting, candidates
 from stlc.trace.formats.registry import MAX_LETTERS
 from stlc.trace.formats.table import GROUPS
@@ -50,7 +50,7 @@ class OneTrace:
     def error(self, traces: str) -> TraceError:
         """Return the error E605: the table holds several traces; `traces` says which or how many."""
         message = f"`{self.name}` holds {traces}; in pieces only one can be read"
-        return TraceError(Diagnostic("E605", message, help=("put each trace into a file of its own",)))
+        return TraceError.of("E605", message, help=("put each trace into a file of its own",))
 
 
 def separated(
@@ -92,7 +92,7 @@ def separated(
     if not parts:
         known = ", ".join(sorted({_label(key) for key in arrays[named[0]][:1000].tolist()})[:8])
         message = f"`{recording.name}` holds no object `{group}`"
-        raise TraceError(Diagnostic("E601", message, note=(f"{named[0]}: {known}, …",)))
+        raise TraceError.of("E601", message, note=(f"{named[0]}: {known}, …",))
     return parts
 
 
@@ -126,7 +126,7 @@ def _telling(
         message = (
             f"which of {', '.join(f'`{n}`' for n in names)} tells the objects in `{recording.name}` apart?"
         )
-        raise TraceError(Diagnostic("E601", message, help=(f"--group {names[0]}",)))
+        raise TraceError.of("E601", message, help=(f"--group {names[0]}",))
     return list(fitting)[:1]
 
 
@@ -156,7 +156,7 @@ def _require_no_runs(recording: Recording, best: Candidate) -> None:
             "--group NAME  judges the runs or objects that a column tells apart, a trace each",
             f"--clock NAME  names the clock, if it is not `{best.name}`",
         )
-        raise TraceError(Diagnostic("E602", message, help=help_))
+        raise TraceError.of("E602", message, help=help_)
 
 
 def _split(
@@ -168,13 +168,13 @@ def _split(
     for name, values in zip(named, keys, strict=True):
         if values.dtype.kind == "U" and (np.char.str_len(values) >= MAX_LETTERS).any():
             message = f"objects in `{recording.name}` have names of {MAX_LETTERS} letters or more in `{name}`"
-            raise TraceError(Diagnostic("E605", message, help=("number them",)))
+            raise TraceError.of("E605", message, help=("number them",))
     coded = [np.unique(values, return_inverse=True) for values in keys]
     codes = np.ravel_multi_index([inverse for _, inverse in coded], tuple(len(labels) for labels, _ in coded))
     different, first, sizes = np.unique(codes, return_index=True, return_counts=True)
     if len(different) > MAX_TRACKS:
         message = f"`{','.join(named)}` tells {len(different):,} objects in `{recording.name}` apart"
-        raise TraceError(Diagnostic("E605", message, help=("--group none  if the table is one trace",)))
+        raise TraceError.of("E605", message, help=("--group none  if the table is one trace",))
     order = np.argsort(codes, kind="stable")
     if not one and len(set(sizes.tolist())) == 1:
         rows = order.reshape(len(different), -1)

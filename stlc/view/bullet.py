@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stlc.controller.sketch import DECIDED, NOTE, deciders
 from stlc.controller.stage import Ball, Stage
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import MissingError
 from stlc.dynamics.declaration.kinematics import read_urdf, robot_of
 from stlc.extras import not_installed
 from stlc.view.scene import Scene
@@ -96,7 +96,7 @@ def require_window() -> None:
         raise not_installed("pybullet", need="a window needs")
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         advice = ("leave `--window` out: the animation shows the same, and needs no display",)
-        raise MissingError(Diagnostic("R302", "there is no display for a window", help=advice))
+        raise MissingError.of("R302", "there is no display for a window", help=advice)
 
 
 class Renderer:

@@ -161,7 +161,7 @@ def _example_files(name: str) -> dict[str, str]:
     specs = [path for path, system in _pairs() if name in (system.removesuffix(".yaml"), path.stem)]
     if not specs:
         advice, note = did_you_mean(name, examples()), (f"there are {', '.join(examples())}",)
-        raise UsageError(Diagnostic("U101", f"there is no example `{name}`", help=advice, note=note))
+        raise UsageError.of("U101", f"there is no example `{name}`", help=advice, note=note)
     files: dict[str, str] = {}
     judges = [SPECS / judge for _, system in _pairs(specs) for judge in _JUDGE.findall(_installed(system))]
     for path in dict.fromkeys((*specs, *judges)):

@@ -100,7 +100,7 @@ def _known(error: BaseException) -> StlcError | None:
         case OSError():
             return _from_system(error)
         case MemoryError():
-            return MissingError(Diagnostic("R202", "there is not enough memory"))
+            return MissingError.of("R202", "there is not enough memory")
         case ModuleNotFoundError():
             return absent(error)
     if callable(getattr(error, "format_message", None)):
@@ -112,9 +112,9 @@ def _from_system(error: OSError) -> StlcError | None:
     reason = os_reason(error)
     place = f" `{error.filename}`" if error.filename is not None else ""
     if error.errno in _NO_WRITING:
-        return MissingError(Diagnostic("R201", f"cannot use{place or ' a file'}: {reason}"))
+        return MissingError.of("R201", f"cannot use{place or ' a file'}: {reason}")
     if error.errno in _NO_FILE and place:
-        return UsageError(Diagnostic("U102", f"cannot open{place}: {reason}"))
+        return UsageError.of("U102", f"cannot open{place}: {reason}")
     return None
 
 
@@ -140,7 +140,7 @@ def _crash(error: BaseException, argv: Sequence[str]) -> StlcError:
     path = _write_report(error, argv)
     note = "no crash report could be written" if path is None else f"the crash report is {path}"
     advice = () if path is None else ("report it with that file",)
-    return BugError(Diagnostic("B001", f"a bug in stlc: {headline}", note=(note,), help=advice))
+    return BugError.of("B001", f"a bug in stlc: {headline}", note=(note,), help=advice)
 
 
 def _write_report(error: BaseException, argv: Sequence[str]) -> Path | None:

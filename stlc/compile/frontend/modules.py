@@ -182,4 +182,4 @@ def _stem(written: ast.Import) -> str:
 
 
 def _refused(written: ast.Import, message: str, *help_: str, note: str = "") -> SpecError:
-    return SpecError(Diagnostic("E106", message, written.span, help=help_, note=(note,) if note else ()))
+    return SpecError.of("E106", message, written.span, help=help_, note=(note,) if note else ())

@@ -21,7 +21,7 @@ from stlc.controller.deployment.world_errors import blamed, require_numbers, sce
 from stlc.controller.guard.candidates import Limits, RobustnessMargins
 from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import Charting, Choosing, Redrawing, WorldType
-from stlc.diagnostics import Diagnostic, RunError, SystemFileError
+from stlc.diagnostics import RunError, SystemFileError
 from stlc.dynamics.uncertainty.disturbance import Disturbance
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ class Worlds:
         )
         weaker = ("`--set test.starts=savable` asks for a safe plan",) if starts == "feasible" else ()
         ways = (*weaker, "`--set test.starts=any` takes them all")
-        raise RunError(Diagnostic("R405", message, help=ways))
+        raise RunError.of("R405", message, help=ways)
 
     def advance(self, x: Tensor, action: Tensor, step: int) -> Tensor:
         """Simulate step number `step` in all worlds and return the next states, (rows, n).
@@ -325,13 +325,11 @@ class Worlds:
 
 
 def _cannot_redraw(world: object, test: TestDecl) -> SystemFileError:
-    return SystemFileError(
-        Diagnostic(
-            "S211",
-            f"the world `{type(world).__name__}` cannot draw the start of one agent again",
-            None if test.world is None else test.world.span,
-            label="named here",
-            note=(f"`starts: {test.starts}` draws starts again from which no plan is known",),
-            help=("`--set test.starts=any` takes them all", "a method `redraw` gives agents another start"),
-        )
+    return SystemFileError.of(
+        "S211",
+        f"the world `{type(world).__name__}` cannot draw the start of one agent again",
+        None if test.world is None else test.world.span,
+        label="named here",
+        note=(f"`starts: {test.starts}` draws starts again from which no plan is known",),
+        help=("`--set test.starts=any` takes them all", "a method `redraw` gives agents another start"),
     )

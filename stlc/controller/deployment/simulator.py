@@ -14,7 +14,7 @@ from torch import Tensor
 
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.deployment.batched import Setting, Worlds
-from stlc.diagnostics import Diagnostic, RunError
+from stlc.diagnostics import RunError
 
 if TYPE_CHECKING:
     from stlc.controller.guard.guard import Guard, GuardDecision
@@ -333,4 +333,4 @@ def _require_numbers(action: Tensor, x: Tensor, step: int, guard: Guard) -> None
     note = "its state: " + ", ".join(f"{name} = {value:.6g}" for name, value in state)
     help_ = ("`--backup` lets the backup policy act where the policy cannot",) if guard.backup is None else ()
     message = f"the policy's plan at step {step} is not a number, for {len(broken)} of {len(x)} agents"
-    raise RunError(Diagnostic("R402", message, note=(note,), help=help_))
+    raise RunError.of("R402", message, note=(note,), help=help_)

@@ -79,7 +79,7 @@ def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str],
         return
     agent, column = torch.nonzero(bad)[0].tolist()
     message = f"the world gives {x[agent, column]:g} for `{names[column]}` of agent {agent} {when}"
-    raise SystemFileError(Diagnostic("S302", message, _defined_at(world, method), "by this"))
+    raise SystemFileError.of("S302", message, _defined_at(world, method), "by this")
 
 
 def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | None) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | N
 def wrong(world: object, method: str, what: str) -> SystemFileError:
     """Return error S207 for `method` of a world; `what` completes the message "`method` of the world …"."""
     message = f"`{method}` of the world {what}"
-    return SystemFileError(Diagnostic("S207", message, _defined_at(world, method), "this method"))
+    return SystemFileError.of("S207", message, _defined_at(world, method), "this method")
 
 
 def _shapes(scene: Mapping[str, NDArray[Any]]) -> dict[str, tuple[int, ...]]:

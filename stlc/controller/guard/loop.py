@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from stlc.controller.guard.guard import Guard, GuardDecision
-from stlc.diagnostics import Diagnostic, RunError
+from stlc.diagnostics import RunError
 
 
 class GuardedLoop:
@@ -54,7 +54,7 @@ class GuardedLoop:
         if x.shape[1:] != (len(names),) or not x.isfinite().all():
             help_ = (f"the columns are {', '.join(names)}",)
             message = f"no decision: a state of shape {given.shape}, or one that is not finite"
-            raise RunError(Diagnostic("R107", message, help=help_))
+            raise RunError.of("R107", message, help=help_)
         generator = torch.Generator().manual_seed(self.seed)
         states = system.with_added(x, generator) if before is None else torch.cat((x, self._added), 1)
         self.decision, self._added = self.guard.decide(states, before), system.added_later(states)

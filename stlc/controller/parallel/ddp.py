@@ -21,7 +21,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import MissingError
 
 PATIENCE = timedelta(minutes=10)
 """Timeout of collective operations; building a kernel takes a minute at most."""
@@ -173,10 +173,8 @@ def find_device(name: str) -> torch.device:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0].partition(". ")[0]
-        raise MissingError(
-            Diagnostic(
-                "R302", f"there is no device `{name}` here", help=("use --device cpu",), note=(reason,)
-            )
+        raise MissingError.of(
+            "R302", f"there is no device `{name}` here", help=("use --device cpu",), note=(reason,)
         ) from error
     return device
 
@@ -211,15 +209,13 @@ def joined(device: str) -> Iterator[Ranks]:
 
 def _lost(ranks: Ranks, error: Exception) -> MissingError:
     reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(". ")[0]
-    return MissingError(
-        Diagnostic(
-            "R403",
-            f"a process of this training is gone (rank {ranks.rank} of {ranks.size} noticed)",
-            help=(
-                "see what ended it above, or in the log of its machine; memory and time limits often do",
-                f"torchrun --nproc-per-node {ranks.size} -m stlc train --resume RUN goes on from"
-                " the last checkpoint",
-            ),
-            note=(reason,),
-        )
+    return MissingError.of(
+        "R403",
+        f"a process of this training is gone (rank {ranks.rank} of {ranks.size} noticed)",
+        help=(
+            "see what ended it above, or in the log of its machine; memory and time limits often do",
+            f"torchrun --nproc-per-node {ranks.size} -m stlc train --resume RUN goes on from"
+            " the last checkpoint",
+        ),
+        note=(reason,),
     )

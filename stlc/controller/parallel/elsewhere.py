@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from stlc.controller.parallel.workers import CallFiles
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import MissingError
 from stlc.files import within, write_atomic
 from stlc.version import __version__
 
@@ -165,7 +165,7 @@ class RemoteValue:
         """
         if self.refused:
             help_ = ("install the same version on every machine",)
-            raise MissingError(Diagnostic("R406", self.refused, help=help_))
+            raise MissingError.of("R406", self.refused, help=help_)
         for path, data in (self.outputs or {}).items():
             write_atomic(path, data)
         return self.value

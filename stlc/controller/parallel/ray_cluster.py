@@ -15,7 +15,7 @@ from typing import Any, Self, TextIO, cast
 
 from stlc.controller.parallel.elsewhere import RemoteCall, RemoteValue, answer, linked
 from stlc.controller.parallel.workers import NO_FILES, CallFiles, LostCall
-from stlc.diagnostics import Diagnostic, MissingError
+from stlc.diagnostics import MissingError
 from stlc.extras import needed
 
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
@@ -205,6 +205,4 @@ def _connected(address: str, folder: str | None) -> Any:
 
 
 def _no_cluster(message: str, reason: str, *ways_out: str) -> MissingError:
-    return MissingError(
-        Diagnostic("R302", message, note=tuple(reason.strip().splitlines()[:1]), help=ways_out)
-    )
+    return MissingError.of("R302", message, note=tuple(reason.strip().splitlines()[:1]), help=ways_out)

@@ -102,13 +102,11 @@ def load_checkpoint(run: RunDir, *, spec_hash: str, system_hash: str) -> Checkpo
         ("system_hash", system_hash, "system"),
     ):
         if facts.get(key) != wanted:
-            raise RunError(
-                Diagnostic(
-                    "R102",
-                    f"the checkpoint in `{run.shown}/{FOLDER}` was trained for another {word}",
-                    help=(f"train again, or put the {word} back that the checkpoint was made with",),
-                    note=(f"{word} now {wanted[:12]}, of the checkpoint {str(facts.get(key))[:12]}",),
-                )
+            raise RunError.of(
+                "R102",
+                f"the checkpoint in `{run.shown}/{FOLDER}` was trained for another {word}",
+                help=(f"train again, or put the {word} back that the checkpoint was made with",),
+                note=(f"{word} now {wanted[:12]}, of the checkpoint {str(facts.get(key))[:12]}",),
             )
     try:
         return Checkpoint(load_tensors(data), facts)
@@ -133,13 +131,11 @@ def _read(run: RunDir) -> tuple[dict[str, Any], bytes]:
             written with the scalars.
     """
     if not run.has(f"{FOLDER}/{POINTER}"):
-        raise RunError(
-            Diagnostic(
-                "R101",
-                f"there is no checkpoint in `{run.shown}/{FOLDER}`",
-                help=("train: stlc train SPEC", "an earlier run is named by its number: stlc simulate 7"),
-                note=("nothing has been saved yet, or the run ended before that",),
-            )
+        raise RunError.of(
+            "R101",
+            f"there is no checkpoint in `{run.shown}/{FOLDER}`",
+            help=("train: stlc train SPEC", "an earlier run is named by its number: stlc simulate 7"),
+            note=("nothing has been saved yet, or the run ended before that",),
         )
     facts = run.read_json(f"{FOLDER}/{POINTER}", CheckpointHead)
     name = facts["file"]

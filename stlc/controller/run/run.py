@@ -12,7 +12,7 @@ from stlc.compile.frontend.modules import file_of
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.checkpoint import load_checkpoint, weights
 from stlc.controller.run.config import ResolvedConfig, checked_config
-from stlc.diagnostics import Diagnostic, PluginError, RunError
+from stlc.diagnostics import PluginError, RunError
 from stlc.dynamics.load import load_system_decl
 from stlc.dynamics.scenario import scenario_constants, under
 from stlc.dynamics.system import System
@@ -120,9 +120,7 @@ class Run:
         """
         if self.policy.network is None:
             message = f"the policy of `{self.dir.shown}` has no network that proposes plans"
-            raise RunError(
-                Diagnostic("R101", message, help=("export a run of another `--method`, such as `guided`",))
-            )
+            raise RunError.of("R101", message, help=("export a run of another `--method`, such as `guided`",))
         return self.policy.network
 
     def plan_judged(self, x0: Tensor) -> tuple[Tensor, PlanVerdicts]:
@@ -191,7 +189,7 @@ def load_weights(folder: RunDir, module: Net, prefix: str) -> Net:
         module.load_state_dict(weights(saved, prefix))
     except RuntimeError as error:
         message = f"the checkpoint of `{folder.shown}` does not fit its network"
-        raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
+        raise RunError.of("R101", message, note=(str(error),)) from error
     return module
 
 
@@ -260,7 +258,7 @@ def _unknown(folder: RunDir, registry: PackageRegistry[Any], name: str) -> Plugi
     message = f"run `{folder.shown}` needs the {registry.kind} `{name:.40}`, which stlc does not have"
     note = (f"it came from {source.get('source')}",) if isinstance(source, dict) else ()
     help_ = f"if you trust its file: {variable(registry.group)}={path} stlc …"
-    return PluginError(Diagnostic("S206", message, note=note, help=(help_,)))
+    return PluginError.of("S206", message, note=note, help=(help_,))
 
 
 @dataclass(frozen=True, slots=True)

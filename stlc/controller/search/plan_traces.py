@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.frontend.modules import library_of, spec_sha256
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import UsageError, usage
 from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.trace import Reading, Trace, TraceMeta, load_trace
@@ -114,7 +114,7 @@ def _recorded(task: Task, text: str, count: int | None, seed: int) -> Tensor:
     """
     if not text.strip() or not Path(text).exists():
         help_ = ("random", "x=1, v=2 m/s", "a trace, such as trace.npz")
-        raise UsageError(Diagnostic("U102", f"there is no file `{text}` with initial states", help=help_))
+        raise UsageError.of("U102", f"there is no file `{text}` with initial states", help=help_)
     columns = task.system.signature.columns
     trace = load_trace(text, Reading(words={column.name: words_of(column) for column in columns}))
     rows = min(trace.traces, count or trace.traces)

@@ -18,7 +18,7 @@ from stlc.compile.semantics.switch import Hard
 from stlc.compile.semantics.tolerance import satisfied
 from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import Objective, rolled, without_lost
-from stlc.diagnostics import Diagnostic, RunError, StlcError, SystemFileError
+from stlc.diagnostics import RunError, StlcError, SystemFileError
 from stlc.dynamics.system import System
 
 if TYPE_CHECKING:
@@ -63,12 +63,10 @@ def diagnose(step: TrainingStep) -> StlcError:
         found = check(step)
         if found is not None:
             return found
-    return RunError(
-        Diagnostic(
-            "R401",
-            f"training diverged: the loss or its gradient is not finite at step {step.number}",
-            help=("try a smaller --lr; `stlc compile` shows the dynamics that are rolled out",),
-        )
+    return RunError.of(
+        "R401",
+        f"training diverged: the loss or its gradient is not finite at step {step.number}",
+        help=("try a smaller --lr; `stlc compile` shows the dynamics that are rolled out",),
     )
 
 
@@ -76,13 +74,11 @@ def _plans(step: TrainingStep) -> StlcError | None:
     row = _first(~torch.isfinite(step.u).flatten(1).all(1))
     if row is None:
         return None
-    return RunError(
-        Diagnostic(
-            "R401",
-            f"training diverged: at step {step.number} the network's plans are no numbers",
-            help=("try a smaller --lr",),
-            note=(f"for the start {_state(step, row)}",),
-        )
+    return RunError.of(
+        "R401",
+        f"training diverged: at step {step.number} the network's plans are no numbers",
+        help=("try a smaller --lr",),
+        note=(f"for the start {_state(step, row)}",),
     )
 
 
@@ -97,15 +93,13 @@ def _motion(step: TrainingStep) -> StlcError | None:
     name = step.task.system.names[int(bad[row, when].nonzero()[0])]
     what = "NaN" if bool(states[row, when].isnan().any()) else "infinity"
     then = f"{when} step{'s' * (when > 1)} ({when * step.task.system.dt:.3g} s) after a start"
-    return SystemFileError(
-        Diagnostic(
-            "S302",
-            f"the dynamics of {step.task.system.decl.name} give {what} in `{name}`, {then}",
-            step.task.system.decl.places.get(name),
-            label="declared here",
-            help=("clamp the state, shorten the step, or keep divisors away from 0",),
-            note=(f"from {_state(step, row)}", f"with {_plan(step, row, when)}", _at(step)),
-        )
+    return SystemFileError.of(
+        "S302",
+        f"the dynamics of {step.task.system.decl.name} give {what} in `{name}`, {then}",
+        step.task.system.decl.places.get(name),
+        label="declared here",
+        help=("clamp the state, shorten the step, or keep divisors away from 0",),
+        note=(f"from {_state(step, row)}", f"with {_plan(step, row, when)}", _at(step)),
     )
 
 
@@ -123,15 +117,13 @@ def _robustness(step: TrainingStep) -> StlcError | None:
         for rule, check in zip(rules, checks, strict=True):
             row = _first(bad_of(*check))
             if row is not None:
-                return RunError(
-                    Diagnostic(
-                        "R401",
-                        f"the {what.format(rule.name)} on states that are",
-                        rule.span,
-                        label="this requirement",
-                        help=(way,),
-                        note=(f"from {_state(step, row)}", f"with {_plan(step, row)}", _at(step)),
-                    )
+                return RunError.of(
+                    "R401",
+                    f"the {what.format(rule.name)} on states that are",
+                    rule.span,
+                    label="this requirement",
+                    help=(way,),
+                    note=(f"from {_state(step, row)}", f"with {_plan(step, row)}", _at(step)),
                 )
     return None
 
@@ -152,13 +144,11 @@ def _cost(step: TrainingStep) -> StlcError | None:
         value, slope = _differentiated(step, cost)
         row = _first(~torch.isfinite(value) | ~_finite(slope))
         if row is not None:
-            return RunError(
-                Diagnostic(
-                    "R401",
-                    f"the performance term `{term.name}`, or its gradient, is not a number",
-                    help=("a root, a power, a logarithm or a quotient has no slope at 0: keep away from it",),
-                    note=(f"from {_state(step, row)}", f"with {_plan(step, row)}", _at(step)),
-                )
+            return RunError.of(
+                "R401",
+                f"the performance term `{term.name}`, or its gradient, is not a number",
+                help=("a root, a power, a logarithm or a quotient has no slope at 0: keep away from it",),
+                note=(f"from {_state(step, row)}", f"with {_plan(step, row)}", _at(step)),
             )
     return None
 
@@ -272,16 +262,14 @@ def _compare(task: Task, names: tuple[str, ...], found: Tensor, wanted: Tensor, 
     if float(shares[worst]) <= ODD:
         return
     row = int(off[:, worst].nonzero()[0])
-    raise SystemFileError(
-        Diagnostic(
-            "S304",
-            f"the `mirror` of the policy is not a symmetry: {what} differs in {names[worst]}",
-            task.system.decl.policy.mirror_span,
-            "declared here",
-            help=("write the image of every state and control that changes sides, or leave `mirror` out",),
-            note=(
-                f"{float(found[row, worst]):.6g} instead of {float(wanted[row, worst]):.6g} for one of "
-                f"{SAMPLES} random states, and something of the kind for {float(shares[worst]):.0%} of them",
-            ),
-        )
+    raise SystemFileError.of(
+        "S304",
+        f"the `mirror` of the policy is not a symmetry: {what} differs in {names[worst]}",
+        task.system.decl.policy.mirror_span,
+        "declared here",
+        help=("write the image of every state and control that changes sides, or leave `mirror` out",),
+        note=(
+            f"{float(found[row, worst]):.6g} instead of {float(wanted[row, worst]):.6g} for one of "
+            f"{SAMPLES} random states, and something of the kind for {float(shares[worst]):.0%} of them",
+        ),
     )

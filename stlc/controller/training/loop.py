@@ -26,7 +26,7 @@ from stlc.controller.training.diagnose import check_mirror
 from stlc.controller.training.failures import SHARE, FailureSearch
 from stlc.controller.training.final_evaluation import FinalEvaluation, TrainingOutcome
 from stlc.controller.training.writer import RunWriter
-from stlc.diagnostics import Diagnostic, RunError, StlcError, UsageError, usage
+from stlc.diagnostics import RunError, StlcError, UsageError, usage
 from stlc.native import never
 from stlc.registry import METHODS
 
@@ -256,12 +256,10 @@ def resume(
             return _without_steps(method, task, config, writer, time_, watch)
         learner.steps = steps or learner.steps
         if learner.step >= past.schedule.steps and folder.status == "finished":
-            raise RunError(
-                Diagnostic(
-                    "R103",
-                    f"run `{folder.name}` is finished: {learner.step} of {past.schedule.steps} steps",
-                    help=(f"stlc train --resume {folder.name} --budget 60s goes on",),
-                )
+            raise RunError.of(
+                "R103",
+                f"run `{folder.name}` is finished: {learner.step} of {past.schedule.steps} steps",
+                help=(f"stlc train --resume {folder.name} --budget 60s goes on",),
             )
         writer.before(learner.next_validation)
         time_ = TimeBudget.of(now, started - past.seconds, past.allowed, late)
@@ -277,12 +275,10 @@ def _alone(folder: RunDir, ranks: Ranks) -> Iterator[None]:
     """Context in which no other process trains the run in `folder`. Raises RunError (R109) if one does."""
     with folder.claimed() if ranks.first else nullcontext(True) as own:
         if ranks.any(not own):
-            raise RunError(
-                Diagnostic(
-                    "R109",
-                    f"run `{folder.name}` is being trained by another process",
-                    help=("wait for its end, or end that process: its last checkpoint is kept",),
-                )
+            raise RunError.of(
+                "R109",
+                f"run `{folder.name}` is being trained by another process",
+                help=("wait for its end, or end that process: its last checkpoint is kept",),
             )
         yield
 
@@ -380,13 +376,11 @@ def _require_as_many(before: int, now: int) -> None:
     """
     if before != now:
         start = f"torchrun --nproc-per-node {before} -m stlc" if before > 1 else "stlc"
-        raise UsageError(
-            Diagnostic(
-                "R104",
-                f"the run was trained by {before} process{'es' if before > 1 else ''} together, not by {now}",
-                help=(f"{start} train --resume RUN",),
-                note=("every one of them has states of its own, which the run goes on with",),
-            )
+        raise UsageError.of(
+            "R104",
+            f"the run was trained by {before} process{'es' if before > 1 else ''} together, not by {now}",
+            help=(f"{start} train --resume RUN",),
+            note=("every one of them has states of its own, which the run goes on with",),
         )
 
 

@@ -14,7 +14,7 @@ from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.training.config import TrainConfig, base_config
-from stlc.diagnostics import Diagnostic, RunError, StlcError
+from stlc.diagnostics import RunError, StlcError
 from stlc.native import Stop, never
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ class Learner(ABC):
             has made some of them by the time its loss is known.
         """
         message = f"training diverged: the loss or its gradient is not finite at step {self.step}"
-        return RunError(Diagnostic("R401", message, help=("try a smaller --lr",))), False
+        return RunError.of("R401", message, help=("try a smaller --lr",)), False
 
     def torch_reasons(self) -> Mapping[str, str]:
         """For each part of the training, the reason why this part runs in torch; "" if it runs in C.

@@ -9,7 +9,7 @@ from typing import Literal
 
 from stlc.compile.frontend.scope import External
 from stlc.compile.ir import nodes as ir
-from stlc.diagnostics import Diagnostic, SystemFileError
+from stlc.diagnostics import SystemFileError
 from stlc.dynamics.declaration.kinematics import chain, position, read_urdf
 from stlc.dynamics.declaration.schema.names import Context
 from stlc.dynamics.declaration.schema.record import OF, TEXT, key, read, word
@@ -65,7 +65,7 @@ class FunctionDecl:
         message = (
             f"`{self.name}` takes a vector of {takes} and gives one of {gives}, declared is another form"
         )
-        raise SystemFileError(Diagnostic("S208", message, self.span, "named here", help=(form,)))
+        raise SystemFileError.of("S208", message, self.span, "named here", help=(form,))
 
 
 @dataclass(repr=False, eq=False)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from stlc.compile.frontend.scope import Definition
-from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
+from stlc.diagnostics import StlcError, SystemFileError
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.schema.names import Names, NumberChanges, base_name
 from stlc.dynamics.declaration.schema.yaml_nodes import Mapping as MappingNode
@@ -101,7 +101,7 @@ def _require_carried(
 
 def _refused(what: str, why: str, span: Span, advice: str) -> SystemFileError:
     message = f"{what} may be off, which cannot be simulated or bounded: {why}"
-    return SystemFileError(Diagnostic("S212", message, span, "read here", help=(advice,)))
+    return SystemFileError.of("S212", message, span, "read here", help=(advice,))
 
 
 # ------------------------------------------------------------------------------ places in the file

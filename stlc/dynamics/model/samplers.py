@@ -485,7 +485,7 @@ class _File:
 
     def _refused(self, message: str, note: str = "") -> SystemFileError:
         notes = (note,) if note else ()
-        return SystemFileError(Diagnostic("S303", message, self._decl.span, "named here", note=notes))
+        return SystemFileError.of("S303", message, self._decl.span, "named here", note=notes)
 
 
 def _values(column: Column, arrays: Mapping[str, np.ndarray], recording: Recording) -> np.ndarray | None:

@@ -18,7 +18,7 @@ from stlc.compile.frontend.values import Number
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import multiply
 from stlc.compile.ir.support import columns_in
-from stlc.diagnostics import Diagnostic, SystemFileError, usage
+from stlc.diagnostics import SystemFileError, usage
 from stlc.dynamics.declaration.decl import SystemDecl
 from stlc.dynamics.declaration.motion import Assign
 from stlc.dynamics.declaration.schema.names import Names, NumberChanges, base_name, each_number
@@ -168,7 +168,7 @@ def _without_effect(number: Uncertain, found: SystemKeys, decl: SystemDecl) -> S
         why = f"`{number.text}` is a temperature on a scale, which has no relative error"
     message = f"an uncertain constant without effect: {why}"
     advice = "leave it out of `uncertain`, or list the constants that the dynamics read"
-    return SystemFileError(Diagnostic("S213", message, span, "listed here", help=(advice,)))
+    return SystemFileError.of("S213", message, span, "listed here", help=(advice,))
 
 
 def _factor(name: str) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
-from stlc.diagnostics import Diagnostic, SpecError
+from stlc.diagnostics import SpecError
 from stlc.grammar.fold import MAX_DEPTH
 from stlc.grammar.tokens import Token
 from stlc.grammar.words import BINARY_TEMPORAL, SPACE, UNARY_TEMPORAL
@@ -238,7 +238,7 @@ def _check_depth(text: Text) -> None:
     for token in text.tokens:
         depth += (token.text in _OPENING) - (token.text in _CLOSING)
         if depth > MAX_DEPTH:
-            raise SpecError(Diagnostic("E005", f"brackets are nested more than {MAX_DEPTH} deep"))
+            raise SpecError.of("E005", f"brackets are nested more than {MAX_DEPTH} deep")
 
 
 def _with_commas(text: Text) -> Text:

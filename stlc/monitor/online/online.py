@@ -12,7 +12,7 @@ import numpy as np
 
 from stlc.compile.pipeline import Compiled, CompiledRequirement
 from stlc.compile.semantics.tolerance import TOLERANCE, Status
-from stlc.diagnostics import Diagnostic, TraceError, usage
+from stlc.diagnostics import TraceError, usage
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
 from stlc.monitor.judgement import unknown_requirement
@@ -163,13 +163,13 @@ class Online:
             if laid.samples != 1 or laid.shape:
                 message = f"`{need.column.name}` is one number of a sample, and several are given"
                 note = (f"needed by: {', '.join(need.by)}",)
-                raise TraceError(Diagnostic("E605", message, need.span, note=note))
+                raise TraceError.of("E605", message, need.span, note=note)
             numbers.append(laid.env[need.column.name][0, 0])
         return self.push_block([numbers])[0]
 
     def _no_row(self) -> TraceError:
         message = f"a sample is one number for each of {', '.join(self.signals)}"
-        return TraceError(Diagnostic("E605", message))
+        return TraceError.of("E605", message)
 
     def push_block(self, rows: Floats | Sequence[Any], *, pause: bool = False) -> tuple[int, int]:
         """Add samples, (count, signals); with `pause`, up to the first that decides a start.
@@ -317,7 +317,7 @@ class Online:
             TraceError: E306, `end` is "strict" and the trace is too short; E605, there was no sample.
         """
         if not self.samples:
-            raise TraceError(Diagnostic("E605", "there are no samples"))
+            raise TraceError.of("E605", "there are no samples")
         if self.how.end == "strict":
             grid = self.compiled.grid
             found = (check_length(w.asked.rule, self.samples, self._starts(w), grid) for w in self._watched)

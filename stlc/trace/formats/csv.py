@@ -303,7 +303,7 @@ def write(path: Path | str, trace: Trace) -> None:
     """
     if grouped := [name for name in trace.data if name in GROUPS]:
         message = f"the column `{grouped[0]}` of a `.csv` says which trace a line is of"
-        raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which has no such column",)))
+        raise TraceError.of("E605", message, help=("write a `.npz`, which has no such column",))
     columns: dict[str, NDArray[Any]] = {"t": np.tile(trace.times, trace.traces)}
     if trace.traces > 1:
         columns = {GROUPS[0]: np.repeat(np.arange(trace.traces), trace.samples), **columns}
@@ -326,7 +326,7 @@ def write_csv(path: Path | str, columns: Mapping[str, NDArray[Any]], units: Mapp
     if _names_in(heads) != names:
         odd = next((name for name in names if _names_in([name]) != [name]), names[0])
         message = f"no column of a `.csv` can be called `{odd}`"
-        raise TraceError(Diagnostic("E605", message, help=("write a `.npz`, which holds any name",)))
+        raise TraceError.of("E605", message, help=("write a `.npz`, which holds any name",))
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     write_atomic(path, _line(heads) + "".join(f"{','.join(map(repr, row))}\n" for row in rows))
 

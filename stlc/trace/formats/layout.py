@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.escape import from_spreadsheet
 from stlc.source import Source
 from stlc.trace.formats.cells import bare, is_missing, number_of
@@ -181,7 +181,7 @@ def layout_of(path: Path, data: bytes, wanted: Wanted) -> Layout:
     if layout.names != tuple(split_head(name)[0] for name in names):
         message = f"the file names its columns itself: {', '.join(row.cells)}"
         help_ = ("leave out --columns,  and use  --map SIGNAL=NAME",)
-        raise TraceError(Diagnostic("E605", message, source.span(row.begin, row.end), help=help_))
+        raise TraceError.of("E605", message, source.span(row.begin, row.end), help=help_)
     return _named(header.delimiter, names, (), lines)
 
 
@@ -198,7 +198,7 @@ def _without_numbers(source: Source, tried: Mapping[str, list[_Row]]) -> _Header
     if {"n", "d"} & set(row.kinds):
         help_ = ("--columns t,x,v  names the columns of a file without a header",)
         message = "the first line holds numbers, not names: it must name the columns"
-        raise TraceError(Diagnostic("E605", message, source.span(row.begin, row.end), help=help_))
+        raise TraceError.of("E605", message, source.span(row.begin, row.end), help=help_)
     return _Header((True, True), mark, row)
 
 
@@ -210,7 +210,7 @@ def _without_header(source: Source, tried: Mapping[str, list[_Row]], names: Sequ
                 return _named(mark, names, (), source.text.count("\n", 0, row.begin))
     most = max((len(row.cells) for rows in tried.values() for row in rows if row.is_data), default=0)
     message = f"the lines of `{source.name}` have {most} numbers, --columns names {len(names)} columns"
-    raise TraceError(Diagnostic("E605", message, help=("an empty name leaves a column out: `t,,v`",)))
+    raise TraceError.of("E605", message, help=("an empty name leaves a column out: `t,,v`",))
 
 
 def _named(delimiter: str, heads: Sequence[str], units: Sequence[str], lines: int) -> Layout:

@@ -503,7 +503,7 @@ class Log:
             message = f"message {odd + 1:,} of `{topic}` is stamped {when}, {years:.0f} years off the others"
             other = "header.stamp" if clock in (LOG, PUBLISH) else LOG
             ways_out = (f"--clock {other}  takes other times", "or leave the message out of the file")
-            raise TraceError(Diagnostic("E602", message, help=ways_out))
+            raise TraceError.of("E602", message, help=ways_out)
         return order
 
     def _others(self, read: set[str]) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 import numpy.lib.format as npy
 
-from stlc.diagnostics import Diagnostic, TraceError
+from stlc.diagnostics import TraceError
 from stlc.files import atomic_path, opened_regular
 from stlc.signature import Column
 from stlc.trace.formats.arrays import Array, Arrays, no_letters
@@ -210,7 +210,7 @@ def chunks(path: Path, samples: int, wanted: Wanted = ALL) -> Iterator[Recording
         for name, member in read.items():
             if member.length != max(length, 0):
                 why = f"`{name}` in `{path}` is not one value per sample: it cannot be read in pieces"
-                raise TraceError(Diagnostic("E605", why))
+                raise TraceError.of("E605", why)
         members = {name: member for name, member in members.items() if member.length == length}
         share = min(samples, length) / max(length, 1)
         require_room(path, int(share * sum(member.size for member in members.values())), chunk=True)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.diagnostics import Diagnostic, TraceError, UsageError
+from stlc.diagnostics import TraceError, UsageError
 from stlc.extras import needed
 from stlc.files import atomic_path
 from stlc.signature import MAX_COMPONENTS
@@ -50,7 +50,7 @@ class _Opened:
 def _open(path: Path, wanted: Wanted) -> _Opened:
     parquet = needed("pyarrow.parquet")
     if not path.is_file():
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: no such file or directory"))
+        raise UsageError.of("U102", f"cannot read `{path}`: no such file or directory")
     found, kinds = Arrays(wanted), {}
     with damage(path):
         file = parquet.ParquetFile(path, memory_map=True)
@@ -149,7 +149,7 @@ def _recording(path: Path, opened: _Opened, table: Any) -> Recording:
             continue
         for part in values:
             if part in found.kept:
-                raise TraceError(Diagnostic("E605", f"two columns of `{path}` are called `{part}`"))
+                raise TraceError.of("E605", f"two columns of `{path}` are called `{part}`")
             found.kept[part], found.units[part] = values[part], unit or noted
     return found.recording(path)
 

@@ -20,7 +20,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from stlc.diagnostics import Diagnostic, StlcError, TraceError, UsageError
+from stlc.diagnostics import StlcError, TraceError, UsageError
 from stlc.extras import needed
 from stlc.registry import PackageRegistry
 
@@ -110,7 +110,7 @@ def suffixes() -> tuple[str, ...]:
 
 def unreadable(path: Path | str, why: str, *, advice: str = "") -> TraceError:
     """Return the error E603: the file cannot be read, or is not safe to read; `advice` is a help."""
-    return TraceError(Diagnostic("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ()))
+    return TraceError.of("E603", f"cannot read `{path}`: {why}", help=(advice,) if advice else ())
 
 
 @contextmanager
@@ -120,7 +120,7 @@ def opened(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         why = (error.strerror or type(error).__name__).lower()
-        raise UsageError(Diagnostic("U102", f"cannot read `{path}`: {why}")) from None
+        raise UsageError.of("U102", f"cannot read `{path}`: {why}") from None
 
 
 @contextmanager

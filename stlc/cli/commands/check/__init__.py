@@ -17,7 +17,7 @@ from stlc.cli.commands.check import options as given
 from stlc.cli.framework.options import FailUnderOption, JsonOption, require_separate
 from stlc.cli.framework.output import QUIET, Answer, emit, say, show_diagnostics, wants_color
 from stlc.cli.framework.program import command
-from stlc.diagnostics import Diagnostic, UsageError, usage
+from stlc.diagnostics import UsageError, usage
 from stlc.escape import visible
 from stlc.files import SPEC_SUFFIXES, STDIN, has_wildcard, matching_traces, real, write_atomic
 from stlc.jsontext import plain
@@ -336,7 +336,7 @@ def _expanded(names: Sequence[str], written: Sequence[Path]) -> list[str]:
             if match not in known and Path(match).suffix not in SPEC_SUFFIXES and own.isdisjoint(places):
                 found.append(match)
     if not found:
-        raise UsageError(Diagnostic("U102", f"no trace matches `{names[0]}`"))
+        raise UsageError.of("U102", f"no trace matches `{names[0]}`")
     return found
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stlc.cli.commands.check.options import Judging
-from stlc.diagnostics import Diagnostic, StlcError, UsageError, usage
+from stlc.diagnostics import StlcError, UsageError, usage
 from stlc.files import find_spec, find_system, read_source
 from stlc.jsontext import dumps
 from stlc.monitor.check import Question, monitor_of
@@ -120,7 +120,7 @@ def _result(path: Path) -> Mapping[str, Any]:
         if not isinstance(result, dict) or not isinstance(result.get("files", []), list):
             raise TypeError("its result is no record")
     except OSError as error:
-        raise UsageError(Diagnostic("U102", f"`{path}` cannot be read: {error}")) from None
+        raise UsageError.of("U102", f"`{path}` cannot be read: {error}") from None
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         message = f"`{path}` is no output of `stlc check --json`: {error}"
         raise usage(message, "stlc check SPEC TRACE --json > RESULT.json") from None
@@ -132,6 +132,6 @@ def _require_same(result: Path, name: str, digest: str) -> None:
     path = Path(name)
     if not (path.is_file() or path.is_dir()):
         message = f"`{name}`, from which {result} was made, is not here"
-        raise UsageError(Diagnostic("U102", message, help=("run it in the folder of the first check",)))
+        raise UsageError.of("U102", message, help=("run it in the folder of the first check",))
     if _file(path).sha256 != digest:
-        raise UsageError(Diagnostic("U102", f"`{name}` has changed since {result} was made"))
+        raise UsageError.of("U102", f"`{name}` has changed since {result} was made")

@@ -18,7 +18,7 @@ from stlc.cli.framework.output import Answer, say, show_diagnostics
 from stlc.cli.framework.program import command
 from stlc.controller.training.budget import StepSchedule
 from stlc.controller.training.options import TrainOptions
-from stlc.diagnostics import Diagnostic, MissingError, StlcError, UsageError, usage
+from stlc.diagnostics import MissingError, StlcError, UsageError, usage
 from stlc.options import (
     NONE_GIVEN,
     RUNS,
@@ -243,7 +243,7 @@ def _refuse_on_resume(own: Mapping[str, object], changed: Mapping[str, object]) 
     if named:
         message = f"{', '.join(named)} cannot change when a run is resumed"
         advice = ("stlc train --resume RUN [--steps N | --budget TIME]", "a new run takes any option")
-        raise UsageError(Diagnostic("R104", message, help=advice))
+        raise UsageError.of("R104", message, help=advice)
 
 
 # ------------------------------------------------------------------- several ranks

@@ -10,7 +10,7 @@ from stlc.controller.run.config import ResolvedConfig
 from stlc.controller.search.planner_policy import PlannerChoice, PlannerPolicy, planner_of, planner_policy
 from stlc.controller.training.config import TrainConfig, base_config
 from stlc.controller.training.method import Method
-from stlc.diagnostics import Diagnostic, RunError
+from stlc.diagnostics import RunError
 from stlc.registry import PLANNERS
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class PlanMethod(Method):
             given = {str(name): str(value) for name, value in json.loads(config.options).items()}
         except (ValueError, AttributeError, RecursionError) as error:
             message = f"the options of the planner of `{run.shown}` are damaged"
-            raise RunError(Diagnostic("R101", message, note=(str(error),))) from error
+            raise RunError.of("R101", message, note=(str(error),)) from error
         choice = PlannerChoice(config.planner, given, config.seconds, config.evaluations or None)
         return planner_policy(task, choice, seed=config.seed)
 

@@ -166,7 +166,7 @@ def load_yaml(source: Source, *, sink: list[Diagnostic]) -> Mapping:
         stop = min(node.span.end, source.text.find("\n", start) % (len(source.text) + 1))
         problem, span = "not a mapping of keys to values", source.span(start, max(stop, start + 1))
         advice = "a system file consists of lines `key: value`"
-    raise SystemFileError(Diagnostic("S100", f"`{source.name}` is {problem}", span, help=(advice,)))
+    raise SystemFileError.of("S100", f"`{source.name}` is {problem}", span, help=(advice,))
 
 
 def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
@@ -189,12 +189,10 @@ def load_node(source: Source, *, sink: list[Diagnostic]) -> Node | None:
     except yaml.reader.ReaderError as error:
         offset = min(int(error.position), len(source.text))
         char = source.text[offset : offset + 1]
-        raise SystemFileError(
-            Diagnostic(
-                "S100",
-                f"a character that YAML does not allow: U+{ord(char or chr(0)):04X}",
-                source.span(offset, offset + 1),
-            )
+        raise SystemFileError.of(
+            "S100",
+            f"a character that YAML does not allow: U+{ord(char or chr(0)):04X}",
+            source.span(offset, offset + 1),
         ) from None
 
 
@@ -248,7 +246,7 @@ class _Builder:
 
     def refuse(self, event: Any, message: str, *help_: str) -> SystemFileError:
         """Return an S100 error with the given message and advice, located at `event`."""
-        return SystemFileError(Diagnostic("S100", message, self.span(event), help=help_))
+        return SystemFileError.of("S100", message, self.span(event), help=help_)
 
     def span(self, start: Any, end: Any = None) -> Span:
         """Return the source location from event `start` to event `end`, without trailing blanks.
@@ -343,9 +341,7 @@ class _Builder:
             return value.entries
         if isinstance(value, Sequence) and all(isinstance(item, Mapping) for item in value.items):
             return tuple(entry for item in value.items if isinstance(item, Mapping) for entry in item.entries)
-        raise SystemFileError(
-            Diagnostic("S100", "`<<` merges mappings; this is none", key.span.to(value.span))
-        )
+        raise SystemFileError.of("S100", "`<<` merges mappings; this is none", key.span.to(value.span))
 
     def duplicate(self, key: Scalar, first: Scalar) -> None:
         """Report S102 for a key that occurs twice in one mapping, with both source locations."""
