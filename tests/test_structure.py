@@ -10,8 +10,8 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463230
-CROSSINGS = 5.79
+NODES = 463051
+CROSSINGS = 5.73
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {
     "numbers of one step": 5,

@@ -26,7 +26,6 @@ from stlc.controller.guard.candidates import (
     POLICY,
     REPAIRED,
     Candidates,
-    RobustnessMargins,
     finite,
     first,
 )
@@ -37,7 +36,7 @@ from stlc.dynamics.model.samplers import seeded
 from stlc.runtime.decision import best
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from stlc.controller.guard.kind import GuardInputs, GuardKind
     from stlc.controller.policies.policy import Policy
@@ -83,7 +82,7 @@ class Certifier:
         return self._tubes.safe(x, plans, steps=self.task.system.decl.test.replan)
 
     @torch.no_grad()
-    def sought(self, policy: Policy, least: RobustnessMargins) -> Task:
+    def sought(self, policy: Policy, least: Mapping[str, float]) -> Task:
         """Return the task with margins of safety, for which a search on the model finds certified plans.
 
         The margin of a requirement at the end of a plan is a quantile of the robustness that plans of the

@@ -105,7 +105,7 @@ def test_what_is_none_of_them(make: Make, before: str, after: str, words: str) -
 
 
 def test_a_share_of_a_temperature_is_not_wrong(make: Make) -> None:
-    from stlc.dynamics.uncertainty.perturbed import perturbable
+    from stlc.dynamics.declaration.perturbable import perturbable
 
     found = perturbable(make(ROOM.format(unit="degC", **RATES)).decl)
     assert {each.text for each in found.numbers} == {"loss", "0.01 K/s", "5 K"}

@@ -30,11 +30,11 @@ from stlc.compile.backends.array.interval_ops import INTERVALS
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.traverse import numbers, subexpressions
 from stlc.diagnostics import usage
+from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.samplers import Drawing
 from stlc.dynamics.model.step import build_step, commands
 from stlc.dynamics.uncertainty.disturbance import ErrorSizes
-from stlc.dynamics.uncertainty.perturbed import perturbable
 
 if TYPE_CHECKING:
     from stlc.compile.augment.timers import Timer

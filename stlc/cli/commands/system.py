@@ -123,8 +123,8 @@ def _roll_out(decl: SystemDecl, steps: int, seed: int) -> tuple[Diagnostic, ...]
     """
     import torch
 
+    from stlc.dynamics.declaration.perturbable import perturbable
     from stlc.dynamics.system import System
-    from stlc.dynamics.uncertainty.perturbed import perturbable
 
     if decl.test.uncertain is not None:
         perturbable(decl)

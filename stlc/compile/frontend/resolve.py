@@ -28,7 +28,6 @@ from stlc.compile.frontend.values import Number, Value, VectorValue
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
-from stlc.compile.ir.ranges import KnownRanges
 from stlc.compile.ir.warnings import contradictions, safety_never_violated, vacuous
 from stlc.diagnostics import Diagnostic, Findings, Label, SpecError
 from stlc.grammar import ast
@@ -325,7 +324,7 @@ def _items(spec: ast.Spec, kind: type[Item]) -> list[Item]:
 
 
 def _requirements(
-    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: KnownRanges
+    spec: ast.Spec, kind: type[ast.Require | ast.Assume], scope: Scope, ranges: Mapping[str, Bounds]
 ) -> tuple[typed.Requirement, ...]:
     """Return the requirements or assumptions (`kind`) that have no errors.
 
@@ -358,7 +357,7 @@ def _requirements(
     return tuple(found)
 
 
-def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope) -> float:
+def _scale(tags: Tags, formula: typed.Formula, ranges: Mapping[str, Bounds], scope: Scope) -> float:
     """Return the number by which the robustness of a requirement is divided, as given by the tag `@scale`.
 
     Raises:
@@ -373,7 +372,7 @@ def _scale(tags: Tags, formula: typed.Formula, ranges: KnownRanges, scope: Scope
 
 
 def _warnings(
-    requirement: typed.Requirement, item: ast.Require, signature: Signature, facts: KnownRanges
+    requirement: typed.Requirement, item: ast.Require, signature: Signature, facts: Mapping[str, Bounds]
 ) -> list[Diagnostic]:
     """Return the warnings about a requirement.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from stlc.compile.frontend.arithmetic import refuse_point
@@ -13,7 +13,7 @@ from stlc.compile.frontend.scope import Failed, Scope
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir import typed
 from stlc.compile.ir.functions import Bounds
-from stlc.compile.ir.ranges import KnownRanges, bounds
+from stlc.compile.ir.ranges import bounds
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
 from stlc.diagnostics import Diagnostic
@@ -33,7 +33,9 @@ def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
     }
 
 
-def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, scope: Scope) -> float:
+def reach_of_formula(
+    formula: typed.Formula, ranges: Mapping[str, Bounds], place: Span, scope: Scope
+) -> float:
     """Return the greatest magnitude that the margin of any predicate in a formula can have.
 
     The margins are computed over the ranges of the signals by interval arithmetic. `place` is the source
@@ -49,7 +51,7 @@ def reach_of_formula(formula: typed.Formula, ranges: KnownRanges, place: Span, s
     return max(found)
 
 
-def reach_of_number(num: ir.Num, ranges: KnownRanges, place: Span, scope: Scope) -> float:
+def reach_of_number(num: ir.Num, ranges: Mapping[str, Bounds], place: Span, scope: Scope) -> float:
     """Return the greatest magnitude that a number can have within the ranges of its signals.
 
     `place` is the source location for the error.

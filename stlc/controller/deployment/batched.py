@@ -18,7 +18,7 @@ from torch import Tensor
 
 from stlc.controller.deployment.tape import Tape
 from stlc.controller.deployment.world_errors import blamed, require_numbers, scene_of, states_of, wrong
-from stlc.controller.guard.candidates import Limits, RobustnessMargins
+from stlc.controller.guard.candidates import Limits
 from stlc.controller.search.feasibility import solvable, viable
 from stlc.controller.world import Charting, Choosing, Redrawing, WorldType
 from stlc.diagnostics import RunError, SystemFileError
@@ -65,7 +65,7 @@ class Setting:
     replan: int = 1
     limit: float | None = 0.1
     known_feasible: int = 0
-    margin: RobustnessMargins = field(default_factory=dict)
+    margin: Mapping[str, float] = field(default_factory=dict)
     paper_limit: float | None = None
     draws: tuple[NDArray[np.float64], ...] | None = None
 

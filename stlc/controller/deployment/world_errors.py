@@ -22,8 +22,6 @@ from stlc.source import Source, Span
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from stlc.controller.sketch import Scene
-
 
 @contextmanager
 def blamed(world: object, method: str, what: str) -> Iterator[None]:
@@ -82,7 +80,9 @@ def require_numbers(world: object, method: str, x: Tensor, names: Sequence[str],
     raise SystemFileError.of("S302", message, _defined_at(world, method), "by this")
 
 
-def scene_of(world: object, given: Scene, before: Mapping[str, NDArray[Any]] | None) -> dict[str, Any]:
+def scene_of(
+    world: object, given: Mapping[str, NDArray[Any]], before: Mapping[str, NDArray[Any]] | None
+) -> dict[str, Any]:
     """Convert the snapshot `given` to arrays, and compare their names and shapes with the previous snapshot.
 
     `before`: the previous snapshot; None for the first one.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from time import perf_counter
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -20,9 +20,6 @@ from stlc.runtime.prefixes import PrefixGrid
 
 if TYPE_CHECKING:
     from stlc.controller.problem.task import Task
-
-RobustnessMargins: TypeAlias = Mapping[str, float]
-"""Safety requirement -> required robustness margin, in its unit; 0 for requirements left out."""
 
 SOURCES = ("policy", "backup", "safest", "polished")
 TARGET_SHARE = 0.05
@@ -231,7 +228,7 @@ class Limits:
     guesses: int = 8
     again: int = 2000
     rescue: bool = True
-    margin: RobustnessMargins = field(default_factory=dict)
+    margin: Mapping[str, float] = field(default_factory=dict)
     paper: float | None = None
 
 

@@ -31,12 +31,11 @@ from stlc.registry import GUARDS, closest
 
 if TYPE_CHECKING:
     from stlc.compile.pipeline import CompiledRequirement
-    from stlc.controller.guard.candidates import RobustnessMargins
     from stlc.controller.policies.policy import Policy
 
 
 def with_margins(
-    task: Task, margin: RobustnessMargins, ramp: Mapping[str, float] = MappingProxyType({})
+    task: Task, margin: Mapping[str, float], ramp: Mapping[str, float] = MappingProxyType({})
 ) -> Task:
     """Return the task with tightened safety requirements: the robustness of each is reduced by its margin.
 
@@ -83,7 +82,9 @@ SEED = 20_251
 
 
 @torch.no_grad()
-def calibrated_margins(task: Task, policy: Policy, steps: int = 1, share: float = SHARE) -> RobustnessMargins:
+def calibrated_margins(
+    task: Task, policy: Policy, steps: int = 1, share: float = SHARE
+) -> Mapping[str, float]:
     """Compute a margin for each safety requirement from the robustness that safe plans lose when executed.
 
     Args:
@@ -148,7 +149,7 @@ class MarginRequest:
     named: Mapping[str, float] = field(default_factory=dict)
     share: float | None = None
 
-    def of(self, task: Task, policy: Policy, guard: str, replan: int = 1) -> RobustnessMargins:
+    def of(self, task: Task, policy: Policy, guard: str, replan: int = 1) -> Mapping[str, float]:
         """Return the requested margin of each safety requirement, without margins of 0.
 
         The margin of a requirement is its entry in the attribute `named`. If it has none, its calibrated

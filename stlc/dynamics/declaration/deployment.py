@@ -257,7 +257,7 @@ class ErrorsDecl:
     """Errors of actuators, parameters and sensors in a scenario, as fractions (0.1 is 10 %).
 
     The error of a control that is a direction (`squash: angle`) is a fraction of one radian. Parameters are
-    the numbers in the dynamics (see `stlc.dynamics.uncertainty.perturbed`). States with the unit second are
+    the numbers in the dynamics (see `stlc.dynamics.declaration.perturbable`). States with the unit second are
     clocks and have no error.
     """
 

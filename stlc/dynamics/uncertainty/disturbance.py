@@ -14,8 +14,9 @@ from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.switch import Hard
 from stlc.dynamics.declaration.deployment import ErrorsDecl, EventDecl
+from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.model.samplers import Drawing, Rows, seeded
-from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
+from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
 from stlc.units import parse_unit
 
 if TYPE_CHECKING:

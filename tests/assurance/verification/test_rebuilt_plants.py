@@ -23,9 +23,10 @@ from stlc.controller.problem.task import Task
 from stlc.controller.search.plan_traces import RANDOM, following
 from stlc.controller.world import ModelWorld
 from stlc.diagnostics import SystemFileError
+from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
-from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
+from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
 from stlc.grammar.parser import parse
 from stlc.source import Source
 

@@ -15,12 +15,13 @@ from stlc.assurance.verification.tubes import DEVIATIONS, TubeModel, tube
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.controller.problem.task import Task
 from stlc.diagnostics import UsageError
+from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.model.samplers import Drawing
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
 from stlc.dynamics.uncertainty.disturbance import Disturbance, ErrorSizes
-from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
+from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
 from stlc.files import read_source
 from stlc.grammar.parser import parse
 from stlc.source import Source

@@ -10,10 +10,11 @@ import torch
 from stlc.compile.ir.support import columns_in
 from stlc.diagnostics import SystemFileError, UsageError
 from stlc.dynamics.declaration.decl import SystemDecl
+from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.load import load_system_decl, parse_system
 from stlc.dynamics.scenario import under
 from stlc.dynamics.system import System
-from stlc.dynamics.uncertainty.perturbed import PerturbedSystem, perturbable
+from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
 from stlc.source import Source
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
