@@ -11,7 +11,7 @@ from helpers.tools import ROOT, load_tool
 
 from stlc.toolchain import compiler
 
-probes = load_tool("probes")
+probes, faces = load_tool("probes"), load_tool("faces")
 LAGGING = 0
 
 
@@ -34,7 +34,7 @@ def test_every_face_follows(probe: Any, plain: dict[str, Any], tmp_path: Path) -
 def test_each_meaning_has_one_place(probe: Any) -> None:
     assert (ROOT / "stlc" / probe.place).read_text(encoding="utf-8").count(probe.old) == 1
     assert probe.new != probe.old
-    assert set(probe.faces) <= probes.FACES.keys()
+    assert set(probe.faces) <= faces.FACES.keys()
 
 
 def test_what_lags_is_held_by_a_test() -> None:

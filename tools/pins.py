@@ -4,10 +4,9 @@
     python tools/pins.py check before
     python tools/pins.py check before --only guards --only verdicts --tolerance 1e-9
 
-`write` stores the golden results (pins) of every part below a folder: JSON with full-precision floats, and
-text. `check` computes them again and prints each difference: the pin, the old and the new value. Use it on
-one machine before and after a refactoring; between machines the last digits of floats differ
-(`tests/test_pins.py` pins portable results). Exit code: 0 no difference, 1 differences, 2 a usage error.
+`write` stores golden results (pins): JSON with all digits of floats, and text. `check` computes them again,
+and prints each difference. Use it on one machine: elsewhere the last digits of floats differ. Exit code: 0 no
+difference, 1 differences, 2 a usage error. `tests/test_pins.py` pins portable results.
 
 The parts:
 
@@ -20,8 +19,7 @@ The parts:
 - `guards`: decisions of every guard on fixed states, without a time limit.
 - `runs`: simulations, exports, reports and lists of runs.
 
-`plans`, `guards` and `runs` use the policies stored by `write` below DIR/trained, so that they do not depend
-on changes of training; with `--anew`, those that `check` trains. About four minutes of one core.
+`plans`, `guards` and `runs` use the policies that `write` stored; with `--anew`, those that `check` trains.
 """
 
 from __future__ import annotations
