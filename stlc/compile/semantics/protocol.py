@@ -71,7 +71,7 @@ class Associative:
 
     __slots__ = ()
 
-    def lift(self, x: Array, _pick: Pick, _ops: Ops) -> Parts:
+    def lift(self, x: Array, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
         """Return the operands unchanged, as partial results."""
         return (x,)
 
@@ -79,6 +79,6 @@ class Associative:
         """Return the extremum of two partial results."""
         return (self.pair(a[0], b[0], pick, ops),)
 
-    def finish(self, parts: Parts, _pick: Pick, _ops: Ops) -> Array:
+    def finish(self, parts: Parts, pick: Pick, ops: Ops) -> Array:  # noqa: ARG002
         """Return the partial result itself, which is the minimum or maximum of its operands."""
         return parts[0]

@@ -52,7 +52,7 @@ class Hard:
 
     exact: ClassVar[bool] = True
 
-    def indicator(self, rho: Array, strict: bool, _sharpness: float | None, ops: Ops) -> Array:
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """Return 1 where the condition holds, else 0."""
         return ops.number(ops.gt(rho, 0.0) if strict else ops.ge(rho, 0.0), rho)
 
@@ -77,12 +77,12 @@ class Tanh:
     exact: ClassVar[bool] = False
     sharpness: float = 500.0
 
-    def indicator(self, rho: Array, _strict: bool, sharpness: float | None, ops: Ops) -> Array:
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """Return `(1 + tanh(w rho)) / 2`, where w is `sharpness`, or `self.sharpness` if this is None."""
         width = self.sharpness if sharpness is None else sharpness
         return ops.sigmoid(rho * ops.constant(2.0 * width, rho))
 
-    def settle(self, weight: Array, _truth: Array, _ops: Ops) -> Array:
+    def settle(self, weight: Array, truth: Array, ops: Ops) -> Array:  # noqa: ARG002
         """Return `weight` unchanged; where the margin is 0, `weight` is 1/2, both for `>` and for `>=`."""
         return weight
 
@@ -95,14 +95,14 @@ class Tanh:
 class StraightThrough:
     """Exact evaluation of conditions as 0 or 1, with the gradient of `(1 + tanh(slope rho)) / 2`.
 
-    `if cond then a else b` has the value of the branch taken. Its
+    The argument `sharpness` is not used. `if cond then a else b` has the value of the branch taken. Its
     gradient is that of this branch, plus `a - b` times the gradient of the smooth indicator of `cond`.
     """
 
     exact: ClassVar[bool] = False
     slope: float = 10.0
 
-    def indicator(self, rho: Array, strict: bool, _sharpness: float | None, ops: Ops) -> Array:
+    def indicator(self, rho: Array, strict: bool, sharpness: float | None, ops: Ops) -> Array:  # noqa: ARG002
         """Return 1 where the condition holds, else 0, with the gradient of `(1 + tanh(slope rho)) / 2`."""
         return ops.straight_through(rho, strict, self.slope)
 

@@ -76,7 +76,7 @@ class Mean(ABC):
         losses = ops.where(negative, self.loss(ops.where(negative, -x, 0.0), ops), 0.0)
         return x, gains, losses, ops.number(known, x)
 
-    def merge(self, a: Parts, b: Parts, _pick: Pick, ops: Ops) -> Parts:
+    def merge(self, a: Parts, b: Parts, pick: Pick, ops: Ops) -> Parts:  # noqa: ARG002
         """Return the partial result of the union of two disjoint sets of operands.
 
         The least values are combined by a minimum; the sums and the numbers of operands are added.

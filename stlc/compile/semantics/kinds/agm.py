@@ -28,7 +28,7 @@ class ArithmeticGeometricMean(Mean):
         """Return log(1 + x), the term of an operand x > 0 in the sum `gains`."""
         return ops.log1p(x)
 
-    def loss(self, x: Array, _ops: Ops) -> Array:
+    def loss(self, x: Array, ops: Ops) -> Array:  # noqa: ARG002
         """Return x, the term of a negative operand -x in the sum `losses`."""
         return x
 
@@ -36,7 +36,7 @@ class ArithmeticGeometricMean(Mean):
         """Return the geometric mean of `1 + x` minus 1, for operands that are all positive."""
         return ops.expm1(gains / count)
 
-    def violated(self, losses: Array, count: Array, _ops: Ops) -> Array:
+    def violated(self, losses: Array, count: Array, ops: Ops) -> Array:  # noqa: ARG002
         """Return the arithmetic mean of all operands, where positive ones count as 0."""
         return -(losses / count)
 
