@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from stlc.compile.backends.c.streams import TABLES, Streams, runtime, streams_of
 from stlc.compile.backends.numbers import Untranslatable
@@ -62,18 +62,21 @@ class ExportedMonitor:
         return (f"the state takes {self.bytes:,} bytes",)
 
 
-def export_monitor(monitor: Monitor, folder: Path, *, single: bool = False) -> ExportedMonitor:
+def export_monitor(
+    monitor: Monitor, folder: Path, *, at: int | Literal["all"] | None = None, single: bool = False
+) -> ExportedMonitor:
     """Write the monitor of a specification as C.
 
     Args:
         monitor: the monitor.
         folder: destination; existing files of the same names are replaced.
+        at: instants at which the requirements are evaluated, as of `stlc.monitor.online.How`.
         single: whether all numbers are `float`, for targets without doubles.
 
     Raises:
         UsageError: U101, a requirement has no transducers.
     """
-    online = monitor.online(How())
+    online = monitor.online(How(at=at))
     rules = [streamed_rule(each, online.signals) for each in online.asked]
     for asked, rule in zip(online.asked, rules, strict=True):
         if rule is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from stlc.diagnostics import usage
 from stlc.files import SPEC_SUFFIXES, find_spec
@@ -29,6 +29,8 @@ class ExportOptions:
             default float32.
         single: Numbers of a monitor in C: float, for targets without doubles.
         dt: Time step of a monitor; by default the system's.
+        at: Samples at which a monitor judges: all, or the number of one; by default those that requirements
+            prescribe.
     """
 
     to: str = "torch"
@@ -36,6 +38,7 @@ class ExportOptions:
     precision: str | None = None
     single: Annotated[bool, Option(flags=("--float",))] = False
     dt: Seconds | None = None
+    at: str | None = None
     system: SystemName = None
     overrides: Overrides = field(default_factory=dict)
     python: Python = False
@@ -65,10 +68,22 @@ def export(what: Run | ast.Spec | Path | str, options: ExportOptions) -> Exporte
 
         spec = what if isinstance(what, ast.Spec) else find_spec(str(what))
         monitor = Monitor(spec, options.dt, system=options.system, overrides=options.overrides)
-        return export_monitor(monitor, out or Path("export"), single=options.single)
-    if options.single or options.dt or options.system or options.overrides or isinstance(what, ast.Spec):
+        at: Any = options.at
+        if at is not None and at.isdecimal():
+            at = int(at)
+        elif at not in (None, "all"):
+            raise usage(f"`--at {at}` is neither `all` nor the number of a sample")
+        return export_monitor(monitor, out or Path("export"), at=at, single=options.single)
+    if (
+        options.single
+        or options.dt
+        or options.at
+        or options.system
+        or options.overrides
+        or isinstance(what, ast.Spec)
+    ):
         advice = "stlc export SPEC.stl --to c"
-        raise usage("`--float`, `--dt`, `--system` and `--set` belong to a monitor", advice)
+        raise usage("`--float`, `--dt`, `--at`, `--system` and `--set` belong to a monitor", advice)
     from stlc.controller.run.run import Run
     from stlc.export.write import export as write
     from stlc.export.write import precision_of, target_of

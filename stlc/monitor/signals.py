@@ -273,7 +273,8 @@ def plain_columns(given: Given, needs: Sequence[Need], excerpt: Excerpt) -> dict
                 return None
             kept = excerpt.within(samples)
         x = np.ascontiguousarray(x[kept])
-        if np.isnan(x.dot(x)):  # a sum of squares is NaN only where one of them is
+        squares = x.dot(x)
+        if squares != squares:  # NaN, as one of them is
             return None
         env[name] = x[:, None]
     return env if samples and given.keys().isdisjoint(CLOCKS) else None

@@ -22,6 +22,7 @@ from stlc.compile.ir.lower import lower
 from stlc.compile.ir.simplify import simplify
 from stlc.diagnostics import UsageError
 from stlc.export.monitor import _texts, export_monitor
+from stlc.monitor.instants import At
 from stlc.monitor.online.kernel import streamed_rule
 from stlc.monitor.online.online import How, Online
 from stlc.monitor.verdict import Monitor
@@ -61,25 +62,25 @@ def said(program: Path, rows: np.ndarray, names: tuple[str, ...]) -> list[tuple[
 
 
 @pytest.mark.parametrize(
-    ("language", "single"),
+    ("language", "single", "at"),
     [
-        (("-std=c99",), False),
-        (("-x", "c++", "-std=c++17"), True),
-        pytest.param(("-std=c99",), True, marks=pytest.mark.apart),
-        pytest.param(("-x", "c++", "-std=c++17"), False, marks=pytest.mark.apart),
+        (("-std=c99",), False, None),
+        (("-x", "c++", "-std=c++17"), True, 3),
+        pytest.param(("-std=c99",), True, None, marks=pytest.mark.apart),
+        pytest.param(("-x", "c++", "-std=c++17"), False, None, marks=pytest.mark.apart),
     ],
 )
 def test_a_monitor_is_built_without_warnings_and_says_what_python_says(
-    tmp_path: Path, language: tuple[str, ...], single: bool
+    tmp_path: Path, language: tuple[str, ...], single: bool, at: At
 ) -> None:
     monitor = Monitor(SPEC, dt=1.0)
-    assert export_monitor(monitor, tmp_path, single=single).files == (
+    assert export_monitor(monitor, tmp_path, at=at, single=single).files == (
         "demo_monitor.h",
         "demo_monitor.c",
         "main.c",
     )
     rows = np.random.default_rng(0).normal(size=(40, 2)).astype(np.float32).astype(float)
-    online = monitor.online()
+    online = monitor.online(How(at=at))
     online.push_block(rows)
     found = said(built(tmp_path, *language), rows, ("x", "y"))
     wanted = [(each.low, each.high) for each in online.finish().values()]
@@ -122,12 +123,26 @@ def test_random_formulas_under_sanitizers(written, trace) -> None:
     assert found == [(each.low, each.high) for each in online.finish().values()]
 
 
+def test_a_monitor_in_c_judges_at_every_sample(tmp_path: Path) -> None:
+    text = "signal x\nsignal y\nrequire r: always[0, 3 s] (x > -1 or y > 0)\nrequire s: once[0, 2 s] x > 1"
+    monitor, rows = Monitor(text, dt=1.0), np.random.default_rng(1).normal(size=(40, 2))
+    export_monitor(monitor, tmp_path, at="all")
+    online = monitor.online(How(at="all"))
+    online.push_block(rows)
+    tallies = online.finish().values()
+    assert said(built(tmp_path, "-std=c99", *SANITIZED), rows, ("x", "y")) == [
+        (each.low, each.high) for each in tallies
+    ]
+    assert [each.instants for each in tallies] == [37, 40]
+
+
 def test_a_specification_is_exported_without_a_run(tmp_path: Path) -> None:
     spec = tmp_path / "demo.stl"
     spec.write_text(SPEC)
     assert main(["export", str(spec), "--to", "c", "--dt", "1s", "-o", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "demo_monitor.c").is_file()
     assert main(["export", "latest", "--to", "c", "--float"]) == 2
+    assert main(["export", str(spec), "--to", "c", "--dt", "1s", "--at", "soon"]) == 2
 
 
 def test_what_has_no_transducers_is_refused(tmp_path: Path) -> None:

@@ -75,8 +75,10 @@ class StreamKernel:
         self, library: ctypes.CDLL, program: Streams, predicates: ctypes.CDLL, asked: Sequence[Asked]
     ) -> None:
         self.library, self._predicates = library, predicates
-        tables = {name: [number for row in rows for number in row] for name, rows in program.tables.items()}
-        self._arrays = {name: np.array(table or [0], np.int32) for name, table in tables.items()}
+        self._arrays = {
+            name: np.array([number for row in rows for number in row] or [0], np.int32)
+            for name, rows in program.tables.items()
+        }
         places = {name: array.ctypes.data for name, array in self._arrays.items()}
         function = ctypes.cast(predicates.predicates, ctypes.c_void_p)
         self._tables = _Tables(**places, predicates=function, **program.sizes)
@@ -174,8 +176,7 @@ class Streamed:
     @property
     def counted(self) -> tuple[float, float]:
         """Bounds on the robustness at the start that was counted last."""
-        low, high = self._counted()[1][2:4]
-        return low, high
+        return tuple(self._counted()[1][2:4])  # type: ignore[return-value]
 
     def live(self, starts: range) -> JudgedInstants:
         """Bounds and verdicts at starts that are not counted, while the trace continues."""

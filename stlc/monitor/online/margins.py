@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir.support import columns_in
-from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope, satisfied, status_of, violated
+from stlc.compile.semantics.tolerance import StatusInScope, satisfied, status_of, violated
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.recompute import GrowingBounds
 from stlc.monitor.online.tally import Asked
@@ -91,11 +91,6 @@ class _Watched:
         return self.last
 
 
-def _watched(rule: CompiledRequirement, horizon: int | None) -> _Watched:
-    everywhere = rule.windowed and not rule.absolute and horizon is not None
-    return _Watched(Asked(rule, rule, 0, everywhere, horizon, "open", TOLERANCE))
-
-
 class Margins:
     """Robustness margins of every requirement on many traces that grow together.
 
@@ -108,21 +103,16 @@ class Margins:
     """
 
     def __init__(self, rules: Sequence[CompiledRequirement], horizon: int | None) -> None:
-        self._watched = [_watched(rule, horizon) for rule in rules]
+        self._watched = {
+            rule.name: _Watched(
+                Asked(rule, rule, 0, rule.windowed and not rule.absolute and horizon is not None, horizon)
+            )
+            for rule in rules
+        }
         self._names = sorted({name for rule in rules for name in columns_in(rule.formula)})
         self._history = ColumnHistory()
         self._found: dict[str, Margin] = {}
         self._evaluated = 0
-
-    @property
-    def requirements(self) -> tuple[str, ...]:
-        """Names of the requirements, in order."""
-        return tuple(watched.asked.rule.name for watched in self._watched)
-
-    @property
-    def samples(self) -> int:
-        """Number of samples received."""
-        return self._history.samples
 
     def push(self, signals: Mapping[str, Floats]) -> None:
         """Add one sample of every trace: signal name -> values (traces,)."""
@@ -131,9 +121,9 @@ class Margins:
 
     def evaluate(self) -> dict[str, Margin]:
         """Return the margins of every requirement at the latest sample; needs at least one sample."""
-        if self._evaluated != self.samples:
-            found = [each.evaluate(self._history) for each in self._watched]
-            self._found, self._evaluated = dict(zip(self.requirements, found, strict=True)), self.samples
-            needs = [each.bounds.needs(each.next) for each in self._watched]
-            self._history.forget(min(needs, default=self.samples))
+        if self._evaluated != self._history.samples:
+            self._found = {name: each.evaluate(self._history) for name, each in self._watched.items()}
+            self._evaluated = self._history.samples
+            needs = [each.bounds.needs(each.next) for each in self._watched.values()]
+            self._history.forget(min(needs, default=self._evaluated))
         return self._found

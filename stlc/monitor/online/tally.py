@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.semantics.tolerance import Status, satisfied, status_of, violated
+from stlc.compile.semantics.tolerance import TOLERANCE, Status, satisfied, status_of, violated
 from stlc.monitor.online.history import Floats
 from stlc.monitor.values import Ends
 
@@ -37,8 +37,8 @@ class Asked:
     begin: int
     everywhere: bool
     horizon: int | None
-    ending: Ends
-    tolerance: float
+    ending: Ends = "open"
+    tolerance: float = TOLERANCE
 
     @property
     def lag(self) -> int:

@@ -231,6 +231,9 @@ judge(REAL **arrays, const int64_t *shape, int operands, Walk walk, int max, int
 /* The better of two values; the earlier one where they tie. */
 #define BETTER(a, b, max) ((((max) ? (b) > (a) : (b) < (a)) | ((b) != (b))) ? (b) : (a))
 
+/* The same where `b` depends on what was computed before: quicker if `a` is a number. */
+#define CHAINED(a, b, max) ((a) != (a) && (b) == (b) ? (a) : ((max) ? (a) > (b) : (a) < (b)) ? (a) : (b))
+
 /* Extrema of `x` over all rows from one on, values alone; with `left`, `until`. Rows lie beside each other. */
 static inline __attribute__((always_inline)) void
 ended(const REAL *left, const REAL *x, REAL *out, int64_t rows, int64_t count, int64_t traces, int max)
@@ -242,8 +245,8 @@ ended(const REAL *left, const REAL *x, REAL *out, int64_t rows, int64_t count, i
         const REAL *after = out + least(t + 1, count - 1) * traces;
         REAL *to = out + least(t, count - 1) * traces;
         for (int64_t i = 0, at = t * traces; i < traces; i++, at++) {
-            best = BETTER(x[at], traces == 1 ? best : after[i], max);
-            to[i] = best = left ? BETTER(left[at], best, !max) : best;
+            best = CHAINED(x[at], traces == 1 ? best : after[i], max);
+            to[i] = best = left ? CHAINED(left[at], best, !max) : best;
         }
     }
 }
