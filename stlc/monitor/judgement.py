@@ -15,7 +15,7 @@ from stlc.compile.ir.discretize import Horizon
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics, semantics_of
 from stlc.compile.semantics.tolerance import TOLERANCE, End, Status, overall, status_of
-from stlc.diagnostics import Diagnostic, UsageError
+from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.jsontext import Num
 from stlc.monitor.facts.extent import samples_read
 from stlc.monitor.facts.fact import Fact
@@ -720,18 +720,21 @@ def chosen(rules: Sequence[R], names: Sequence[str]) -> tuple[R, ...]:
 
 
 def require_known(names: Sequence[str], known: Sequence[str]) -> None:
-    """Raise UsageError (U101) if one of `names` is not that of a requirement; `known` are their names."""
+    """Raise UsageError (U101) if one of `names` is not that of a requirement; `known` are their names.
+
+    A single text is refused, too: its letters would be the names.
+    """
+    if isinstance(names, str):
+        raise usage("requirements are a list of names", f'["{names}"]')
     for name in names:
         if name not in known:
-            raise unknown_requirement(name, known)
-
-
-def unknown_requirement(name: str, names: Sequence[str]) -> UsageError:
-    """Return the error U101: no requirement is called `name`."""
-    near = closest(name, names)
-    help_ = (f"did you mean `{near}`?",) if near else ()
-    note = (f"requirements: {', '.join(names)}",)
-    return UsageError.of("U101", f"there is no requirement `{name}`", help=help_, note=note)
+            near = closest(name, known)
+            raise UsageError.of(
+                "U101",
+                f"there is no requirement `{name}`",
+                help=(f"did you mean `{near}`?",) if near else (),
+                note=(f"requirements: {', '.join(known)}",),
+            )
 
 
 def _known(status: Status) -> bool | None:

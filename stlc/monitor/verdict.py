@@ -274,10 +274,10 @@ class Monitor:
         at: int | None = None,
         semantics: Semantics | None = None,
     ) -> Prepared:
-        given, recorded = self._read(subject, tuple(require))
+        given, recorded = self._read(subject, require)
         key = (recorded, tuple(require), plain)
         if key not in self._selected:
-            self._selected[key] = _selection(self._ready(recorded), *key[1:])
+            self._selected[key] = _selection(self._ready(recorded), require, plain)
         selected = self._selected[key]
         if isinstance(given, Trace):
             require_windows(given, selected.rules)
@@ -285,13 +285,13 @@ class Monitor:
         record = Record.of(signals.env, signals.ops, signals.cells, semantics)
         return Prepared(selected.compiled, selected.rules, signals, record, cause_of, facts_of)
 
-    def _read(self, given: Subject, names: tuple[str, ...]) -> tuple[Given | Trace, Times]:
+    def _read(self, given: Subject, names: Sequence[str]) -> tuple[Given | Trace, Times]:
         """Return the signals that requirements read (`names` empty: all), and times given with them."""
         recorded = _UNKNOWN
         if not isinstance(given, Trace):
-            if names not in self._readings:
-                self._readings[names] = reading_of(self.spec, read=self.reads(names))
-            reading = self._readings[names]
+            if (key := tuple(names)) not in self._readings:
+                self._readings[key] = reading_of(self.spec, read=self.reads(names))
+            reading = self._readings[key]
             if isinstance(given, (str, Path)):
                 given = load_trace(given, reading)
             elif is_frame(given):

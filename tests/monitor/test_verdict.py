@@ -421,6 +421,9 @@ def test_bad_specifications_and_names() -> None:
     with pytest.raises(UsageError, match="no requirement `giveway`") as caught:
         monitor.check({}, require=["giveway"])
     assert caught.value.diagnostics[0].help == ("did you mean `give_way`?",)
+    with pytest.raises(UsageError, match="a list of names") as letters:
+        Monitor("signal x\nrequire a: x > 0\nrequire b: x > 1\n", dt=1).check({"x": [2.0]}, require="ab")
+    assert letters.value.diagnostics[0].help == ('["ab"]',)
 
 
 # --------------------------------------------------------------------------- signals

@@ -15,7 +15,7 @@ from stlc.compile.semantics.tolerance import TOLERANCE, Status
 from stlc.diagnostics import TraceError, usage
 from stlc.monitor.explain.report import Cause
 from stlc.monitor.instants import At, check_length, starts_of
-from stlc.monitor.judgement import unknown_requirement
+from stlc.monitor.judgement import require_known
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.kernel import Streamed, StreamKernel, streamed_rule
 from stlc.monitor.online.recompute import Recomputed
@@ -355,7 +355,5 @@ class Online:
         return self._buffer.cause(watched.asked.rule, worst)
 
     def _find(self, name: str) -> Watched:
-        for watched in self._watched:
-            if watched.asked.rule.name == name:
-                return watched
-        raise unknown_requirement(name, list(self.requirements))
+        require_known([name], self.requirements)
+        return self._watched[self.requirements.index(name)]
