@@ -222,6 +222,20 @@ def test_what_is_learnt_does_not_follow_comments_and_deployment() -> None:
     assert len({learnt(), *(learnt(*change) for change in changed)}) == len(changed) + 1
 
 
-def test_what_is_learnt_has_the_hash_of_earlier_releases() -> None:
-    rover = load_system_decl(Path(__file__).parents[2] / "examples" / "rover.yaml")
-    assert rover.learnt == "ff3e9e4e7051ab910eff381c70bc51345bc114ab56bac51369c04d3fb67cea83"
+@pytest.mark.parametrize(
+    ("name", "hashed"),
+    [
+        ("car", "42ca1189f4c1eb78642ba2c93e3fac2f72f05edd3255b11fa8d48328c09c3836"),
+        ("maze", "a64209507066dc9ed61a6474c508bae0ba81cfbcf8372375aba16c69a5ba51ff"),
+        ("panda", "4153a81654698a7d6226bf10019d3defe860f30eaab3658bcaa507329e57d170"),
+        ("rover", "ff3e9e4e7051ab910eff381c70bc51345bc114ab56bac51369c04d3fb67cea83"),
+        ("ship_safe", "5d13634a8493039a5ffbaa1dd86286fbff217286d8fad025d1bff86e6640539e"),
+        ("ship_track", "8d6b97b2a52937e7b1ea9b0c1d34f5f7fae7263d0f039762a742af6811bdea1f"),
+        ("unicycle", "27d4ecf200a01d475c7f474cf4627b9ea2c9b6bca38b6e8adbd761b85aa1b055"),
+    ],
+)
+def test_what_is_learnt_has_the_hash_of_earlier_releases(name: str, hashed: str) -> None:
+    path = Path(__file__).parents[2] / "examples" / f"{name}.yaml"
+    assert load_system_decl(path).learnt == hashed
+    commented = Source(str(path), "# a comment moves all places\n" + path.read_text())
+    assert parse_system(commented, path).learnt == hashed

@@ -97,7 +97,7 @@ class SystemDecl:
     name: str
     doc: str
     path: Path
-    source: Source
+    source: Source = field(repr=False)
     spec: Path | None
     dt: Fraction
     horizon: int
@@ -121,10 +121,10 @@ class SystemDecl:
     scenarios: tuple[ScenarioDecl, ...] = ()
     scenario: ScenarioDecl | None = None
     functions: tuple[FunctionDecl, ...] = ()
-    bases: tuple[Source, ...] = ()
+    bases: tuple[Source, ...] = field(default=(), repr=False)
     overrides: Mapping[str, str] = field(default_factory=dict)
-    places: Mapping[str, Span] = field(default_factory=dict)
-    warnings: tuple[Diagnostic, ...] = ()
+    places: Mapping[str, Span] = field(default_factory=dict, repr=False)
+    warnings: tuple[Diagnostic, ...] = field(default=(), repr=False)
     inputs: tuple[InputDecl, ...] = ()
     tables: tuple[TableDecl, ...] = ()
     updates: tuple[Assign, ...] = ()

@@ -166,7 +166,7 @@ class WorldRef:
 
     path: Path
     name: str
-    span: Span = field(compare=False)
+    span: Span = field(compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +182,7 @@ class JudgeRef:
 
     path: Path
     written: str
-    span: Span = field(compare=False)
+    span: Span = field(compare=False, repr=False)
 
 
 @reads({"type": ["string", "null"]})

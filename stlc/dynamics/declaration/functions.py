@@ -42,8 +42,8 @@ class FunctionDecl:
     module: str | Path
     attribute: str
     library: Literal["numpy", "torch"] | None = None
-    span: Span | None = field(default=None, compare=False)
-    body: ir.Body | None = None
+    span: Span | None = field(default=None, compare=False, repr=False)
+    body: ir.Body | None = field(default=None, repr=False)
     base: str = ""
 
     def bound(self, arguments: tuple[int | None, ...], result: int | None) -> ir.Body:

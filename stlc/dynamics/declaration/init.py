@@ -62,7 +62,7 @@ class FileDecl:
 
     path: Path
     columns: tuple[Column, ...]
-    span: Span = field(compare=False)
+    span: Span = field(compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +105,8 @@ class InitDecl:
     where_text: tuple[str, ...] = field(default=(), compare=False)
     params: tuple[Assign, ...] = ()
     override: tuple[Assign, ...] = ()
-    span: Span | None = field(default=None, compare=False)
-    computed: tuple[Assign, ...] = ()
+    span: Span | None = field(default=None, compare=False, repr=False)
+    computed: tuple[Assign, ...] = field(default=(), repr=False)
 
 
 @dataclass(repr=False, eq=False)

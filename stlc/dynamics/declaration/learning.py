@@ -283,9 +283,9 @@ class PolicyDecl:
     mirror: tuple[Assign, ...] = key(
         _mirror, "images of states and controls under a symmetry of system and specification", (), spread=True
     )
-    mirror_span: Span | None = field(default=None, compare=False)
+    mirror_span: Span | None = field(default=None, compare=False, repr=False)
     feedback: FeedbackDecl | None = key(_feedback, "a stabilising feedback beneath the plans", spread=True)
-    feedback_span: Span | None = field(default=None, compare=False)
+    feedback_span: Span | None = field(default=None, compare=False, repr=False)
 
 
 # ------------------------------------------------------------------------------------- train

@@ -45,7 +45,7 @@ class Scalar:
     span: Span
     text: str
     style: Style = "plain"
-    size: int = field(default=1, compare=False)
+    size: int = field(default=1, compare=False, repr=False)
 
     @property
     def inside(self) -> Span:
@@ -90,7 +90,7 @@ class Sequence:
 
     span: Span
     items: tuple[Node, ...]
-    size: int = field(compare=False)
+    size: int = field(compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class Mapping:
 
     span: Span
     entries: tuple[Entry, ...]
-    size: int = field(compare=False)
+    size: int = field(compare=False, repr=False)
 
     def get(self, key: str) -> Node | None:
         """The value of `key`, or None."""
