@@ -6,8 +6,10 @@ import json
 import math
 import shutil
 import subprocess
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +32,7 @@ from stlc.export.programs import without_deprecations
 from stlc.export.verify import Answer, agreement, answers, by_c
 from stlc.export.write import export, target_of
 from stlc.runtime import backup
-from stlc.runtime.decision import acceptable
+from stlc.runtime.decision import Shot, prefix_shooting
 from stlc.runtime.facts import read_facts
 from stlc.runtime.graphs import Graphs
 from stlc.runtime.prefixes import SAMPLINGS
@@ -218,7 +220,12 @@ def test_a_backup_policy_with_another_rule_is_not_handed_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = run_of("traffic", "car", tmp_path)
-    monkeypatch.setattr(backup, "continued", lambda rho, safe, _, ops: acceptable(rho, safe, ops))
+
+    def dearest(*of: Any) -> Iterator[Shot[Any]]:
+        for shot in prefix_shooting(*of):
+            yield replace(shot, plans=replace(shot.plans, cost=-shot.plans.cost))
+
+    monkeypatch.setattr(backup, "prefix_shooting", dearest)
     with pytest.raises(RunError, match="does not do what the run does"):
         export(run, "onnx", tmp_path / "out")
     assert not (tmp_path / "out").exists()
