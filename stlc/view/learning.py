@@ -249,8 +249,9 @@ def learning_on_record(
 
 def clause(held: HeldOut | None, signature: Signature | None) -> str:
     """Clause on the region in which the worst requirement fails; "" if none fails."""
-    weakness = None if held is None else find_weakness(held)
-    return "" if held is None or weakness is None else weakness_text(weakness, held, signature)
+    if held is None or (weakness := find_weakness(held)) is None:
+        return ""
+    return weakness_text(weakness, held, signature)
 
 
 def learning_of(
@@ -301,14 +302,13 @@ def learning_of(
 
 
 def _without_plan(commands: Commands, *, proved: bool) -> Learning:
-    level: Level = "infeasible" if proved else "no plan known"
-    sentence = "neither the policy nor search found a satisfying plan for any start"
-    more = "more training hardly helps where there is no plan"
+    looser = "a looser specification, a longer horizon, or another initial set; more training cannot help"
     if proved:
         sentence = "no plan satisfies the specification: bounds of what the controls can do prove it"
-        more = "more training cannot help"
-    advice = f"a looser specification, a longer horizon, or another initial set: {more}"
-    return Learning(level, None, sentence, (advice,), commands.report)
+        return Learning("infeasible", None, sentence, (looser,), commands.report)
+    sentence = "neither the policy nor search found a satisfying plan for any start"
+    advice = (f"a longer search tells whether there are plans: `{commands.search}`", looser)
+    return Learning("no plan known", None, sentence, advice, commands.search)
 
 
 def best_drives(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
