@@ -54,7 +54,7 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_unconfigure() -> None:
-    """What is left is searched once, and not again by pytest and by the end of the process."""
+    """A single search for garbage at the end: pytest and the end of the process would search again."""
     gc.collect()
     gc.freeze()
 

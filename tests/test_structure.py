@@ -10,7 +10,7 @@ from helpers.tools import ROOT, load_tool
 
 structure = load_tool("structure")
 
-NODES = 463102
+NODES = 463111
 CROSSINGS = 5.73
 CIRCLES: set[tuple[str, str]] = set()
 IMPLEMENTATIONS = {

@@ -302,13 +302,14 @@ def learning_of(
 
 
 def _without_plan(commands: Commands, *, proved: bool) -> Learning:
-    looser = "a looser specification, a longer horizon, or another initial set; more training cannot help"
+    looser = "a looser specification, a longer horizon, or another initial set"
     if proved:
         sentence = "no plan satisfies the specification: bounds of what the controls can do prove it"
-        return Learning("infeasible", None, sentence, (looser,), commands.report)
+        advice = f"{looser}: more training cannot help"
+        return Learning("infeasible", None, sentence, (advice,), commands.report)
     sentence = "neither the policy nor search found a satisfying plan for any start"
-    advice = (f"a longer search tells whether there are plans: `{commands.search}`", looser)
-    return Learning("no plan known", None, sentence, advice, commands.search)
+    longer = f"a longer search may find plans: `{commands.search}`"
+    return Learning("no plan known", None, sentence, (longer, f"else {looser}"), commands.search)
 
 
 def best_drives(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
