@@ -203,13 +203,13 @@ def parse_seconds(text: str) -> float:
     Raises:
         UsageError: U101, the text is not a duration.
     """
-    from stlc.units import parse_unit
+    from stlc.units import Unit
 
     number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz ").strip()
     unit = text.strip()[len(number) :].strip() or "s"
     try:
-        value = float(number) * float(parse_unit(unit).scale)
-        if parse_unit(unit).dims != parse_unit("s").dims or not 0.0 < value < 1e9:
+        value = float(number) * float(Unit.parse(unit).scale)
+        if Unit.parse(unit).dims != Unit.parse("s").dims or not 0.0 < value < 1e9:
             raise ValueError
     except ValueError as error:
         raise usage(f"`{text}` is not a duration", "write it as 60s or 5min") from error

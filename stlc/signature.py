@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from stlc.jsontext import Num
-from stlc.units import DIMENSIONLESS, Unit
+from stlc.units import Unit
 
 Kind = Literal["real", "int", "bool", "enum"]
 Role = Literal["input", "output", "state", "env", "timer"]
@@ -33,7 +33,7 @@ class Column:
     """
 
     name: str
-    unit: Unit = DIMENSIONLESS
+    unit: Unit = Unit.ONE
     kind: Kind = "real"
     role: Role = "state"
     low: Num | None = None

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from types import MappingProxyType
+from typing import ClassVar
 
 Dims = tuple[int, ...]
 
@@ -22,6 +23,35 @@ _FACTOR = re.compile(r"(?P<symbol>[A-Za-zµμ°Ω]+|%|1)(?:\^?(?P<power>[+-]?\d+
 _RAISED = str.maketrans("⁻¹²³⁴", "-1234")
 _MAX_POWER = 99
 _BLANKS = " \t\r\n"
+_QUANTITY = re.compile(
+    r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)"
+    r"([ \t\r\n]*(?P<unit>[^\d\s.].*)|[ \t\r\n]+(?P<per>1(/.*)?))?"  # such as `2 1/s`
+)
+_CELSIUS = re.compile(r"deg(?:ree)?s?[_. ]*C(?:elsius)?|°[_ ]*C|Cel(?:sius)?|centigrade", re.IGNORECASE)
+_DEFINED: Mapping[str, tuple[Fraction | int | str, str]] = {
+    **{"g": ("1/1000", "kg"), "rad": (1, "1"), "sr": (1, "1"), "Hz": (1, "1/s"), "N": (1, "kg*m/s^2")},
+    **{"Nm": (1, "N*m"), "Pa": (1, "N/m^2"), "J": (1, "N*m"), "W": (1, "J/s"), "VA": (1, "J/s")},
+    **{
+        "C": (1, "A*s"),
+        "V": (1, "W/A"),
+        "F": (1, "C/V"),
+        "ohm": (1, "V/A"),
+        "Ω": (1, "V/A"),
+        "S": (1, "A/V"),
+    },
+    **{"Wb": (1, "V*s"), "T": (1, "Wb/m^2"), "H": (1, "Wb/A"), "lm": (1, "cd"), "lx": (1, "lm/m^2")},
+    **{"Bq": (1, "1/s"), "Gy": (1, "J/kg"), "Sv": (1, "J/kg"), "kat": (1, "mol/s"), "l": ("1/1000", "m^3")},
+    **{"L": (1, "l"), "bar": (100_000, "Pa"), "Wh": (3600, "J"), "Ah": (3600, "C")},
+    **{"eV": (Fraction("1.602176634e-19"), "J")},
+}
+"""Unit that takes prefixes -> (size, unit of the size)."""
+
+_PLAIN: Mapping[str, tuple[Fraction | int | str, str]] = {
+    **{"min": (60, "s"), "h": (3600, "s"), "ft": ("381/1250", "m"), "mph": ("1397/3125", "m/s")},
+    **{"lb": ("45359237/100000000", "kg"), "rpm": (Fraction(math.pi) / 30, "1/s"), "%": ("1/100", "1")},
+    **{"deg": (Fraction(math.pi) / 180, "1"), "°": (Fraction(math.pi) / 180, "1")},
+}
+"""Unit without prefixes -> (size, unit of the size)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +65,70 @@ class Unit:
         offset: value of the unit's zero in SI units, exactly: 273.15 for `degC`, 0 for units without offset.
     """
 
+    ONE: ClassVar[Unit]
+    """The dimensionless unit."""
+    SYMBOLS: ClassVar[Mapping[str, Unit]]
+    """Symbol -> unit, with all prefixes."""
+    PREFIXES: ClassVar = MappingProxyType(
+        {
+            **{
+                "q": -30,
+                "r": -27,
+                "y": -24,
+                "z": -21,
+                "a": -18,
+                "f": -15,
+                "p": -12,
+                "n": -9,
+                "u": -6,
+                "m": -3,
+            },
+            **{"µ": -6, "μ": -6, "c": -2, "d": -1, "da": 1, "h": 2, "k": 3, "M": 6, "G": 9, "T": 12, "P": 15},
+            **{"E": 18, "Z": 21, "Y": 24, "R": 27, "Q": 30},
+        }
+    )
+    """SI prefix -> its power of ten; micro is `u`, the micro sign or the Greek letter."""
+    PREFIXED: ClassVar = tuple(sorted({*_BASES, *_DEFINED} - {"kg"}))
+    """Units that take prefixes. `T` is a unit with a prefix only: alone, it is the planning horizon."""
+    CELSIUS: ClassVar = "degrees Celsius are written `degC`, kelvin `K`"
+
     dims: Dims = _NONE
     ratio: Fraction = Fraction(1)
     text: str = field(default="", compare=False)
     offset: Fraction = Fraction(0)
+
+    @classmethod
+    def parse(cls, text: str) -> Unit:
+        """Parse a unit: a product or quotient of powers, e.g. `m/s^2`, `kg*m`, `1/s`, `deg`.
+
+        Raises:
+            ValueError: the text is not a unit; the message has the reason.
+        """
+        cleaned = text.strip(_BLANKS)
+        if not cleaned:
+            raise ValueError("an empty unit")
+        factors = _factors(cleaned)
+        for symbol, power in factors:
+            unit = cls.SYMBOLS.get(symbol)
+            if unit is None:
+                raise ValueError(f"unknown unit `{symbol}`")
+            if unit.offset:
+                if factors == [(symbol, 1)]:
+                    return replace(unit, text=cleaned)
+                raise ValueError(f"`{symbol}` has a zero of its own and stands alone: {_in_kelvin(factors)}")
+            if abs(power) > _MAX_POWER:
+                raise ValueError(f"the power {power} of `{symbol}` is too large")
+        return cls(*_combined(factors, cls.SYMBOLS), cleaned)
+
+    @classmethod
+    def written(cls, text: str) -> Unit:
+        """Parse a unit as `parse` does; an empty text is the dimensionless unit. Raises ValueError."""
+        return cls.parse(text) if text else cls.ONE
+
+    @classmethod
+    def celsius_advice(cls, text: str) -> tuple[str, ...]:
+        """Advice about a text that means degrees Celsius but is not `degC`; () for any other text."""
+        return (cls.CELSIUS,) if _CELSIUS.fullmatch(text.strip()) else ()
 
     @property
     def scale(self) -> float:
@@ -71,6 +161,22 @@ class Unit:
         """Convert a number from SI units to this unit."""
         return (value - float(self.offset)) / self.scale
 
+    def value_of(self, text: str) -> float:
+        """Parse a finite number with or without a unit, such as `36 km/h`, and return its value in this unit.
+
+        Raises:
+            ValueError: the text is not such a number, or its unit has another dimension; the message has the
+                reason.
+        """
+        match = _QUANTITY.fullmatch(text.strip())
+        found = float(match["number"]) if match is not None else math.nan
+        if match is None or not math.isfinite(found):
+            raise ValueError(f"`{text.strip()}` is not a finite number")
+        given = Unit.parse(written) if (written := match["unit"] or match["per"]) else self
+        if given.dims != self.dims:
+            raise ValueError(f"`{given}` is not a unit of [{self}]")
+        return found if given == self else self.of_si(found * given.scale + float(given.offset))
+
     def __mul__(self, other: Unit) -> Unit:
         return _product(((self, 1), (other, 1)))
 
@@ -101,47 +207,6 @@ class Unit:
         return self.text or _si_text(self.dims)
 
 
-DIMENSIONLESS = Unit()
-
-
-PREFIXES: Mapping[str, int] = MappingProxyType(
-    {
-        **{"q": -30, "r": -27, "y": -24, "z": -21, "a": -18, "f": -15, "p": -12, "n": -9, "u": -6, "m": -3},
-        **{"µ": -6, "μ": -6, "c": -2, "d": -1, "da": 1, "h": 2, "k": 3, "M": 6, "G": 9, "T": 12, "P": 15},
-        **{"E": 18, "Z": 21, "Y": 24, "R": 27, "Q": 30},
-    }
-)
-"""SI prefix -> its power of ten; micro is `u`, the micro sign or the Greek letter."""
-
-_DEFINED: Mapping[str, tuple[Fraction | int | str, str]] = {
-    **{"g": ("1/1000", "kg"), "rad": (1, "1"), "sr": (1, "1"), "Hz": (1, "1/s"), "N": (1, "kg*m/s^2")},
-    **{"Nm": (1, "N*m"), "Pa": (1, "N/m^2"), "J": (1, "N*m"), "W": (1, "J/s"), "VA": (1, "J/s")},
-    **{
-        "C": (1, "A*s"),
-        "V": (1, "W/A"),
-        "F": (1, "C/V"),
-        "ohm": (1, "V/A"),
-        "Ω": (1, "V/A"),
-        "S": (1, "A/V"),
-    },
-    **{"Wb": (1, "V*s"), "T": (1, "Wb/m^2"), "H": (1, "Wb/A"), "lm": (1, "cd"), "lx": (1, "lm/m^2")},
-    **{"Bq": (1, "1/s"), "Gy": (1, "J/kg"), "Sv": (1, "J/kg"), "kat": (1, "mol/s"), "l": ("1/1000", "m^3")},
-    **{"L": (1, "l"), "bar": (100_000, "Pa"), "Wh": (3600, "J"), "Ah": (3600, "C")},
-    **{"eV": (Fraction("1.602176634e-19"), "J")},
-}
-"""Unit that takes prefixes -> (size, unit of the size)."""
-
-_PLAIN: Mapping[str, tuple[Fraction | int | str, str]] = {
-    **{"min": (60, "s"), "h": (3600, "s"), "ft": ("381/1250", "m"), "mph": ("1397/3125", "m/s")},
-    **{"lb": ("45359237/100000000", "kg"), "rpm": (Fraction(math.pi) / 30, "1/s"), "%": ("1/100", "1")},
-    **{"deg": (Fraction(math.pi) / 180, "1"), "°": (Fraction(math.pi) / 180, "1")},
-}
-"""Unit without prefixes -> (size, unit of the size)."""
-
-PREFIXED = tuple(sorted({*_BASES, *_DEFINED} - {"kg"}))
-"""Units that take prefixes. `T` is a unit with a prefix only: alone, it is the planning horizon."""
-
-
 def _symbols() -> Mapping[str, Unit]:
     table = {"1": Unit(text="1")}
     for index, text in enumerate(_BASES):
@@ -149,8 +214,8 @@ def _symbols() -> Mapping[str, Unit]:
     for text, (size, of) in {**_DEFINED, **_PLAIN}.items():
         dims, ratio = _combined(_factors(of), table)
         table[text] = Unit(dims, Fraction(size) * ratio, text)
-    for text in PREFIXED:
-        for prefix, power in PREFIXES.items():
+    for text in Unit.PREFIXED:
+        for prefix, power in Unit.PREFIXES.items():
             whole = prefix + text
             table.setdefault(whole, Unit(table[text].dims, table[text].ratio * Fraction(10) ** power, whole))
     del table["T"]
@@ -167,69 +232,6 @@ def _combined(factors: Iterable[tuple[str, int]], symbols: Mapping[str, Unit]) -
         dims = tuple(a + b * power for a, b in zip(dims, unit.dims, strict=True))
         ratio *= unit.ratio**power
     return dims, ratio
-
-
-def parse_unit(text: str) -> Unit:
-    """Parse a unit: a product or quotient of powers, e.g. `m/s^2`, `kg*m`, `1/s`, `deg`.
-
-    Raises:
-        ValueError: the text is not a unit; the message has the reason.
-    """
-    cleaned = text.strip(_BLANKS)
-    if not cleaned:
-        raise ValueError("an empty unit")
-    factors = _factors(cleaned)
-    for symbol, power in factors:
-        unit = SYMBOLS.get(symbol)
-        if unit is None:
-            raise ValueError(f"unknown unit `{symbol}`")
-        if unit.offset:
-            if factors == [(symbol, 1)]:
-                return replace(unit, text=cleaned)
-            raise ValueError(f"`{symbol}` has a zero of its own and stands alone: {_in_kelvin(factors)}")
-        if abs(power) > _MAX_POWER:
-            raise ValueError(f"the power {power} of `{symbol}` is too large")
-    return Unit(*_combined(factors, SYMBOLS), cleaned)
-
-
-def written_unit(text: str) -> Unit:
-    """Parse a unit as `parse_unit` does; an empty text is the dimensionless unit. Raises ValueError."""
-    return parse_unit(text) if text else DIMENSIONLESS
-
-
-_QUANTITY = re.compile(
-    r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)"
-    r"([ \t\r\n]*(?P<unit>[^\d\s.].*)|[ \t\r\n]+(?P<per>1(/.*)?))?"  # such as `2 1/s`
-)
-
-
-def parse_quantity(text: str, unit: Unit) -> float:
-    """Parse a finite number with or without a unit, such as `36 km/h`, and return its value in `unit`.
-
-    Raises:
-        ValueError: the text is not such a number, or its unit has another dimension than `unit`; the message
-            has the reason.
-    """
-    match = _QUANTITY.fullmatch(text.strip())
-    found = float(match["number"]) if match is not None else math.nan
-    if match is None or not math.isfinite(found):
-        raise ValueError(f"`{text.strip()}` is not a finite number")
-    given = parse_unit(written) if (written := match["unit"] or match["per"]) else unit
-    if given.dims != unit.dims:
-        raise ValueError(f"`{given}` is not a unit of [{unit}]")
-    if given == unit:
-        return found
-    in_si = found * given.scale + float(given.offset)
-    return (in_si - float(unit.offset)) / unit.scale
-
-
-CELSIUS = "degrees Celsius are written `degC`, kelvin `K`"
-_CELSIUS = re.compile(r"deg(?:ree)?s?[_. ]*C(?:elsius)?|°[_ ]*C|Cel(?:sius)?|centigrade", re.IGNORECASE)
-
-
-def celsius_advice(text: str) -> tuple[str, ...]:
-    """Return the advice about a text that means degrees Celsius but is not `degC`; () for any other text."""
-    return (CELSIUS,) if _CELSIUS.fullmatch(text.strip()) else ()
 
 
 def nearest(value: Fraction | float) -> float:
@@ -274,7 +276,7 @@ def _in_kelvin(factors: Iterable[tuple[str, int]]) -> str:
     """Advice for a unit that is a product with `degC`, such as `W/degC`: the same product with `K`."""
     powers: dict[str, int] = {}
     for symbol, power in factors:
-        known = SYMBOLS.get(symbol)
+        known = Unit.SYMBOLS.get(symbol)
         name = str(known.interval) if known is not None and known.offset else symbol
         powers[name] = powers.get(name, 0) + power
     return f"write `{_text(powers)}`"
@@ -311,15 +313,5 @@ def _text(powers: Mapping[str, int]) -> str:
     return "/".join(["*".join(above) or "1", *below])
 
 
-SYMBOLS = _symbols()
-"""Symbol -> unit, with all prefixes."""
-
-
-def floored(share: float) -> str:
-    """Format a lower bound on a share, rounded down to two decimals of a percent."""
-    return f"{math.floor(1e4 * share + 1e-9) / 100:.2f} %"
-
-
-def raised(share: float) -> str:
-    """Format an upper bound on a share, rounded up to two decimals of a percent."""
-    return f"{math.ceil(1e4 * share - 1e-9) / 100:.2f} %"
+Unit.ONE = Unit()
+Unit.SYMBOLS = _symbols()

@@ -250,3 +250,16 @@ def certifies(successes: int, trials: int, share: float, confidence: float, *, a
     if any_time:
         return log_capital(Tally.counted(successes, trials), share) >= -math.log1p(-confidence)
     return successes > 0 and regularised_beta(share, successes, trials - successes + 1) <= 1.0 - confidence
+
+
+# ---------------------------------------------------------------------- text
+
+
+def floored(share: float) -> str:
+    """Format a lower bound on a share, rounded down to two decimals of a percent."""
+    return f"{math.floor(1e4 * share + 1e-9) / 100:.2f} %"
+
+
+def raised(share: float) -> str:
+    """Format an upper bound on a share, rounded up to two decimals of a percent."""
+    return f"{math.ceil(1e4 * share - 1e-9) / 100:.2f} %"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from stlc.activity import PULSE
+from stlc.assurance.bounds import floored, raised
 from stlc.assurance.campaign import (
     Campaign,
     CertificateCheck,
@@ -29,7 +30,6 @@ from stlc.provenance import hardware, versions
 from stlc.records import read
 from stlc.registry import GUARDS
 from stlc.rundir import RunDir, now
-from stlc.units import floored, raised
 
 if TYPE_CHECKING:
     from stlc.assurance.campaign import Subject

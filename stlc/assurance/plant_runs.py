@@ -14,7 +14,6 @@ from stlc.diagnostics import notice, usage
 from stlc.escape import visible
 from stlc.registry import did_you_mean
 from stlc.trace import Trace, check_writable, save_trace
-from stlc.units import parse_quantity
 
 if TYPE_CHECKING:
     from stlc.assurance.options import SimulateOptions
@@ -99,7 +98,7 @@ def _assignments(plant: Plant, text: str) -> Iterator[tuple[str, float]]:
 def _value(variable: PlantVariable, part: str, text: str) -> float:
     """Return the value of a variable in its unit, from a text such as `1 m`. Raises UsageError (U101)."""
     try:
-        found = parse_quantity(text, variable.unit)
+        found = variable.unit.value_of(text)
     except ValueError as error:
         advice = f"write NAME=NUMBER; `{variable.name}` is in [{variable.unit}]"
         raise usage(f"`{part}`: {error}", advice) from None

@@ -22,7 +22,7 @@ from stlc.grammar.printer import own_name
 from stlc.grammar.scan import declaration_starts, lexemes
 from stlc.grammar.tables import acceptable
 from stlc.grammar.words import BINARY_TEMPORAL, PRAGMAS, RESERVED, ROLES, UNARY_TEMPORAL
-from stlc.units import PREFIXED, SYMBOLS
+from stlc.units import Unit
 
 OfferKind: TypeAlias = Literal[
     "Keyword", "Function", "Unit", "Property", "Class", "Variable", "Constant", "Reference", "EnumMember"
@@ -208,7 +208,7 @@ def _shared(document: Document, alias: str) -> Iterator[Offer]:
 
 
 def _units() -> Iterator[Offer]:
-    usual = {prefix + unit for prefix in ("", *"numkM") for unit in PREFIXED}
-    rest = (unit for unit in SYMBOLS if unit in usual and unit not in _FIRST_UNITS)
+    usual = {prefix + unit for prefix in ("", *"numkM") for unit in Unit.PREFIXED}
+    rest = (unit for unit in Unit.SYMBOLS if unit in usual and unit not in _FIRST_UNITS)
     yield from (Offer(unit, "Unit", order=1) for unit in _FIRST_UNITS)
     yield from (Offer(unit, "Unit", order=8) for unit in rest)

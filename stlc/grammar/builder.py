@@ -20,7 +20,7 @@ from stlc.grammar import ast
 from stlc.grammar.errors.units import unit_advice
 from stlc.grammar.words import BINARY_TEMPORAL, BUILT_IN, SPACE, UNARY_TEMPORAL
 from stlc.source import Source, Span
-from stlc.units import celsius_advice, parse_unit
+from stlc.units import Unit
 
 MAX_DIGITS = 400
 _UNIT_LENGTH = 60
@@ -90,7 +90,7 @@ def unit_of(context: BuildContext, leaf: TerminalToken | None) -> str:
     try:
         if len(text) > _UNIT_LENGTH:
             raise ValueError("this is too long for a unit")
-        parse_unit(text)
+        Unit.parse(text)
     except ValueError as error:
         context.findings.append(_bad_unit(leaf, text, str(error)))
     return text
@@ -100,7 +100,7 @@ def _bad_unit(leaf: TerminalToken, text: str, reason: str) -> Diagnostic:
     if "," in text:
         advice: tuple[str, ...] = (f"a range is written `in {leaf.text}`",)
     else:
-        advice = celsius_advice(text.strip("[] "))
+        advice = Unit.celsius_advice(text.strip("[] "))
         advice = advice or next(filter(None, map(unit_advice, _LETTERS.findall(text))), ())
     return Diagnostic(
         "E101", reason, leaf.span, help=advice, note=("a unit is a product of powers: [m/s^2], [1/s], [%]",)

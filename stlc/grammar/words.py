@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from stlc.units import PREFIXED, PREFIXES, SYMBOLS
+from stlc.units import Unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,10 +151,10 @@ def _choice(words: Iterable[str]) -> str:
 
 def _units() -> str:
     """Pattern of one unit; a table of all of them with their prefixes would make the lexer slow."""
-    prefix = _choice(PREFIXES)
-    known = {*PREFIXED, *(prefix + unit for prefix in PREFIXES for unit in PREFIXED)}
-    plain = _choice(SYMBOLS.keys() - known - {"%", "1"})
-    return f"(?:{prefix}?{_choice({*PREFIXED} - {'T'})}|{prefix}T|{plain})"
+    prefix = _choice(Unit.PREFIXES)
+    known = {*Unit.PREFIXED, *(prefix + unit for prefix in Unit.PREFIXES for unit in Unit.PREFIXED)}
+    plain = _choice(Unit.SYMBOLS.keys() - known - {"%", "1"})
+    return f"(?:{prefix}?{_choice({*Unit.PREFIXED} - {'T'})}|{prefix}T|{plain})"
 
 
 PATTERNS = MappingProxyType(

@@ -279,14 +279,14 @@ def write_robustness(path: Path, verdict: Verdict, question: Question) -> None:
 
     from stlc.signature import Column, Signature
     from stlc.trace import Trace, save_trace
-    from stlc.units import written_unit
+    from stlc.units import Unit
 
     trace = verdict.subject.signals.trace
     assert trace is not None
     monitor = monitor_of(verdict.about.source, question, trace.meta.carried)
     end: Literal["strict", "truncate"] = "truncate" if question.end == "truncate" else "strict"
     values = monitor.requirement_robustness(trace, end=end, semantics=question.semantics)
-    units = {judged.name: written_unit(judged.unit) for judged in verdict}
+    units = {judged.name: Unit.written(judged.unit) for judged in verdict}
     data = {
         name: np.asarray(values[name], dtype=np.float64).reshape(trace.traces, trace.samples)
         for name in units
@@ -444,15 +444,15 @@ def instant_of(text: int | str | None, name: str, dt: float, t0: float, samples:
 
 def seconds_of(option: str, text: str, advice: str) -> float:
     """Return a time with its unit, the value of an option, in seconds. Raises UsageError (U101)."""
-    from stlc.units import parse_unit
+    from stlc.units import Unit
 
     match = _INSTANT.fullmatch(text.strip())
     if match is None or not match["unit"]:
         raise usage(f"`{option} {text}` is not a time", advice)
     try:
-        unit = parse_unit(match["unit"])
+        unit = Unit.parse(match["unit"])
     except ValueError as error:
         raise usage(f"`{option} {text}`: {error}", advice) from None
-    if unit.dims != parse_unit("s").dims:
+    if unit.dims != Unit.parse("s").dims:
         raise usage(f"`{option} {text}` is not a time", advice)
     return float(match["number"]) * unit.scale

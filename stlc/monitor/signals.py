@@ -37,7 +37,7 @@ from stlc.trace.enums import TRUTH, Words
 from stlc.trace.formats.table import GROUPS
 from stlc.trace.recording import Conversion, conversion
 from stlc.trace.resample import Between, How, Moments, TimeRange
-from stlc.units import SYMBOLS, written_unit
+from stlc.units import Unit
 
 CLOCK = "t"
 """Name under which a trace also offers its time in seconds."""
@@ -122,7 +122,7 @@ def reading_of(spec: ast.Spec, requested: Reading = AS_IT_IS, read: Collection[s
         name = item.column or item.name
         words[name] = {} if item.type is None else worth.get(item.type.name, {})
         kinds[name] = "real" if item.type is None else _KINDS.get(item.type.name, "enum")
-        timelike[name] = not item.unit or written_unit(item.unit).same_dims(SYMBOLS["s"])
+        timelike[name] = not item.unit or Unit.written(item.unit).same_dims(Unit.SYMBOLS["s"])
         if (declared := _declared_between(item)) is not None:
             between[name] = declared
     _require_signals(requested, spec, columns)
@@ -166,7 +166,7 @@ def _turned(between: Between, item: ast.Signal | None) -> Between:
     """Values between samples with a full turn in the unit of the signal."""
     if between.how != "angle" or item is None or not item.unit:
         return between
-    return replace(between, period=2.0 * math.pi / written_unit(item.unit).scale)
+    return replace(between, period=2.0 * math.pi / Unit.written(item.unit).scale)
 
 
 @dataclass(frozen=True, slots=True)

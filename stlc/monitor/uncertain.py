@@ -26,7 +26,7 @@ from stlc.jsontext import Num
 from stlc.monitor.values import Record
 from stlc.registry import closest
 from stlc.signature import Column
-from stlc.units import DIMENSIONLESS, Unit, parse_unit
+from stlc.units import Unit
 
 _AMOUNT = re.compile(r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>.*)")
 _INDEX = re.compile(r"(?<=.)\[\d+\]\Z")
@@ -46,7 +46,7 @@ class Uncertainty:
 
     absolute: Num = 0.0
     relative: Num = 0.0
-    unit: Unit = DIMENSIONLESS
+    unit: Unit = Unit.ONE
 
     @staticmethod
     def parse(text: str) -> Uncertainty:
@@ -62,7 +62,7 @@ class Uncertainty:
         number, unit = float(match["number"]), match["unit"].strip()
         if unit == "%":
             return Uncertainty(relative=number / 100.0)
-        return Uncertainty(absolute=number, unit=parse_unit(unit) if unit else DIMENSIONLESS)
+        return Uncertainty(absolute=number, unit=Unit.parse(unit) if unit else Unit.ONE)
 
     def __str__(self) -> str:
         if self.relative and not self.absolute:

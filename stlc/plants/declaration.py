@@ -41,7 +41,7 @@ from stlc.files import read_source
 from stlc.plants.kind import KINDS, ControllerLayout, Layout, PlantKind, Port
 from stlc.source import Source, Span
 from stlc.trace.trace import RESERVED
-from stlc.units import DIMENSIONLESS, Unit
+from stlc.units import Unit
 
 VERSION = 1
 MOST_STEPS = 10**9
@@ -95,7 +95,7 @@ class OutputKeys:
     source: str | None = key(TEXT, "its name in the plant, if that is another one", name="from")
 
 
-_REAL = Kind(lambda cx, node, label: cx.here.constant(node, label, DIMENSIONLESS), EXPRESSION)
+_REAL = Kind(lambda cx, node, label: cx.here.constant(node, label, Unit.ONE), EXPRESSION)
 
 
 @dataclass(frozen=True, slots=True)

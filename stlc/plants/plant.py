@@ -23,7 +23,7 @@ from stlc.plants.process import Fault, FaultyError, PlantProcess
 from stlc.signature import Column, Signature
 from stlc.stopping import leaving
 from stlc.trace import Trace, TraceMeta
-from stlc.units import Unit, parse_unit
+from stlc.units import Unit
 
 if TYPE_CHECKING:
     from stlc.monitor.online.online import Online
@@ -406,7 +406,7 @@ def _variables(decl: PlantDecl) -> Iterator[PlantVariable]:
             for name in signal.values:
                 yield PlantVariable(name, signal.low, signal.high, signal.unit)
             for name in signal.times:
-                yield PlantVariable(name, 0.0, float(signal.duration), parse_unit("s"))
+                yield PlantVariable(name, 0.0, float(signal.duration), Unit.parse("s"))
 
 
 def _end(processes: list[PlantProcess]) -> None:

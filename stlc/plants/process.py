@@ -24,7 +24,7 @@ from stlc.plants.declaration import OutputDecl, PlantDecl, PlantInput, VariableD
 from stlc.plants.kind import Reason
 from stlc.plants.messages import SAID, Message, MessageError, encoded, received
 from stlc.plants.watchdog import Watchdog
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 Floats: TypeAlias = NDArray[np.float64]
 TAIL = 4000
@@ -256,7 +256,7 @@ def _require_units(decl: PlantDecl, units: Mapping[str, Any]) -> None:
         for each in variables:
             text = units.get(each.source)
             try:
-                known = parse_unit(text) if isinstance(text, str) else None
+                known = Unit.parse(text) if isinstance(text, str) else None
             except ValueError:
                 continue
             if known is None or not known.text or not each.unit.text:

@@ -31,7 +31,7 @@ from stlc.trace.recording import (
     is_count_name,
     is_source_time,
 )
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 Floats = NDArray[np.float64]
 Read = Mapping[str, bool] | None
@@ -133,10 +133,10 @@ _WHY = ("its name", "its name and magnitude", "its unit is stated")
 def _scale(unit: str) -> float:
     """Seconds in a unit of time; 0 for other units."""
     try:
-        parsed = parse_unit(unit)
+        parsed = Unit.parse(unit)
     except ValueError:
         return 0.0
-    return float(parsed.scale) if parsed.dims == parse_unit("s").dims else 0.0
+    return float(parsed.scale) if parsed.dims == Unit.parse("s").dims else 0.0
 
 
 def unit_in(name: str, stated: str) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stlc.jsontext import loads
 from stlc.signature import Column, Kind, Role, Signature
 from stlc.trace.formats.registry import unreadable
-from stlc.units import DIMENSIONLESS, parse_unit
+from stlc.units import Unit
 
 _TYPES: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
@@ -158,7 +158,7 @@ def _column(name: str, entry: Mapping[str, Any]) -> Column:
     if kind not in get_args(Kind) or role not in get_args(Role):
         raise ValueError(f"`{name}` is {kind!r:.20} {role!r:.20}")
     labels = tuple((label, _number(label, value)) for label, value in entry.get("labels", {}).items())
-    unit = parse_unit(entry["unit"]) if entry.get("unit") else DIMENSIONLESS
+    unit = Unit.parse(entry["unit"]) if entry.get("unit") else Unit.ONE
     low, high = (None if entry.get(end) is None else _number(end, entry[end]) for end in ("low", "high"))
     return Column(name, unit, kind, role, low, high, labels)
 

@@ -16,7 +16,7 @@ from stlc.registry import closest
 from stlc.signature import MAX_COMPONENTS, Column
 from stlc.source import Span
 from stlc.trace.meta import TraceMeta
-from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, celsius_advice, parse_unit
+from stlc.units import Unit
 
 Array = NDArray[Any]
 
@@ -227,10 +227,10 @@ def absent(trace: str, signal: str, known: Iterable[str]) -> Diagnostic:
 def unit_of(path: Path | str, name: str, text: str) -> Unit:
     """Parse the unit that a recording gives for a column. Raises TraceError (E605) for an invalid unit."""
     try:
-        return parse_unit(text) if text else DIMENSIONLESS
+        return Unit.parse(text) if text else Unit.ONE
     except ValueError as error:
         message = f"column `{name}` of `{path}`: {error}"
-        raise TraceError.of("E605", message, help=celsius_advice(text)) from None
+        raise TraceError.of("E605", message, help=Unit.celsius_advice(text)) from None
 
 
 def fit(name: str, arrays: Mapping[str, Array], samples: int) -> dict[str, Array]:
@@ -295,7 +295,7 @@ def conversion(trace: str, column: Column, recorded: Unit, span: Span | None = N
         return None
     if not recorded.same_dims(wanted):
         message = f"`{column.name}` is in [{recorded}] in `{trace}`, the specification declares [{wanted}]"
-        coulombs = wanted.dims == SYMBOLS["K"].dims and recorded.text == "C"
+        coulombs = wanted.dims == Unit.SYMBOLS["K"].dims and recorded.text == "C"
         help_ = (f"[C] is coulombs: name the column `{column.name} [degC]`",) if coulombs else ()
         raise TraceError.of("E605", message, span, help=help_)
     found = Conversion(

@@ -14,7 +14,7 @@ from stlc.grammar import ast
 from stlc.monitor.judgement import Verdict
 from stlc.signature import Column, Signature
 from stlc.trace import Trace
-from stlc.units import parse_unit
+from stlc.units import Unit
 from stlc.view import require_drawing
 from stlc.view.signals import Choice, acted_in, choose_traces, draw_signals
 from stlc.view.style import Picture, picture_style
@@ -137,7 +137,7 @@ def _as_declared(trace: Trace, spec: ast.Spec) -> Trace:
         for item in spec.items:
             if isinstance(item, ast.Signal) and (item.column or item.name) == column.name:
                 if item.unit and not column.unit.text:
-                    return replace(column, unit=parse_unit(item.unit))
+                    return replace(column, unit=Unit.parse(item.unit))
                 if item.type and item.type.name == "bool":
                     return replace(column, kind="bool")
         return column

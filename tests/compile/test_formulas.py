@@ -15,7 +15,7 @@ from stlc.diagnostics import SystemFileError
 from stlc.grammar.parser import parse_expr
 from stlc.signature import Column
 from stlc.source import Source
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 SAMPLES = st.fixed_dictionaries(
     {name: st.sampled_from([-1.5, -0.5, 0.5, 1.5, 2.5]) for name in ("x", "y", "v")}
@@ -153,7 +153,7 @@ def test_places_point_into_the_text() -> None:
 
 
 def test_a_guard_of_a_system_file() -> None:
-    scope = Scope(column_entries([Column("x", parse_unit("m"))]), error=SystemFileError)
+    scope = Scope(column_entries([Column("x", Unit.parse("m"))]), error=SystemFileError)
     found = resolve_state_formula(parse_expr(Source("car.yaml", "x > 8")), scope, what="a guard")
     assert found == ir.Predicate(ir.Op("sub", (ir.Signal("x"), ir.Const(8.0))), strict=True)
     with pytest.raises(SystemFileError) as caught:

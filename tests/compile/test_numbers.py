@@ -25,25 +25,25 @@ from stlc.diagnostics import SpecError, StlcError, SystemFileError
 from stlc.grammar.parser import parse_expr
 from stlc.signature import Column
 from stlc.source import Source
-from stlc.units import DIMENSIONLESS, parse_unit
+from stlc.units import Unit
 
 LABELS = (("stop", 0.0), ("light", 1.0))
 COLUMNS = (
-    Column("x", parse_unit("m")),
-    Column("v", parse_unit("m/s"), low=-0.01, high=10.0, fact=True),
-    Column("psi", parse_unit("deg")),
-    Column("d", parse_unit("km")),
+    Column("x", Unit.parse("m")),
+    Column("v", Unit.parse("m/s"), low=-0.01, high=10.0, fact=True),
+    Column("psi", Unit.parse("deg")),
+    Column("d", Unit.parse("km")),
     Column("free"),
     Column("sign", kind="enum", labels=LABELS),
     Column("yielding", kind="bool"),
     Column("gear", kind="int"),
-    Column("q[0]", parse_unit("m")),
-    Column("q[1]", parse_unit("m")),
+    Column("q[0]", Unit.parse("m")),
+    Column("q[1]", Unit.parse("m")),
 )
 CONSTANTS = {
-    "amax": Known(constant_value(10.0, parse_unit("m/s^2"))),
-    "dt": Known(constant_value(0.1, parse_unit("s"))),
-    "two": Known(constant_value(2.0, DIMENSIONLESS)),
+    "amax": Known(constant_value(10.0, Unit.parse("m/s^2"))),
+    "dt": Known(constant_value(0.1, Unit.parse("s"))),
+    "two": Known(constant_value(2.0, Unit.ONE)),
 }
 ROW = {"x": 3.0, "v": 2.0, "psi": 90.0, "d": 1.5, "free": 0.25, "sign": 1.0, "yielding": 0.0, "gear": 3.0}
 ROW |= {"q[0]": 3.0, "q[1]": -4.0}
@@ -161,7 +161,7 @@ def test_large_powers_do_not_grow_without_bound() -> None:
 )
 def test_units_follow_the_operations(text: str, unit: str) -> None:
     found = number(text)
-    assert found.unit.same_dims(parse_unit(unit))
+    assert found.unit.same_dims(Unit.parse(unit))
     assert not found.flexible
 
 
@@ -376,7 +376,7 @@ def test_samplers_where_they_are_allowed() -> None:
     assert number("uniform(x, 2)", COLUMNS[0], samplers=True).num == ir.Op(
         "uniform", (ir.Signal("x"), ir.Const(2.0))
     )
-    assert number("uniform(0, 90)", COLUMNS[2], samplers=True).unit == parse_unit("deg")
+    assert number("uniform(0, 90)", COLUMNS[2], samplers=True).unit == Unit.parse("deg")
     assert codes("uniform(x, v)", samplers=True) == ["E203"]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from helpers.tools import load_tool
 
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, RESERVED, UNARY_TEMPORAL
-from stlc.units import SYMBOLS
+from stlc.units import Unit
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 EXTENSION = ROOT / "editors/vscode"
@@ -128,7 +128,7 @@ def test_every_reserved_word_is_coloured():
 
 
 def test_every_unit_is_coloured():
-    units = SYMBOLS.keys() - {"1"}
+    units = Unit.SYMBOLS.keys() - {"1"}
     assert {colours(f"x > 2 {unit} ")[unit] for unit in units} == {"keyword.other.unit"}
 
 

@@ -19,7 +19,7 @@ from stlc.grammar.printer import show
 from stlc.grammar.scan import lexemes
 from stlc.lint.lint import lint
 from stlc.source import Source
-from stlc.units import parse_unit
+from stlc.units import Unit
 from tests.helpers.strategies import specs
 
 SPACES = [c for c in map(chr, range(sys.maxunicode + 1)) if unicodedata.category(c) == "Zs" and c != " "]
@@ -99,7 +99,7 @@ def test_another_space_is_refused_between_words_and_kept_in_comments_and_names(c
         parse_expr(Source("car.yaml", f"1{char}+ 2"))
     for unit in (f"m{char}/s", f"m/s{char}"):
         with pytest.raises(ValueError, match="is not a unit"):
-            parse_unit(unit)
+            Unit.parse(unit)
 
 
 def test_a_lone_carriage_return_hides_nothing():

@@ -21,7 +21,7 @@ from stlc.grammar.fold import LONG_CHAIN, MAX_DEPTH
 from stlc.grammar.parser import MAX_LEXEMES, MAX_TEXT, parse, parse_expr
 from stlc.grammar.traverse import descendants
 from stlc.source import Source
-from stlc.units import SYMBOLS
+from stlc.units import Unit
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = sorted((Path(__file__).parent / "data").glob("*.stl"))
@@ -148,7 +148,7 @@ def test_quantities(text, value, unit):
 
 
 def test_every_unit_follows_a_number_and_stands_in_brackets():
-    for symbol in SYMBOLS.keys() - {"1"}:
+    for symbol in Unit.SYMBOLS.keys() - {"1"}:
         tree, signal = expr(f"2 {symbol}"), only(f"signal x [{symbol}]")
         assert isinstance(tree, ast.Quantity)
         assert isinstance(signal, ast.Signal)

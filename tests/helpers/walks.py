@@ -7,7 +7,7 @@ from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 SPEC = """spec walk
 state signal x, y [m]
@@ -37,7 +37,7 @@ def walk(names=tuple(CORNERS), text=SPEC):
     paths = np.array(
         [[np.interp(times, [0, 2, 4, 6], axis) for axis in np.array(CORNERS[n]).T] for n in names]
     )
-    columns = tuple(Column(name, parse_unit(unit)) for name, unit in (("x", "m"), ("y", "m"), ("v", "m/s")))
+    columns = tuple(Column(name, Unit.parse(unit)) for name, unit in (("x", "m"), ("y", "m"), ("v", "m/s")))
     data = {"x": paths[:, 0], "y": paths[:, 1], "v": np.zeros_like(paths[:, 0])}
     meta = TraceMeta(spec_name="walk", spec_text=text, dt=0.1)
     return Trace(Signature(columns), 0.1, data, meta=meta)

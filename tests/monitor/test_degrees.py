@@ -16,7 +16,7 @@ from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, load_trace, save_trace
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 DEGREES = np.array([20.0, 30.5, 45.0, 59.0, 58.0, 61.0])
 RECORDED = {
@@ -34,7 +34,7 @@ require calm: always[0 s, 0.5 s] abs(temp - 21 degC) <= 45 K
 
 
 def recorded(unit: str) -> Trace:
-    return Trace(Signature((Column("temp", parse_unit(unit)),)), 0.1, {"temp": RECORDED[unit][None]})
+    return Trace(Signature((Column("temp", Unit.parse(unit)),)), 0.1, {"temp": RECORDED[unit][None]})
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +57,7 @@ def test_files_and_specifications_of_either_unit(unit: str, declared: str) -> No
 
 
 def test_a_file_in_coulombs_is_told_how_degrees_are_written() -> None:
-    trace = Trace(Signature((Column("temp", parse_unit("C")),)), 0.1, {"temp": DEGREES[None]})
+    trace = Trace(Signature((Column("temp", Unit.parse("C")),)), 0.1, {"temp": DEGREES[None]})
     with pytest.raises(TraceError, match="E605") as caught:
         Monitor(SPEC.format(unit="degC"), dt=0.1).check(trace)
     assert "temp [degC]" in caught.value.diagnostics[0].help[0]
@@ -80,7 +80,7 @@ def test_units_of_files(suffix: str) -> None:
     for unit in ("degC", "K"):
         name = f"{unit}{suffix}"
         save_trace(name, recorded(unit))
-        assert load_trace(name).signature["temp"].unit == parse_unit(unit)
+        assert load_trace(name).signature["temp"].unit == Unit.parse(unit)
 
 
 @pytest.mark.parametrize(

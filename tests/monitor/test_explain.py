@@ -21,7 +21,7 @@ from stlc.monitor.explain.report import explain, names_in, shown
 from stlc.monitor.values import Record
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "check"
 
@@ -207,7 +207,7 @@ def test_a_violation_before_the_end_of_a_short_trace() -> None:
 def test_values_as_one_reads_them() -> None:
     light = Column("light", kind="enum", labels=(("red", 0.0), ("green", 1.0)))
     assert [shown(value, light) for value in (0.0, 1.0, 0.5)] == ["red", "green", "0.5"]
-    assert shown(0.27000000001, Column("x", parse_unit("m"))) == "0.27 m"
+    assert shown(0.27000000001, Column("x", Unit.parse("m"))) == "0.27 m"
 
 
 def test_names_are_found_in_every_kind_of_expression() -> None:

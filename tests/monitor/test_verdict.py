@@ -19,7 +19,7 @@ from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta, save_trace
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 ROOT = Path(__file__).parents[2]
 TRAFFIC = ROOT / "specs" / "traffic.stl"
@@ -477,9 +477,9 @@ def test_a_constant_formula_counts_samples_where_nothing_is_read() -> None:
 
 def test_units_of_a_trace_are_converted() -> None:
     monitor = Monitor("signal v [m/s]\nrequire r: v < 10\n")
-    fast = Trace(Signature((Column("v", parse_unit("km/h")),)), 1.0, {"v": np.array([[30.0, 40.0]])})
+    fast = Trace(Signature((Column("v", Unit.parse("km/h")),)), 1.0, {"v": np.array([[30.0, 40.0]])})
     assert monitor.check(fast, at="all")["r"].robustness[0] == pytest.approx(10 - 40 / 3.6)
-    wrong = Trace(Signature((Column("v", parse_unit("m")),)), 1.0, {"v": np.array([[30.0, 40.0]])})
+    wrong = Trace(Signature((Column("v", Unit.parse("m")),)), 1.0, {"v": np.array([[30.0, 40.0]])})
     with pytest.raises(TraceError, match=r"E605: `v` is in \[m\]"):
         monitor.check(wrong)
 

@@ -14,7 +14,7 @@ import pytest
 from stlc.diagnostics import StlcError
 from stlc.signature import Column, Signature
 from stlc.trace import Reading, Trace, TraceMeta, load_trace, save_trace
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 writers = pytest.importorskip("mcap.writer")
 from helpers import robot_logs  # noqa: E402
@@ -141,7 +141,7 @@ def test_what_is_written_is_read_again(tmp_path: Path, traces: int) -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(traces, 8))
     x[0, :4] = np.nan, np.inf, -np.inf, -0.0
-    columns = Signature((Column("keep gap", parse_unit("m")), Column("mode", kind="int"), Column("q[0]")))
+    columns = Signature((Column("keep gap", Unit.parse("m")), Column("mode", kind="int"), Column("q[0]")))
     data = {"keep gap": x, "mode": np.ones((traces, 8)), "q[0]": -x}
     meta = TraceMeta("traffic", seed=3, dt=1 / 30, origin=robot_logs.START)
     trace = Trace(columns, 1 / 30, data, -0.5, meta=meta)
@@ -155,7 +155,7 @@ def test_others_find_messages_of_json_with_a_schema(tmp_path: Path) -> None:
     data = {"r": np.array([[1.0, np.nan], [2.0, np.inf]])}
     meta = TraceMeta(origin=robot_logs.START)
     save_trace(
-        tmp_path / "my margins.mcap", Trace(Signature((Column("r", parse_unit("m")),)), 0.1, data, meta=meta)
+        tmp_path / "my margins.mcap", Trace(Signature((Column("r", Unit.parse("m")),)), 0.1, data, meta=meta)
     )
     reader = pytest.importorskip("mcap.reader").make_reader(
         io.BytesIO((tmp_path / "my margins.mcap").read_bytes())

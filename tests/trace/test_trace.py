@@ -22,14 +22,14 @@ from stlc.trace import Reading, Trace, TraceMeta, as_fraction, load_trace, save_
 from stlc.trace.enums import TRUTH
 from stlc.trace.formats import csv as trace_csv
 from stlc.trace.formats.npz import read as read_npz
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SIGNATURE = Signature(
     (
-        Column("x", parse_unit("m"), low=-10.0, high=8.0),
+        Column("x", Unit.parse("m"), low=-10.0, high=8.0),
         Column("sign", kind="enum", role="env", labels=(("stop", 0.0), ("light", 1.0))),
-        Column("q[0]", parse_unit("rad")),
+        Column("q[0]", Unit.parse("rad")),
     )
 )
 

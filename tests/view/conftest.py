@@ -11,7 +11,7 @@ from PIL import Image
 from stlc.rundir import RunDir
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, TraceMeta, save_trace
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 FRAMES = 4
 
@@ -27,7 +27,7 @@ SPEC = (ROOT / "specs/traffic.stl").read_text()
 SYSTEM = (ROOT / "examples/car.yaml").read_text()
 REQUIREMENTS = ("no_collision", "stop_sign", "give_way", "red_light")
 
-M, S, MS = parse_unit("m"), parse_unit("s"), parse_unit("m/s")
+M, S, MS = Unit.parse("m"), Unit.parse("s"), Unit.parse("m/s")
 SIGNATURE = Signature(
     (
         Column("x", M, low=-10, high=8),

@@ -13,7 +13,7 @@ from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.trace import Trace, TraceMeta
-from stlc.units import parse_unit
+from stlc.units import Unit
 from stlc.view.verdicts import (
     FLASH,
     FLASHES,
@@ -112,7 +112,7 @@ def test_a_margin_has_the_unit_of_its_predicates():
         "require apart: always[0, T] [x, x] not in circle([0, 0], 1)\n"
     )
     names = (("x", "m"), ("v", "km/h"))
-    columns = (*(Column(name, parse_unit(unit)) for name, unit in names), Column("on", kind="bool"))
+    columns = (*(Column(name, Unit.parse(unit)) for name, unit in names), Column("on", kind="bool"))
     data = {name: np.ones((1, 4)) for name in ("x", "v", "on")}
     trace = Trace(Signature(columns), 0.1, data, meta=TraceMeta(spec_text=text, horizon=2, dt=0.1))
     verdict = monitor_of(trace).check(trace)
@@ -194,7 +194,7 @@ def test_a_mark_comes_and_goes():
 
 def test_marks_are_in_the_units_of_the_trace_and_name_the_deciding_sample():
     text = "spec s\nsignal x [m]\nrequire up: always (x < 4 m -> eventually[0 s, 2 s] x > 0.8 m)\n"
-    column = Column("x", unit=parse_unit("cm"))
+    column = Column("x", unit=Unit.parse("cm"))
     trace = Trace(
         Signature((column,)), 1.0, {"x": np.array([[500.0, 300.0, 20.0, 79.0, 500.0, 500.0, 500.0]])}
     )

@@ -84,7 +84,7 @@ def _exit_code(found: Verification, fail_under: float | None) -> int:
 
 def _lines(told: Verified) -> Iterator[str]:
     """Lines of text that show the result of `stlc verify`."""
-    from stlc.units import floored
+    from stlc.assurance.bounds import floored
 
     found, modes = told.found, told.modes
     rows = [

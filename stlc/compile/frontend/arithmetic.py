@@ -24,7 +24,7 @@ from stlc.compile.ir.ranges import bounds
 from stlc.diagnostics import Diagnostic, Label
 from stlc.signature import Kind
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, SYMBOLS, Unit, nearest
+from stlc.units import Unit, nearest
 
 _MAX_BITS = 512
 _QUANTITY = re.compile(r"(-? *[\d.]+(?:[eE][+-]?\d+)?) *(?:[^\W\d]|°)\S*")
@@ -33,11 +33,11 @@ _OF_POINTS = ("min", "max", "clip", "choice", "uniform")
 """Functions that select among temperatures in degC, or draw between them."""
 
 _LENGTHS = ("abs", "norm", "norm1", "norminf")
-_TEMPERATURE = SYMBOLS["K"].dims
+_TEMPERATURE = Unit.SYMBOLS["K"].dims
 _MISSING = {
-    SYMBOLS["m"].dims: ("length", "m"),
-    SYMBOLS["kg"].dims: ("mass", "kg"),
-    SYMBOLS["s"].dims: ("time", "s"),
+    Unit.SYMBOLS["m"].dims: ("length", "m"),
+    Unit.SYMBOLS["kg"].dims: ("mass", "kg"),
+    Unit.SYMBOLS["s"].dims: ("time", "s"),
 }
 
 
@@ -100,12 +100,12 @@ def agree(args: Sequence[Number], what: str, span: Span, scope: Scope) -> tuple[
         return _on_one_scale(args, what, span, scope)
     known = rigid or [arg for arg in args if not arg.bare]
     if not known:
-        return tuple(args), Number(ir.Const(0.0), DIMENSIONLESS, True, True, span=span)
+        return tuple(args), Number(ir.Const(0.0), Unit.ONE, True, True, span=span)
     unit, senses = known[0].unit, {arg.sense for arg in args}
     sense: Sense = "open" if "open" in senses else "difference" if "difference" in senses else ""
     bare = next((arg for arg in args if arg.bare), None)
     if bare is not None and sense == "open":
-        scope.fail(_which(bare, SYMBOLS["degC"], span))
+        scope.fail(_which(bare, Unit.SYMBOLS["degC"], span))
     blank = Number(ir.Const(0.0), unit, not rigid, sense=sense, span=span)
     return tuple(in_unit(arg, unit, scope) if arg.bare else arg for arg in args), blank
 
@@ -234,7 +234,7 @@ def _units(
         case "plain" | "sign":
             if function.rule == "plain":
                 _check_plain(function, args, scope)
-            unit, flexible = DIMENSIONLESS, bare
+            unit, flexible = Unit.ONE, bare
     sense: Sense = "difference" if _length_or_multiple(function, args, unit) else "open" if scaled else ""
     return tuple(args), Number(ir.Const(0.0), unit, flexible, bare, sense=sense, span=span)
 
@@ -490,7 +490,7 @@ def _root(arg: Number, span: Span, scope: Scope) -> Unit:
         return arg.unit ** Fraction(1, 2)
     except ValueError:
         if arg.flexible:
-            return DIMENSIONLESS
+            return Unit.ONE
     return scope.fail(
         Diagnostic("E203", f"the square root of {unit_text(arg)} has no unit", arg.span or span)
     )
@@ -501,7 +501,7 @@ def _power(base: Number, exponent: Number, span: Span, scope: Scope) -> Unit:
         message = f"an exponent has no unit, this is {unit_text(exponent)}"
         scope.fail(Diagnostic("E203", message, exponent.span or span))
     if base.unit.dimensionless:
-        return DIMENSIONLESS
+        return Unit.ONE
     if exponent.constant is None:
         message = f"{unit_text(base)} to a power that varies has no unit"
         scope.fail(Diagnostic("E203", message, span, help=("use a constant exponent",)))
@@ -509,7 +509,7 @@ def _power(base: Number, exponent: Number, span: Span, scope: Scope) -> Unit:
         return base.unit ** (exponent.exact if exponent.exact is not None else Fraction(exponent.constant))
     except ValueError as error:
         if base.flexible:
-            return DIMENSIONLESS
+            return Unit.ONE
         return scope.fail(Diagnostic("E203", str(error), span))
 
 

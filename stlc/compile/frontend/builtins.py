@@ -56,7 +56,7 @@ from stlc.compile.ir.traverse import map_leaves, shifted
 from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.source import Span
-from stlc.units import SYMBOLS, Unit
+from stlc.units import Unit
 
 FORMALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -192,7 +192,7 @@ def _combined(name: str, call: ast.Call, pairs: Sequence[tuple[ast.Expr, Value]]
     return Combined("union" if name == "union" else "intersect", parts, span=call.span)
 
 
-_SECOND = SYMBOLS["s"]
+_SECOND = Unit.SYMBOLS["s"]
 
 
 def stepping(name: str, call: ast.Call, values: Sequence[Value], scope: Scope) -> Value:

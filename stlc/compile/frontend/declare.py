@@ -32,7 +32,7 @@ from stlc.grammar.words import BUILT_IN
 from stlc.registry import closest
 from stlc.signature import MAX_COMPONENTS, Column, Kind, Role
 from stlc.source import Span
-from stlc.units import CELSIUS, DIMENSIONLESS, Unit, nearest, parse_unit
+from stlc.units import Unit, nearest
 
 
 def check_names(entry: Definition, scope: Scope) -> None:
@@ -153,16 +153,16 @@ def declared_unit(text: str, decl: ast.Declaration, scope: Scope) -> Unit:
         Failed: the unit is unknown (E203).
     """
     if not text:
-        return DIMENSIONLESS
+        return Unit.ONE
     try:
-        unit = parse_unit(text)
+        unit = Unit.parse(text)
     except ValueError as error:
         return scope.fail(
             Diagnostic("E203", str(error), decl.name_span, help=("units: m, s, m/s^2, deg, 1, …",))
         )
     if text.strip() == "C" and _TEMPERATURE.search(decl.name_span.text):
         message = f"`{decl.name_span.text}` is declared in coulombs [C]"
-        scope.report(Diagnostic("W107", message, decl.name_span, help=(CELSIUS,)))
+        scope.report(Diagnostic("W107", message, decl.name_span, help=(Unit.CELSIUS,)))
     return unit
 
 

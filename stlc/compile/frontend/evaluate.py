@@ -48,7 +48,7 @@ from stlc.grammar.words import BINARY_TEMPORAL, OPERATORS
 from stlc.registry import closest
 from stlc.signature import Kind
 from stlc.source import Source, Span
-from stlc.units import nearest, parse_unit
+from stlc.units import Unit, nearest
 
 
 def member_of(expr: ast.Attr, scope: Scope) -> tuple[ast.Name, Scope]:
@@ -181,7 +181,7 @@ def _measured(value: Fraction, unit_text: str) -> Number | None:
     Raises:
         ValueError: the unit is unknown.
     """
-    unit = parse_unit(unit_text)
+    unit = Unit.parse(unit_text)
     exact = value * unit.ratio
     if not math.isfinite(nearest(exact)):
         return None

@@ -13,9 +13,9 @@ from stlc.diagnostics import Diagnostic, Fix, Label
 from stlc.grammar import ast
 from stlc.grammar.words import OPERATORS, UNARY_TEMPORAL
 from stlc.source import Span
-from stlc.units import SYMBOLS, parse_unit
+from stlc.units import Unit
 
-_SECOND = SYMBOLS["s"]
+_SECOND = Unit.SYMBOLS["s"]
 
 
 TIME_WORDS = MappingProxyType(
@@ -121,7 +121,7 @@ def _bare(value: Fraction, expr: ast.Expr, scope: Scope) -> TimeExpr:
                 fix=fix,
             )
         )
-    ratio = parse_unit(scope.time_unit).ratio if scope.time_unit else Fraction(1)
+    ratio = Unit.parse(scope.time_unit).ratio if scope.time_unit else Fraction(1)
     return TimeExpr(value * ratio, span=expr.span)
 
 

@@ -17,7 +17,7 @@ from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column, Kind
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, Unit, nearest
+from stlc.units import Unit, nearest
 
 MAX_NODES = 50_000
 MAX_LEVELS = 120
@@ -337,7 +337,7 @@ def member_entries(enums: Iterable[tuple[tuple[str, float], ...]]) -> dict[str, 
     return {name: Known(EnumMember(name, tuple(found)), "enum member") for name, found in options.items()}
 
 
-def constant_value(value: float, unit: Unit = DIMENSIONLESS) -> Number:
+def constant_value(value: float, unit: Unit = Unit.ONE) -> Number:
     """Return the constant `value`, given in SI units, as a number in `unit`.
 
     A constant without a unit takes the unit that its place in an expression requires.

@@ -21,7 +21,7 @@ from stlc.grammar import ast
 from stlc.registry import closest
 from stlc.signature import Column
 from stlc.source import Span
-from stlc.units import SYMBOLS, written_unit
+from stlc.units import Unit
 
 
 def nominal(columns: Iterable[Column]) -> dict[str, Bounds]:
@@ -144,8 +144,8 @@ def age_of(tag: ast.Tag) -> float | None:
         return None
     age = tag.args[0].value
     if tag.name == "hold" and len(tag.args) == 1 and isinstance(age, ast.Quantity) and age.unit:
-        unit = written_unit(age.unit)
-        if unit.same_dims(SYMBOLS["s"]) and age.value > 0:
+        unit = Unit.written(age.unit)
+        if unit.same_dims(Unit.SYMBOLS["s"]) and age.value > 0:
             return float(age.value) * unit.scale
     raise ValueError(f"`@{tag.name}` does not take this argument")
 

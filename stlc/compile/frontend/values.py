@@ -11,7 +11,7 @@ from stlc.compile.ir import typed
 from stlc.grammar import ast
 from stlc.signature import Kind
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, Unit
+from stlc.units import Unit
 
 Labels: TypeAlias = tuple[tuple[str, float], ...]
 
@@ -57,7 +57,7 @@ class Number(Placed):
     """
 
     num: ir.Num
-    unit: Unit = DIMENSIONLESS
+    unit: Unit = Unit.ONE
     flexible: bool = False
     bare: bool = False
     exact: Fraction | None = None

@@ -15,7 +15,7 @@ from stlc.diagnostics import Diagnostic
 from stlc.grammar import ast
 from stlc.signature import Column, Signature
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, Unit
+from stlc.units import Unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +97,8 @@ class Predicate(Node):
     num: ir.Num
     strict: bool
     guard: bool = False
-    unit: Unit = field(default=DIMENSIONLESS, compare=False, repr=False)
-    written: Unit = field(default=DIMENSIONLESS, compare=False, repr=False)
+    unit: Unit = field(default=Unit.ONE, compare=False, repr=False)
+    written: Unit = field(default=Unit.ONE, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

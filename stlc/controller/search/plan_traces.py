@@ -20,7 +20,6 @@ from stlc.registry import closest
 from stlc.trace import Reading, Trace, TraceMeta, load_trace
 from stlc.trace.enums import words_of
 from stlc.trace.recording import conversion
-from stlc.units import parse_quantity
 from stlc.version import __version__
 
 if TYPE_CHECKING:
@@ -88,7 +87,7 @@ def _assignment(task: Task, part: str) -> tuple[str, float]:
     if word in words:
         return name, float(words[word])
     try:
-        found = parse_quantity(value, column.unit)
+        found = column.unit.value_of(value)
     except ValueError as error:
         listed = f"or {', '.join(words)}" if words else f"`{name}` is in [{column.unit}]"
         raise usage(

@@ -40,7 +40,7 @@ from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Sc
 from stlc.grammar import ast
 from stlc.registry import INTEGRATORS
 from stlc.signature import MAX_COMPONENTS, Column, Role
-from stlc.units import Unit, celsius_advice, parse_unit
+from stlc.units import Unit
 
 Ranges = tuple[tuple[float, float], ...]
 
@@ -55,9 +55,9 @@ def unit_text(cx: Context, node: Node, _label: str) -> Unit | None:
     """Read a unit such as `m/s^2`; report S103 and return None if the text is not a unit."""
     text = cx.reader.text(node, "`unit`")
     try:
-        return None if text is None else parse_unit(text)
+        return None if text is None else Unit.parse(text)
     except ValueError as error:
-        advice = celsius_advice(text or "") or ("a unit is a product of powers, for example `m/s^2`",)
+        advice = Unit.celsius_advice(text or "") or ("a unit is a product of powers, for example `m/s^2`",)
         cx.reader.report("S103", str(error), node.span, *advice)
         return None
 

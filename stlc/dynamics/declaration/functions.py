@@ -16,7 +16,7 @@ from stlc.dynamics.declaration.schema.record import OF, TEXT, key, read, word
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node
 from stlc.files import named_in
 from stlc.source import Span
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 _TARGET = re.compile(r"(?P<module>[\w./-]+\.py|\w+(?:\.\w+)*):(?P<attribute>[^\W\d]\w*)")
 _OWN = {"python": ("kind", "target", "arrays"), "urdf": ("kind", "file", "tip", "base")}
@@ -95,7 +95,7 @@ def read_functions(node: Node | None, cx: Context) -> tuple[FunctionDecl, ...]:
         if function.body is not None:
             sizes = (len(function.body.formals),), len(function.body.outputs)
             cx.names.entries[function.name] = External(
-                function.name, *sizes, parse_unit("m"), "real", function.body, "function", function.span
+                function.name, *sizes, Unit.parse("m"), "real", function.body, "function", function.span
             )
     return kept
 

@@ -18,7 +18,7 @@ from stlc.dynamics.declaration.schema.reader import first_line
 from stlc.dynamics.declaration.schema.record import EXPRESSION, OF, key, raw, read, word
 from stlc.dynamics.declaration.schema.yaml_nodes import Entry, Mapping, Node, Scalar
 from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
-from stlc.units import DIMENSIONLESS, Unit
+from stlc.units import Unit
 
 Extrapolate: TypeAlias = Literal["linear", "hold"]
 Row: TypeAlias = tuple[float, ...]
@@ -127,7 +127,7 @@ def _units(node: Node | None, where: str, cx: Context) -> tuple[Unit, ...] | Non
         found = [unit_text.read(cx, each.value, f"`{each.key.text}` of {where}") for each in node.entries]
     elif isinstance(node, ListNode):
         names = [cx.reader.name(item, f"an argument of {where}") for item in node.items]
-        found = [None if name is None else DIMENSIONLESS for name in names]
+        found = [None if name is None else Unit.ONE for name in names]
     known = tuple(unit for unit in found if unit is not None and not unit.offset)
     if node is not None and (len(known) not in (1, 2) or len(known) < len(found)):
         advice = "of: [throttle, speed], or of: {throttle: 1, speed: rad/s}; temperatures in K"

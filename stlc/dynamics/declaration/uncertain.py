@@ -30,7 +30,7 @@ from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.grammar.traverse import children, descendants
 from stlc.source import Source, Span
-from stlc.units import SYMBOLS
+from stlc.units import Unit
 
 _NAME = re.compile(r"(?<![\w.])[^\W\d]\w*")
 _WORDS = frozenset({"name", "unit", "enum", "squash", "interpolate", "times"})
@@ -243,7 +243,7 @@ def _computed(node: ast.Node) -> tuple[str, ...]:
 
 
 def _is_point(node: ast.Quantity) -> bool:
-    known = SYMBOLS.get(node.unit)
+    known = Unit.SYMBOLS.get(node.unit)
     return known is not None and bool(known.offset)
 
 

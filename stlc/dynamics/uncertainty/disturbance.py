@@ -17,13 +17,13 @@ from stlc.dynamics.declaration.deployment import ErrorsDecl, EventDecl
 from stlc.dynamics.declaration.perturbable import perturbable
 from stlc.dynamics.model.samplers import Drawing, Rows, seeded
 from stlc.dynamics.uncertainty.perturbed import PerturbedSystem
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 if TYPE_CHECKING:
     from stlc.dynamics.declaration.motion import Assign
     from stlc.dynamics.system import System
 
-SECOND = parse_unit("s")
+SECOND = Unit.parse("s")
 _GAINS, _PUSHES, _BLURS, _NUMBERS = range(4)
 """Random streams of a seed, one per use, so that a world draws the same numbers whatever is disturbed."""
 

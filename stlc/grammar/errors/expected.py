@@ -16,7 +16,7 @@ from stlc.grammar.scan import CLOSES, Lexeme, brackets, closes
 from stlc.grammar.words import BINARY_TEMPORAL, DECLARATIONS, OPERATORS, RESERVED, ROLES, UNARY_TEMPORAL
 from stlc.registry import closest
 from stlc.source import Span
-from stlc.units import CELSIUS, celsius_advice
+from stlc.units import Unit
 
 MAX_WORDS = 4
 
@@ -107,7 +107,7 @@ def unknown_unit(failure: ParseFailure) -> Diagnostic | None:
         return None
     if found.text in RESERVED or "UNIT" not in failure.accepts or _begins_line(failure, found):
         return None
-    advice = celsius_advice(found.text) or unit_advice(found.text)
+    advice = Unit.celsius_advice(found.text) or unit_advice(found.text)
     product = f"a product is written with a sign: `{previous.text} * {found.text}`"
     return Diagnostic("E101", f"unknown unit `{found.text}`", failure.of(found), help=(*advice, product))
 
@@ -245,7 +245,7 @@ def _product(failure: ParseFailure) -> tuple[str, ...]:
     if previous is None or found is None or "MULOP" not in failure.accepts or "UNIT" in failure.accepts:
         return ()
     if previous.text in ("deg", "°") and found.text == "C":
-        return (CELSIUS,)
+        return (Unit.CELSIUS,)
     if not failure.piece.repaired_by(previous.end, previous.end, " *"):
         return ()
     return (f"a product is written with a sign: {failure.line_with((previous.end, previous.end, ' *'))}",)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from stlc.grammar.words import UNIT_NAMES
 from stlc.registry import closest
-from stlc.units import PREFIXED, SYMBOLS, celsius_advice
+from stlc.units import Unit
 
 _PREFIXES = "pnumkMG"
-_USUAL = tuple(prefix + unit for prefix in ("", *_PREFIXES) for unit in PREFIXED if prefix + unit in SYMBOLS)
+_USUAL = tuple(
+    prefix + unit for prefix in ("", *_PREFIXES) for unit in Unit.PREFIXED if prefix + unit in Unit.SYMBOLS
+)
 _UNPREFIXED = ("min", "h", "ft", "mph", "lb", "rpm", "deg", "degC", "kg")
 
 
@@ -19,18 +21,18 @@ def unit_advice(word: str) -> tuple[str, ...]:
     """
     if word == "T":
         return ("`T` is the planning horizon; a tesla is `Wb/m^2`, a millitesla `mT`",)
-    if len(word) < 2 or word in SYMBOLS or celsius_advice(word):
+    if len(word) < 2 or word in Unit.SYMBOLS or Unit.celsius_advice(word):
         return ()
     named = UNIT_NAMES.get(word.lower())
     alike = [named] if named else [unit for unit in _USUAL if unit.casefold() == word.casefold()]
     for prefix in "" if alike else _PREFIXES:
         rest = word.removeprefix(prefix)
-        units = [unit for unit in PREFIXED if rest != word and unit[0].casefold() == rest[:1].casefold()]
+        units = [unit for unit in Unit.PREFIXED if rest != word and unit[0].casefold() == rest[:1].casefold()]
         near = closest(rest, units)
         alike += [] if near is None or near == "T" else [prefix + near]
-    near = None if alike else closest(word, [*PREFIXED, *_UNPREFIXED])
+    near = None if alike else closest(word, [*Unit.PREFIXED, *_UNPREFIXED])
     alike = alike[:3] if near is None else [near]
     if len(alike) < 2:
         return tuple(f"did you mean `{unit}`?" for unit in alike)
-    sizes = (f"`{unit}` ({SYMBOLS[unit].scale:g} {SYMBOLS[unit].si})" for unit in alike)
+    sizes = (f"`{unit}` ({Unit.SYMBOLS[unit].scale:g} {Unit.SYMBOLS[unit].si})" for unit in alike)
     return (f"did you mean {' or '.join(sizes)}?",)

@@ -47,7 +47,7 @@ from stlc.compile.semantics.tolerance import violated
 from stlc.monitor.cells import over_columns
 from stlc.monitor.values import Record, assume_missing_true, bounds
 from stlc.source import Span
-from stlc.units import DIMENSIONLESS, Unit
+from stlc.units import Unit
 
 Floats = NDArray[np.float64]
 
@@ -466,7 +466,7 @@ class CauseFinder:
         values: dict[str, FrozenValue] = {}
         last = self.record.samples - 1
         outer = {key: kept.num for key, kept in self.frozen.items()}
-        units = formula.units or (DIMENSIONLESS,) * len(formula.bindings)
+        units = formula.units or (Unit.ONE,) * len(formula.bindings)
         for (key, written), unit in zip(formula.bindings, units, strict=True):
             num = substitute_frozen(written, outer)
             value: ir.Num = ir.ShiftedSignal(next(iter(self.record.env)), last + 1)

@@ -16,7 +16,7 @@ from stlc.monitor.facts.evidence import Evidence, Floats
 from stlc.monitor.facts.fact import Fact
 from stlc.signature import Column
 from stlc.trace.resample import TimeRange
-from stlc.units import Unit, parse_unit
+from stlc.units import Unit
 
 FEW = 10
 """Samples below which a recording is short."""
@@ -200,14 +200,14 @@ def _unit_of(name: str) -> Unit | None:
     if found is None or found[1] in _WORDS:
         return None
     try:
-        return parse_unit(_UNITS.get(found[1].lower(), found[1]))
+        return Unit.parse(_UNITS.get(found[1].lower(), found[1]))
     except ValueError:
         return None
 
 
 def degrees(evidence: Evidence) -> Iterator[Fact]:
     """Yield W722 for signals in radians with values that are an angle only in degrees."""
-    turn, radians = 2.0 * np.pi, parse_unit("rad")
+    turn, radians = 2.0 * np.pi, Unit.parse("rad")
     for column, _ in _signals(evidence, "real"):
         unit = column.unit
         if unit.text != "rad" or not unit.same_dims(radians):

@@ -15,7 +15,7 @@ from stlc.source import Source
 from stlc.trace.formats.cells import bare, is_missing, number_of
 from stlc.trace.formats.registry import unreadable
 from stlc.trace.recording import Wanted
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 _SAMPLES = (20, 500)
 """Numbers of rows in which the header is looked for, one after the other."""
@@ -304,7 +304,7 @@ def _is_bracketed(cell: str) -> bool:
 def is_unit(text: str) -> bool:
     """True if a text is a known unit."""
     try:
-        return _TIMES.fullmatch(text) is not None or (len(text) < _LONG and bool(parse_unit(text)))
+        return _TIMES.fullmatch(text) is not None or (len(text) < _LONG and bool(Unit.parse(text)))
     except ValueError:
         return False
 

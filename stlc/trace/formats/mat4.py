@@ -15,7 +15,7 @@ import numpy as np
 from stlc.trace.formats.arrays import Array, Arrays
 from stlc.trace.formats.mat5 import Node, Variable, texts_of
 from stlc.trace.recording import ClockGroup, Recording, Wanted
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 _DTYPES = ("f8", "f4", "i4", "i2", "u2", "u1")
 _HEAD = 20
@@ -100,6 +100,6 @@ def modelica(path: Path, wanted: Wanted) -> Recording | None:
 def _unit(note: str) -> str:
     found = _UNIT.search(note)
     try:
-        return parse_unit(found[1].replace(".", "*").strip()).text if found else ""
+        return Unit.parse(found[1].replace(".", "*").strip()).text if found else ""
     except ValueError:
         return ""

@@ -15,7 +15,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.typed import Time
 from stlc.diagnostics import SpecError, UsageError
 from stlc.signature import Column, Signature
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 ROOT = Path(__file__).parents[3]
 TRAFFIC = (ROOT / "specs" / "traffic.stl").read_text(encoding="utf-8")
@@ -41,7 +41,7 @@ def test_the_traffic_specification() -> None:
 
 def test_the_columns_of_traffic() -> None:
     columns = {column.name: column for column in traffic().signature.columns}
-    assert (columns["x"].unit, columns["x"].low, columns["x"].high) == (parse_unit("m"), -10.0, 8.0)
+    assert (columns["x"].unit, columns["x"].low, columns["x"].high) == (Unit.parse("m"), -10.0, 8.0)
     assert (columns["tau"].low, columns["tau"].high, columns["tau"].fact) == (0.0, 8.0, False)
     assert (columns["sign"].kind, columns["sign"].labels) == ("enum", (("stop", 0.0), ("light", 1.0)))
     assert (columns["yielding"].kind, columns["yielding"].role) == ("bool", "env")
@@ -100,7 +100,7 @@ def test_vectors_become_columns() -> None:
     predicate = found.requirements[0].formula
     assert isinstance(predicate, typed.Predicate)
     row = {"q[0]": 3.0, "q[1]": 4.0, "q[2]": 0.0}
-    assert reference.number(predicate.num, row) == pytest.approx(5 * parse_unit("deg").scale)
+    assert reference.number(predicate.num, row) == pytest.approx(5 * Unit.parse("deg").scale)
 
 
 def test_a_signal_may_come_from_another_column() -> None:
@@ -138,22 +138,22 @@ def test_vector_constants_and_truth_values() -> None:
 
 
 def car(**columns: Column) -> Interface:
-    own = (Column("x", parse_unit("m")), Column("psi", parse_unit("deg")), *columns.values())
-    return Interface("car", Signature(own), {"k": (4.0, parse_unit("s"))}, path="car.yaml")
+    own = (Column("x", Unit.parse("m")), Column("psi", Unit.parse("deg")), *columns.values())
+    return Interface("car", Signature(own), {"k": (4.0, Unit.parse("s"))}, path="car.yaml")
 
 
 def test_the_system_says_what_is_stored() -> None:
     text = "signal psi [rad] in [-1, 1]\nrequire a: psi < 0.5\nrequire b: psi < 30 deg\n"
     found = spec(text, car())
     column = found.signature["psi"]
-    assert column.unit == parse_unit("deg")
+    assert column.unit == Unit.parse("deg")
     assert column.high == pytest.approx(57.29577951308232)
     row = {"psi": 45.0}
     first, second = (r.formula for r in found.requirements)
     assert isinstance(first, typed.Predicate)
     assert isinstance(second, typed.Predicate)
-    assert reference.number(first.num, row) == pytest.approx(0.5 - 45 * parse_unit("deg").scale)
-    assert reference.number(second.num, row) == pytest.approx(-15 * parse_unit("deg").scale)
+    assert reference.number(first.num, row) == pytest.approx(0.5 - 45 * Unit.parse("deg").scale)
+    assert reference.number(second.num, row) == pytest.approx(-15 * Unit.parse("deg").scale)
 
 
 def test_a_signal_without_a_unit_takes_that_of_the_system() -> None:

@@ -11,7 +11,7 @@ from stlc.diagnostics import CODES, Diagnostic, SpecError
 from stlc.grammar.parser import MAX_ERRORS, parse
 from stlc.signature import Column, Signature
 from stlc.source import Source
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "resolve"
 CASES = sorted(GOLDEN.glob("*.stl"))
@@ -28,7 +28,7 @@ def place(text: str):
 
 
 def car() -> Interface:
-    unit = parse_unit
+    unit = Unit.parse
     columns = (
         Column("x", unit("m")),
         Column("v", unit("m/s")),

@@ -14,7 +14,7 @@ from stlc.compile.ir.lower import in_unit
 from stlc.monitor.explain.report import explain
 from stlc.monitor.online.online import How
 from stlc.monitor.verdict import Monitor
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 HEAD = """
 signal speed [km/h]
@@ -103,7 +103,7 @@ def test_a_number_in_a_unit_is_the_number_over_its_scale(num: ir.Num, x: float) 
     from stlc.compile.backends.array.graph import evaluate
     from stlc.compile.backends.array.numpy_ops import NUMPY
 
-    unit = parse_unit("km/h")
+    unit = Unit.parse("km/h")
     env = {"x": np.array([[x]])}
     plain, scaled = (
         float(evaluate([ir.Predicate(each)], env, ops=NUMPY)[0][0, 0]) for each in (num, in_unit(num, unit))

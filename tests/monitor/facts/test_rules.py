@@ -15,7 +15,7 @@ from stlc.monitor.verdict import Monitor
 from stlc.signature import Column, Signature
 from stlc.source import Source
 from stlc.trace import Reading, Trace, load_trace
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 N = 40
 RAMP = np.linspace(0.0, 2.0, N)
@@ -153,7 +153,7 @@ def test_units_in_names(name: str, unit: str, says: str | None) -> None:
     found = Monitor(f"signal a [{unit}]\nrequire r: always a < 5 {unit}").check(trace).facts
     text = [fact.text for fact in found if fact.code == "W721"]
     assert text == (
-        [] if says is None else [f"`{name}` is read as [{parse_unit(unit).text}], and its name says [{says}]"]
+        [] if says is None else [f"`{name}` is read as [{Unit.parse(unit).text}], and its name says [{says}]"]
     )
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from stlc.assurance.bounds import floored, raised
 from stlc.diagnostics import usage
 from stlc.escape import visible
 from stlc.jsontext import plain
 from stlc.options import checked_share
-from stlc.units import floored, raised
 
 if TYPE_CHECKING:
     from stlc.assurance.certificate import Assessment

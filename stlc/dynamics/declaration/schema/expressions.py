@@ -27,10 +27,10 @@ from stlc.dynamics.declaration.schema.yaml_nodes import Sequence as ListNode
 from stlc.grammar import ast
 from stlc.grammar.parser import parse_expr
 from stlc.source import Span
-from stlc.units import Unit, parse_unit
+from stlc.units import Unit
 
 _T = TypeVar("_T", bound="Number | tuple[Number, ...] | ir.Formula")
-SECOND = parse_unit("s")
+SECOND = Unit.parse("s")
 MAX_STEPS = 100_000
 _ATTRIBUTE = re.compile(r"(?<=[\w)\]\"'])(?<!\d)\.\s*([A-Za-z_]\w*)")
 _NOT_FINITE = frozenset(

@@ -21,7 +21,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from stlc.dynamics.declaration.schema.reader import MAX_NAME
-from stlc.units import DIMENSIONLESS
+from stlc.units import Unit
 
 if TYPE_CHECKING:
     from stlc.dynamics.declaration.schema.names import Context
@@ -211,7 +211,7 @@ def word(options: Iterable[str], known: Iterable[str] | None = None) -> Kind:
 @reads(EXPRESSION)
 def fraction(cx: Context, node: Node, label: str) -> float | None:
     """Read a fraction: a number between 0 and 1, or a percentage. `label` names it in messages."""
-    share = cx.here.constant(node, label, DIMENSIONLESS)
+    share = cx.here.constant(node, label, Unit.ONE)
     if share is not None and not 0.0 <= share <= 1.0:
         cx.reader.wrong(node, label, "a share between 0 and 1", "write `10 %`")
     return share

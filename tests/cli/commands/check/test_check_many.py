@@ -16,7 +16,7 @@ from stlc.cli.framework.app import main
 from stlc.signature import Column, Signature
 from stlc.trace import Trace, load_trace, save_trace
 from stlc.trace.chunks import size_of
-from stlc.units import parse_unit
+from stlc.units import Unit
 
 SPEC = """spec small
 const top = 2
@@ -41,7 +41,7 @@ def a_trace(peak: float = 1.0, samples: int = N, first: float = 0.5, unit: str =
     a = np.full((1, samples), first)
     a[0, samples // 2] = peak
     on = (np.arange(samples) % 7 == 0).astype(float)[None]
-    signature = Signature((Column("a", parse_unit(unit)), Column("on", kind="bool")))
+    signature = Signature((Column("a", Unit.parse(unit)), Column("on", kind="bool")))
     return Trace(signature, 0.1, {"a": a, "on": on})
 
 

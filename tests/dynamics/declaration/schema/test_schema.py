@@ -15,7 +15,7 @@ from stlc.diagnostics import Diagnostic, StlcError, SystemFileError
 from stlc.dynamics.load import parse_system
 from stlc.dynamics.system import System
 from stlc.source import Source
-from stlc.units import parse_unit
+from stlc.units import Unit
 from tests.dynamics.declaration.schema.test_schema_diagnostics import GOOD
 
 Make = Callable[..., System]
@@ -35,7 +35,7 @@ def test_the_declaration_holds_what_was_written() -> None:
         "euler",
         1,
     )
-    assert decl.constants["vmax"] == (4.0, parse_unit("m/s"))
+    assert decl.constants["vmax"] == (4.0, Unit.parse("m/s"))
     assert [column.kind for column in decl.signature.columns] == ["real", "real", "enum", "bool"]
     assert [column.role for column in decl.signature.columns] == ["state", "state", "env", "env"]
     v = decl.signature["v"]
