@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.store import Key, Result, ResultStore, load
 from benchmarks.training import benchmark_order, judged_states, pack, unpack
 from stlc.cli.framework.output import say
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT_SEED
@@ -220,7 +220,7 @@ class _Search:
         better = rho > self.rho
         self.plans = torch.where(better[:, None, None], plans, self.plans)
         self.rho = torch.where(better, rho, self.rho)
-        done = satisfied(self.rho)
+        done = TOLERANCE.satisfied(self.rho)
         solved, self.library = self.open[done], torch.cat((self.plans[done], self.library))[:LIBRARY]
         self.open, self.plans, self.rho = self.open[~done], self.plans[~done], self.rho[~done]
         return solved

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.deployments import sampled_states
 from benchmarks.timing import Times, after_warm_up
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import TARGET_SHARE, Limits
 from stlc.controller.guard.guard import Guard
 from stlc.controller.guard.kinds.full import GUARD as FULL
@@ -121,7 +121,7 @@ def _rejected(run: Run, samples: int, seeds: tuple[int, ...]) -> list[Rejected]:
     for row, step in acted:
         before, x = torch.from_numpy(recording.states[row, [max(step - 1, 0), step]])[:, None]
         plan, rest = run.policy.plan(x).to(x.dtype).detach(), guard.decide(before).later().plan
-        if bool(violated(task.judge(x.expand(2, -1), torch.cat((plan, rest))).rho).all()):
+        if bool(TOLERANCE.violated(task.judge(x.expand(2, -1), torch.cat((plan, rest))).rho).all()):
             found.append((x, plan, rest))
     return found
 
@@ -139,7 +139,11 @@ def _tried(task: Task, method: Method, states: list[Rejected]) -> tuple[Tensor, 
         plans = method(*state)
         seconds = process_time() - begin
         judged = task.judge(state[0].expand(len(plans), -1), plans, states=False)
-        return bool(satisfied(judged.rho).any()), bool(satisfied(judged.safe).any()), seconds
+        return (
+            bool(TOLERANCE.satisfied(judged.rho).any()),
+            bool(TOLERANCE.satisfied(judged.safe).any()),
+            seconds,
+        )
 
     met, safe, seconds = zip(*after_warm_up(attempt, states), strict=True)
     return torch.tensor(met), torch.tensor(safe), Times.of(seconds)

@@ -14,7 +14,7 @@ from benchmarks.store import BENCHMARKS
 from benchmarks.timing import interleaved
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.training.config import TrainConfig, resolve_config
 from stlc.controller.training.learner import Trainer
@@ -154,7 +154,7 @@ def _searched(trainer: Trainer) -> float:
     with torch.no_grad():
         x0 = trainer.supply.take(trainer.config.pool)
         plans, judged = trainer.policy.plan_judged(x0)
-        bad = (~satisfied(judged.rho)).nonzero()[:, 0][: trainer.config.most]
+        bad = (~TOLERANCE.satisfied(judged.rho)).nonzero()[:, 0][: trainer.config.most]
     states, start, library = x0[bad], plans[bad], trainer.buffer.library
     before = time.process_time()
     trainer.searcher.repair(states, start, library)

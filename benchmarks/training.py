@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.store import BENCHMARKS, Key, Result, ResultStore, inputs_of, load, spec_path
 from stlc.cli.framework.output import say
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.evaluation.stats import MeanInterval
 from stlc.controller.parallel import executor
@@ -423,7 +423,7 @@ def collect(run: RunDir, *, cores: int | None = None) -> Result:
     """
     record = run.record()
     held = load_held_out(run)
-    solved = [] if held is None else [satisfied(rho) for rho in held.rho.tolist()]
+    solved = [] if held is None else [TOLERANCE.satisfied(rho) for rho in held.rho.tolist()]
     made = {key: record[key] for key in ("versions", "git", "hardware", "threads")}
     return {
         **record["result"],
@@ -446,7 +446,7 @@ def training_accuracy(folder: RunDir) -> float | None:
     if states is None:
         return None
     _, judged = Run.open(folder.path).plan_judged(states.double())
-    return float(satisfied(judged.rho).double().mean())
+    return float(TOLERANCE.satisfied(judged.rho).double().mean())
 
 
 def _curve(run: RunDir) -> list[dict[str, float | None]]:

@@ -89,14 +89,14 @@ PROBES = (
     Probe(
         "tolerance of a verdict",
         "compile/semantics/tolerance.py",
-        "\nTOLERANCE = 1e-6\n",
-        "\nTOLERANCE = 0.3\n",
+        "TOLERANCE = Tolerance(1e-6)",
+        "TOLERANCE = Tolerance(0.3)",
         (*RECORDED, "stream in C", *BACKUPS, "policy by the header", "gymnasium"),
     ),
     Probe(
         "satisfaction",
         "compile/semantics/tolerance.py",
-        "return rho >= -(tolerance_of(rho) if tolerance is None else tolerance)",
+        "return rho >= -(self.of(rho) if tolerance is None else tolerance)",
         "return rho >= 0.3",
         ("check", "check as text", "stream", *BACKUPS, *POLICIES, "gymnasium", "plan by search"),
     ),

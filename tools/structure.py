@@ -290,12 +290,12 @@ MEANINGS = (
         "compile/semantics/tolerance.py",
         written(
             *("_ >= -TOLERANCE", "_ < -TOLERANCE", "_.ge(_, -TOLERANCE)"),
-            *(f"_ {op} -(tolerance_of(_) if tolerance is None else tolerance)" for op in (">=", "<")),
+            *(f"_ {op} -(_.of(_) if tolerance is None else tolerance)" for op in (">=", "<")),
         ),
     ),
     Meaning("until", "compile/backends/array/windows.py", defined(r"\w*until\w*", "compile/backends/")),
     Meaning("smooth maximum of two", "compile/namespace.py", written("_.log1p(_.exp(_))")),
-    Meaning("overall robustness", "compile/semantics/tolerance.py", written("weighed(_, _, _)")),
+    Meaning("overall robustness", "compile/semantics/tolerance.py", written("_.weighed(_, _, _)")),
     Meaning("squash of a control", "dynamics/model/controls.py", defined("squash(ed)?")),
 )
 

@@ -31,7 +31,7 @@ from stlc.assurance.verification.onnx_layers import read_onnx
 from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.compile.semantics.tolerance import violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.load import load_task
 from stlc.controller.training.budget import clock_of
 from stlc.diagnostics import usage
@@ -226,7 +226,7 @@ def _verified(case: Case, models: Path, seconds: float, store: ResultStore) -> R
         each = max(1, 10_000 // max(1, len(result.boxes)))
         for box in result.boxes:
             at = box.centre + rng.uniform(-1.0, 1.0, (each, len(box.half))) * box.half
-            violations += int(violated(subject.robustness(subject.states(result.mode, at))).sum())
+            violations += int(TOLERANCE.violated(subject.robustness(subject.states(result.mode, at))).sum())
             points += each
         row = {
             "name": case.name,

@@ -22,7 +22,7 @@ from stlc.assurance.verification.subject import VerificationSubject
 from stlc.assurance.verification.verify import Verifier
 from stlc.cli.framework.output import say
 from stlc.cli.framework.program import command
-from stlc.compile.semantics.tolerance import violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import LocalProcesses
 from stlc.controller.run.run import Run
 from stlc.controller.training.budget import clock_of
@@ -216,7 +216,7 @@ def _violations(subject: VerificationSubject, mode: Mode, boxes: Sequence[Box], 
         at = box.centre + rng.uniform(-1.0, 1.0, (points, len(box.half))) * box.half
         at = at[subject.admits(mode, at)]
         if len(at):
-            count += int(violated(subject.robustness(subject.states(mode, at))).sum())
+            count += int(TOLERANCE.violated(subject.robustness(subject.states(mode, at))).sum())
     return count
 
 

@@ -35,7 +35,7 @@ from stlc.assurance.conformal import (
 )
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.semantics.kinds.exact import Exact
-from stlc.compile.semantics.tolerance import Status, overall
+from stlc.compile.semantics.tolerance import TOLERANCE, Status
 from stlc.jsontext import Count, Num
 from stlc.monitor.judgement import RequirementVerdict, Verdict
 
@@ -201,7 +201,7 @@ def together(judged: Sequence[Judged], weights: Mapping[str, float] | None = Non
         return replace(judged[0], name=ALL)
     with np.errstate(invalid="ignore"):
         known = (factors.get(each.name, 1.0) for each in judged)
-        least = overall([each.robustness for each in judged], known, NUMPY, Exact())
+        least = TOLERANCE.overall([each.robustness for each in judged], known, NUMPY, Exact())
     return Judged(
         ALL,
         "",

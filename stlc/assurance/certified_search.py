@@ -21,7 +21,7 @@ from torch import Tensor
 from stlc.assurance.verification.tubes import Tube, TubeModel
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir.support import columns_in
-from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import (
     POLICY,
     REPAIRED,
@@ -156,7 +156,7 @@ class CertifiedSearch(GuardSearch):
         passes = found.satisfies
         rows = passes.nonzero()[:, 0]
         if len(rows):
-            passes[rows] = satisfied(self._certifier.guaranteed(x[rows], found.plans[rows]))
+            passes[rows] = TOLERANCE.satisfied(self._certifier.guaranteed(x[rows], found.plans[rows]))
         return passes
 
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
@@ -186,14 +186,14 @@ class CertifiedSearch(GuardSearch):
         judged = Candidates.judged(self.task, x, plans, REPAIRED, cost=True)
         starts = x.repeat_interleave(choices, 0)
         low = self._certifier.guaranteed(starts, plans.flatten(0, 1)).view(agents, choices)
-        sure, usual = satisfied(low) & judged.is_safe, judged.standing
+        sure, usual = TOLERANCE.satisfied(low) & judged.is_safe, judged.standing
         tier = torch.where(judged.is_safe, 1, 0)
         tier = torch.where(sure, torch.where(judged.satisfies, _CERTIFIED, 3), tier)
         rows = (tier < 3).all(1).nonzero()[:, 0]
         if len(rows):
             again = x[rows].repeat_interleave(choices, 0), plans[rows].flatten(0, 1)
             low[rows] = self._certifier.until_next(*again).view(-1, choices)
-            tier[rows] = torch.where((tier[rows] == 1) & satisfied(low[rows]), 2, tier[rows])
+            tier[rows] = torch.where((tier[rows] == 1) & TOLERANCE.satisfied(low[rows]), 2, tier[rows])
         bounded = (tier == 1) | (tier == 2)
         value = torch.where(tier == _CERTIFIED, -judged.cost, torch.where(bounded, low, usual))
         keys = (tier.to(x.dtype).t(), value.t())

@@ -17,7 +17,7 @@ from stlc.assurance.certificate import Judged, Sample, together
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.frontend.modules import library_of, spec_sha256
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.files import find_spec, find_system, read_source
 from stlc.grammar.parser import parse
 from stlc.jsontext import Count
@@ -153,7 +153,7 @@ class ModelDraws:
         finite = np.isfinite(np.stack([column[-1] for column in columns.values()])).all(0)
         margins = np.where(finite & ~np.isnan(margins), margins, -np.inf)
         judged = [
-            Judged(rule.name, rule.unit, satisfied(row), violated(row), row)
+            Judged(rule.name, rule.unit, TOLERANCE.satisfied(row), TOLERANCE.violated(row), row)
             for rule, row in zip(rules, margins, strict=True)
         ]
         yield _sample(rules, judged).in_scope(scope)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stlc.assurance.drive_simulator import DriveSimulator, JudgedDrives
 from stlc.assurance.portfolio import Portfolio, Proposal
 from stlc.assurance.search_space import Point, SearchSpace
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, SimulationStep, Watch
 from stlc.controller.run.run import Run
@@ -55,7 +55,7 @@ class SearchedDrives:
     @property
     def failing(self) -> NDArray[np.bool_]:
         """True if each drive violates a requirement, (count, agents)."""
-        return np.asarray(violated(self.margins).any(2))
+        return np.asarray(TOLERANCE.violated(self.margins).any(2))
 
     @property
     def least(self) -> float:
@@ -212,7 +212,7 @@ def round_of(
     kept, ended = list[NDArray[np.float64]](), list[int]()
 
     def seen(recording: DeploymentRecording, judged: JudgedDrives) -> None:
-        failing = violated(judged.margins).any(2).reshape(-1)
+        failing = TOLERANCE.violated(judged.margins).any(2).reshape(-1)
         kept.append(wrong_states(recording, failing, test.replan))
         ended.append(int(judged.inconclusive.sum()))
 
@@ -248,7 +248,7 @@ def wrong_states(
         States, (k, n).
     """
     decided = np.arange(recording.steps) % replan == 0
-    wrong = ~satisfied(recording.policy_rho) & decided
+    wrong = ~TOLERANCE.satisfied(recording.policy_rho) & decided
     order = wrong.cumsum(1)
     chosen = wrong & (order <= np.where(failing, WRONG, WRONG // 4)[:, None])
     for row in np.flatnonzero(failing & wrong.any(1)):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stlc.assurance.search_space import SearchSpace
 from stlc.assurance.simulation import PARTS, Simulations, Simulator
-from stlc.compile.semantics.tolerance import violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch
 from stlc.controller.deployment.simulator import simulate as run_worlds
@@ -126,7 +126,7 @@ class DriveSimulator(Simulator):
         drives = self.judge(self.drive(points))
         margins = drives.margins.min(1)[:, requirement]
         open_ = np.array(drives.verdict.requirements[requirement].statuses) == "inconclusive"
-        judged = violated(margins) | ~open_.reshape(len(points), -1).any(1)
+        judged = TOLERANCE.violated(margins) | ~open_.reshape(len(points), -1).any(1)
         return Simulations(margins, np.asarray(drives.in_scope.any(1)), judged)
 
     def drive(self, points: NDArray[np.float64], watch: Watch | None = None) -> DeploymentRecording:

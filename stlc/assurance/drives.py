@@ -20,7 +20,7 @@ from stlc.assurance.campaign import (
 from stlc.assurance.certificate import Judged, Noun, Sample, together
 from stlc.assurance.model_simulator import in_scope
 from stlc.compile.frontend.modules import spec_sha256
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import Recorder, simulate
 from stlc.controller.evaluation.executed import executed_robustness
@@ -73,7 +73,10 @@ def sample_of(
     if rules is None:  # undecided where a drive ends before a window does
         bounds = executed_robustness(task, recording)
         lows = ((rule, *bounds[rule.name]) for rule in task.rules)
-        judged = tuple(Judged(each.name, each.unit, satisfied(a), violated(b), a) for each, a, b in lows)
+        judged = tuple(
+            Judged(each.name, each.unit, TOLERANCE.satisfied(a), TOLERANCE.violated(b), a)
+            for each, a, b in lows
+        )
         states = np.moveaxis(recording.states, -1, 0).swapaxes(1, 2)
         inside = in_scope(task, dict(zip(task.system.names, states, strict=True)))
         weights: Mapping[str, float] = {rule.name: rule.factor for rule in task.rules}

@@ -24,7 +24,7 @@ from stlc.assurance.falsified import (
 )
 from stlc.assurance.falsify import SearchBudget, SearchOrder, falsify_each
 from stlc.assurance.options import FalsifyOptions
-from stlc.compile.semantics.tolerance import violated as is_violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import SpecError, UsageError, usage
 from stlc.escape import file_part
 from stlc.files import SPEC_SUFFIXES, read_source, require_folder, write_atomic
@@ -267,7 +267,7 @@ def _replayed(source: _Source, path: Path) -> ReplayedCounterexample | ReplayedF
     verdict: Any = "inconclusive"
     if not inside:
         verdict = "out of scope"
-    elif is_violated(margin):
+    elif TOLERANCE.violated(margin):
         verdict = "violated"
     elif outcome.judged[0]:
         verdict = "satisfied"

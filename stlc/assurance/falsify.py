@@ -22,7 +22,7 @@ from stlc.assurance.search_space import Point, SearchSpace
 from stlc.assurance.sharing import SharedSimulator, SimulatorWorkers
 from stlc.assurance.simulation import Simulations, Simulator
 from stlc.assurance.strategies import GradientVertices
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import LostCall
 from stlc.jsontext import Num
 
@@ -65,7 +65,7 @@ class Counterexample:
     @property
     def spurious(self) -> bool:
         """Satisfaction of the requirement at half the time step."""
-        return self.half_step is not None and satisfied(self.half_step)
+        return self.half_step is not None and TOLERANCE.satisfied(self.half_step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ class ViolationSearch:
                 continue
             self._points.append(each.point)
             self.least = min(self.least, margin)
-            if violated(margin) and self.found is None:
+            if TOLERANCE.violated(margin) and self.found is None:
                 told[index] = self._examined(points[index], margin, name)
 
     def _examined(self, point: Point, margin: float, name: str) -> float:
@@ -196,7 +196,7 @@ class ViolationSearch:
         simulator = self._simulator
         if simulator.space.sparse and simulator.batch > 1:
             margin = float(simulator.simulate(point[None], self.requirement).margins[0])
-            if satisfied(margin):
+            if TOLERANCE.satisfied(margin):
                 return margin
         half = simulator.at_half_step(point[None], self.requirement)
         candidate = _candidate(point, margin, half, name, self.tried)
@@ -346,7 +346,7 @@ def shrunk(simulator: Simulator, requirement: int, found: Counterexample) -> Cou
                 break
             outcome = simulator.simulate(point[None], requirement)
             margin = float(outcome.margins[0])
-            if outcome.admissible[0] and violated(margin):
+            if outcome.admissible[0] and TOLERANCE.violated(margin):
                 half = simulator.at_half_step(point[None], requirement)
                 simpler = _candidate(point, margin, half, found.strategy, found.simulation)
                 if not simpler.spurious:

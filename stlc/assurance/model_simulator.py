@@ -19,7 +19,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.discretize import counts_samples
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import nodes
-from stlc.compile.semantics.tolerance import violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.kernel import Adjoint, ObjectiveSlopes
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import NativeGradient, NativeJudge
@@ -248,7 +248,7 @@ def in_scope(task: Task, columns: Columns) -> NDArray[np.bool_]:
     scope = np.ones(next(iter(columns.values())).shape[1], dtype=np.bool_)
     for rule in task.compiled.assumptions:
         _, high = rule_bounds(rule, Record.of(columns, NUMPY), range(1), task.horizon, "open")
-        scope &= ~violated(high[0])
+        scope &= ~TOLERANCE.violated(high[0])
     return scope
 
 

@@ -16,7 +16,7 @@ from stlc.compile.backends.onnx.graph import BATCH, OnnxGraph, Value, joined
 from stlc.compile.backends.onnx.ops import ONNX, ONNX_OPS, Columns, build_graph, require_numbers
 from stlc.compile.ir import nodes as ir
 from stlc.compile.semantics.kinds.exact import Exact
-from stlc.compile.semantics.tolerance import overall, satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.safe_prefix import BEYOND, anchored, open_ended
 from stlc.controller.policies.policy import ClosedLoopActor, PlanProposer
 from stlc.controller.problem.task import Task
@@ -259,7 +259,7 @@ def _overall(rules: Sequence[CompiledRequirement], each: States, like: Value) ->
     if not rules:
         return like.graph.constant([[math.inf]]).expand(1, BATCH, like=like)
     factors = (rule.factor for rule in rules)
-    least: Value = overall([each[rule.name] for rule in rules], factors, ONNX, Exact())
+    least: Value = TOLERANCE.overall([each[rule.name] for rule in rules], factors, ONNX, Exact())
     return least
 
 
@@ -365,7 +365,7 @@ def following(task: Task, network: PlanProposer) -> dict[str, Value]:
     better = ONNX_OPS.ge(rest["rank"], policy["rank"])
     if task.pending_goals.items:
         better = ONNX_OPS.either(better, rest["deepened"])
-    kept = ONNX_OPS.both(better, satisfied(rest["rho"]))
+    kept = ONNX_OPS.both(better, TOLERANCE.satisfied(rest["rho"]))
     chosen = {
         name: ONNX_OPS.where(kept.reshaped(BATCH, *[1] * (len(own.shape) - 1)), rest[name], own)
         for name, own in _shown(policy).items()
@@ -396,7 +396,7 @@ def _varied(task: Task, network: PlanProposer, state: Value, policy: Mapping[str
         plans = joined([plan, (plan + changes).apply("Max", low).apply("Min", high)], axis=1)
         table = _table(task, state.on(graph), plans)
         better = _picked(table, _best(table["rank"]))
-        good = satisfied(own["rho"])
+        good = TOLERANCE.satisfied(own["rho"])
         return [
             ONNX_OPS.where(good.reshaped(BATCH, *[1] * (len(own[name].shape) - 1)), own[name], better[name])
             for name in names
@@ -406,7 +406,7 @@ def _varied(task: Task, network: PlanProposer, state: Value, policy: Mapping[str
         return [policy[name].on(graph).apply("Identity") for name in names]
 
     least = _reduced("ReduceMin", policy["rho"], (0,))
-    fails = violated(least).reshaped()
+    fails = TOLERANCE.violated(least).reshaped()
     found = state.graph.branched(fails, changed, as_proposed)
     return dict(zip(names, found, strict=True))
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import completed, finite, first, grid_of
 from stlc.controller.guard.safe_prefix import prefix_robustness
 from stlc.controller.problem.task import PlanVerdicts, Task
@@ -50,7 +50,7 @@ class Deciding(nn.Module):
             return plan, rho, safe, each
         found = self._best(x, self.network.with_changes(plan))
         pairs = zip((plan, rho, safe, each), found, strict=True)
-        good = satisfied(rho)
+        good = TOLERANCE.satisfied(rho)
         plan, rho, safe, each = (
             torch.where(good.view(-1, *[1] * (own.dim() - 1)), own, other) for own, other in pairs
         )

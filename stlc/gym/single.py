@@ -14,7 +14,7 @@ from torch import Tensor
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.controller.problem.environments import MOST, Environments, require_reward, reward_at_end
 from stlc.controller.problem.load import load_task, require_controls
@@ -196,7 +196,7 @@ class SpecEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
             **state,
             "robustness": {rule.name: float(value) for rule, value in named},
             "rho": float(self.task.graph.overall(torch.as_tensor(each)[None])),
-            "satisfied": bool(satisfied(each).all()),
+            "satisfied": bool(TOLERANCE.satisfied(each).all()),
         }
 
 

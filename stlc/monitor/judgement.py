@@ -14,7 +14,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir.discretize import Horizon
 from stlc.compile.pipeline import CompiledRequirement
 from stlc.compile.semantics.semantics import Semantics, semantics_of
-from stlc.compile.semantics.tolerance import TOLERANCE, End, Status, overall, status_of
+from stlc.compile.semantics.tolerance import TOLERANCE, End, Status
 from stlc.diagnostics import Diagnostic, UsageError, usage
 from stlc.jsontext import Num
 from stlc.monitor.facts.extent import samples_read
@@ -183,7 +183,7 @@ class RequirementVerdict:
         """Status of each trace; `out of scope` if the trace violates the assumptions."""
         inside = np.ones(self.holds.shape[1], dtype=bool) if self.scope is None else self.scope
         return [
-            status_of(bool(fails.any()), bool(holds.all())) if counts else "out of scope"
+            TOLERANCE.status(bool(fails.any()), bool(holds.all())) if counts else "out of scope"
             for fails, holds, counts in zip(self.fails.T, self.holds.T, inside, strict=True)
         ]
 
@@ -200,7 +200,7 @@ class RequirementVerdict:
     def overall(self) -> Status:
         """Status over traces in scope: violated if any is, satisfied if all are, else inconclusive."""
         holds = self.counted(self.holds)
-        return status_of(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
+        return TOLERANCE.status(bool(self.counted(self.fails).any()), bool(holds.size and holds.all()))
 
     @property
     def satisfied(self) -> bool | None:
@@ -600,7 +600,7 @@ class Verdict:
         return [
             "out of scope"
             if "out of scope" in found
-            else status_of("violated" in found, found <= {"satisfied"})
+            else TOLERANCE.status("violated" in found, found <= {"satisfied"})
             for found in map(set, rows)
         ]
 
@@ -640,7 +640,7 @@ class Verdict:
     def overall(self) -> Status:
         """Status over traces in scope: violated if a requirement is, satisfied if all, else inconclusive."""
         found = {each.overall for each in self.requirements}
-        return status_of("violated" in found, found <= {"satisfied"})
+        return TOLERANCE.status("violated" in found, found <= {"satisfied"})
 
     @property
     def scoped(self) -> Status:
@@ -702,7 +702,7 @@ def overall_robustness(
 ) -> Any:
     """Return the least `weight * robustness / scale` of requirements: a float, or an array of a shape."""
     rows, factors = [each.least[None] for each in found], (each.rule.factor for each in found)
-    return _shaped(overall(rows, factors, NUMPY, semantics or semantics_of())[0], shape)
+    return _shaped(TOLERANCE.overall(rows, factors, NUMPY, semantics or semantics_of())[0], shape)
 
 
 def beside(moment: str, start: str) -> str:

@@ -24,7 +24,7 @@ from stlc.compile.ir.traverse import leaves, numbers
 from stlc.compile.namespace import Array
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_resolved, resolve_for
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
-from stlc.compile.semantics.tolerance import TOLERANCE, End, overall, satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE, End
 from stlc.diagnostics import SpecError, TraceError, usage
 from stlc.files import read_source
 from stlc.grammar import ast
@@ -383,7 +383,7 @@ class _Selection:
         plan = _plan(self, samples, end, None if at is None else excerpt.at - excerpt.first)
         if plan is None:
             return None
-        whole = overall(plan.values(env), self.factors, NUMPY, _EXACT)
+        whole = TOLERANCE.overall(plan.values(env), self.factors, NUMPY, _EXACT)
         if at is not None:
             return np.float64(whole[0, 0])
         return whole.reshape(-1) if whole.base is None else whole.flatten()  # see `Signals.like_given`
@@ -444,7 +444,7 @@ def _least(ready: Prepared, end: Boundary, at: int | None) -> Array:
     """The least `weight * robustness / scale` over the requirements, in the shape of the signals."""
     ops = ready.signals.ops
     factors = (rule.factor for rule in ready.rules)
-    whole = overall(_rows(ready, end, at), factors, ops, ready.record.semantics)
+    whole = TOLERANCE.overall(_rows(ready, end, at), factors, ops, ready.record.semantics)
     return ready.signals.like_given(whole) if at is None else ready.signals.at_one(whole)
 
 
@@ -499,7 +499,7 @@ def _judge(
     if deciding is not rule:
         record = record_of(deciding, ready, part)
         least, most = outer(*rule_bounds(deciding, record, starts, ready.horizon, ends))
-    holds, fails = satisfied(least, tolerance), violated(most, tolerance)
+    holds, fails = TOLERANCE.satisfied(least, tolerance), TOLERANCE.violated(most, tolerance)
     start = part.first + starts.start
     where = (ready.signals.shape, part, ready.timeline, tolerance)
     return RequirementVerdict(rule, start, low, high, holds, fails, *where, subject=ready)
@@ -521,7 +521,7 @@ def first_violation(judgement: RequirementVerdict) -> int:
         fails = _judge(judgement.rule, subject, starts, "open", judgement.tolerance, shorter).fails
         return bool(judgement.counted(fails).any())
 
-    return bisect_left(range(part.stop), True, lo=start + 1, key=violated) - 1
+    return bisect_left(range(part.stop), True, lo=start + 1, key=TOLERANCE.violated) - 1
 
 
 def timed(verdict: Verdict) -> Verdict:

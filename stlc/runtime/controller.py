@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import RunError, usage
 from stlc.registry import GUARDS
 from stlc.runtime.backup import POLICY, Found, search
@@ -169,7 +169,7 @@ class Controller:
         policy_rho = outputs.get("policy_rho", outputs["rho"]).copy()
         if self._guarded:
             rest = None if previous is None else _continued(previous.judged.plan, elapsed)
-            for row in np.flatnonzero(~satisfied(followed.judged.rho)):
+            for row in np.flatnonzero(~TOLERANCE.satisfied(followed.judged.rho)):
                 left = None if rest is None else rest[row]
                 found = search(self._graphs, x[row], fresh[row], left)
                 followed.put(int(row), found)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
-from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 if TYPE_CHECKING:
     from stlc.compile.namespace import Array, Mask, Ops
@@ -39,8 +39,8 @@ def rank(rho: Array, cost: Array, safe: Array | None, ops: Ops) -> Array:
     cheap = ops.where(known, 1.0 / (1.0 + ops.clamp(cost, 0.0, None)), 0.0)
     poor = ops.where(ops.gt(math.inf, size), rho / (1.0 + size), -1.0) + TIE * cheap
     if safe is not None:
-        poor = ops.where(satisfied(safe), poor, poor - 2.0)
-    return ops.where(ops.both(satisfied(rho), known), 1.0 + cheap, poor)
+        poor = ops.where(TOLERANCE.satisfied(safe), poor, poor - 2.0)
+    return ops.where(ops.both(TOLERANCE.satisfied(rho), known), 1.0 + cheap, poor)
 
 
 def best(allowed: Mask, keys: Sequence[Array], ops: Ops) -> Mask:
@@ -60,7 +60,7 @@ def best(allowed: Mask, keys: Sequence[Array], ops: Ops) -> Mask:
 
 def acceptable(rho: Array, safe: Array, ops: Ops) -> Mask:
     """Mask of the plans that satisfy the specification, or at least phi_safe."""
-    return ops.either(satisfied(rho), satisfied(safe))
+    return ops.either(TOLERANCE.satisfied(rho), TOLERANCE.satisfied(safe))
 
 
 def continued(rho: Array, safe: Array, cost: Array, ops: Ops) -> Mask:
@@ -69,7 +69,7 @@ def continued(rho: Array, safe: Array, cost: Array, ops: Ops) -> Mask:
     Satisfying plans are preferred to safe ones, then robust ones, then cheap ones. Unacceptable plans are not
     chosen while there are others.
     """
-    good = ops.number(satisfied(rho), rho)
+    good = ops.number(TOLERANCE.satisfied(rho), rho)
     return best(acceptable(rho, safe, ops), (good, rho, -cost), ops)
 
 
@@ -85,7 +85,7 @@ def longest(falls: Array, rho: Array, cost: Array, ops: Ops) -> Mask:
         cost: performance terms, (plans, …).
         ops: library of the arrays.
     """
-    samples = ops.sum(ops.number(satisfied(falls), falls))[0]
+    samples = ops.sum(ops.number(TOLERANCE.satisfied(falls), falls))[0]
     depth = ops.sum(ops.clamp(falls, None, 0.0))[0] / len(falls)
     return best(ops.ge(samples, 0.0), (samples, rho, depth, -cost), ops)
 

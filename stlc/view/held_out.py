@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import TOLERANCE, satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import StlcError
 from stlc.escape import picture
 from stlc.records import from_json
@@ -70,7 +70,7 @@ class HeldOut:
     @property
     def worst(self) -> int:
         """Index of the requirement that is violated from the most starts."""
-        return int(np.argmax(violated(self.each).mean(axis=0)))
+        return int(np.argmax(TOLERANCE.violated(self.each).mean(axis=0)))
 
     @property
     def unsolved(self) -> tuple[int, int]:
@@ -78,7 +78,7 @@ class HeldOut:
 
         A start is unsolved if the policy's plan from it fails.
         """
-        failing = ~satisfied(self.rho)
+        failing = ~TOLERANCE.satisfied(self.rho)
         return int(failing.sum()), 0 if self.known is None else int((failing & self.known).sum())
 
 
@@ -158,7 +158,7 @@ def find_weakness(held: HeldOut, requirement: int | None = None) -> Weakness | N
     starts is chosen.
     """
     index = held.worst if requirement is None else requirement
-    failing = violated(held.each[:, index])
+    failing = TOLERANCE.violated(held.each[:, index])
     if not failing.any():
         return None
     conditions = _grow(held.x0, failing) if failing.sum() >= ENOUGH else ()
@@ -364,7 +364,7 @@ def draw_failures(
 def _draw_starts(axes: Axes, held: HeldOut, weakness: Weakness, signature: Signature | None) -> None:
     labels = tuple(condition for condition in weakness.conditions if condition.op == "=")
     shown = _region(held.x0, labels)
-    failing = violated(held.each[:, weakness.requirement])
+    failing = TOLERANCE.violated(held.each[:, weakness.requirement])
     name = held.requirements[weakness.requirement]
     where = region_text(labels, held.names, signature)
     axes.set_title(f"starts with {where}" if where else "all held-out starts")
@@ -423,7 +423,7 @@ def _draw_margins(axes: Axes, held: HeldOut, weakness: Weakness, units: Mapping[
     rho = rho[np.isfinite(rho)]
     low, high = np.quantile(rho, [0.002, 0.998])
     edges = np.sort(np.append(np.linspace(min(low, -1e-3), max(high, 1e-3), 46), -TOLERANCE))
-    clipped, fails = np.clip(rho, edges[0], edges[-1]), violated(rho)
+    clipped, fails = np.clip(rho, edges[0], edges[-1]), TOLERANCE.violated(rho)
     axes.hist(clipped[~fails], bins=edges.tolist(), color=BLUE, alpha=0.85)
     axes.hist(clipped[fails], bins=edges.tolist(), color=RED, alpha=0.85)
     axes.axvline(0, color=INK, lw=0.8)

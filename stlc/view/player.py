@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from stlc.compile.semantics.tolerance import violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.escape import script_json
 from stlc.jsontext import dumps
 from stlc.monitor.judgement import beside
@@ -187,7 +187,7 @@ def _interventions(strip: Strip, shown: range) -> _Track:
 
 def _margin(strip: Strip, name: str, shown: range) -> _Track:
     rho, unit = finite(strip.margins[name]), strip.units.get(name, "")
-    limits, fails, zero = margin_limits(rho), violated(rho), np.zeros(len(rho))
+    limits, fails, zero = margin_limits(rho), TOLERANCE.violated(rho), np.zeros(len(rho))
     good, bad = np.where(fails, np.nan, rho), np.where(fails, rho, np.nan)
     parts = [
         _path(f"M0 {_up(zero, limits)[0]:.1f}H{_WIDE}", "zero"),

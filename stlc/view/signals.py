@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.sketch import DECIDED, DECIDERS
 from stlc.escape import picture
 from stlc.signature import Column
@@ -92,7 +92,7 @@ def margin_limits(rho: Floats) -> tuple[float, float]:
     if not len(known):
         return -1.0, 1.0
     low, high = min(float(known.min()), 0.0), max(float(np.quantile(known, 0.95)), 0.0)
-    if satisfied(low):
+    if TOLERANCE.satisfied(low):
         low = 0.0  # rounding errors only
     else:
         high = min(high, 4 * -low)
@@ -120,7 +120,7 @@ def _plot_margin(axes: Axes, times: Floats, rho: Floats) -> None:
     rho = finite(rho)
     kept = extremes(rho)
     times, rho = times[kept], rho[kept]
-    fails = violated(rho)
+    fails = TOLERANCE.violated(rho)
     axes.axhline(0, color=MUTED, lw=0.6)
     axes.fill_between(times, rho, 0, where=~fails, step="post", color=BLUE, alpha=0.2, lw=0)
     axes.fill_between(times, rho, 0, where=fails, step="post", color=RED, alpha=0.35, lw=0)
@@ -208,7 +208,7 @@ def choose_traces(
     called = names or [f"trace {index}" for index in range(len(least))]
     if worst == other:
         return (Choice(worst, called[worst]),)
-    first = "worst" if violated(least[worst]) else "least robust"
+    first = "worst" if TOLERANCE.violated(least[worst]) else "least robust"
     return Choice(worst, f"{first}: {called[worst]}"), Choice(other, f"{word}: {called[other]}")
 
 
@@ -479,7 +479,7 @@ def _draw_margin(strip: Strip, name: str, axes: Axes) -> FrameUpdate:
     def turn(index: int) -> None:
         now = float(rho[index])
         value.set_text(margin_text(now, strip.units.get(name, "")))
-        value.set_color(RED if violated(now) else INK)
+        value.set_color(RED if TOLERANCE.violated(now) else INK)
 
     return FrameUpdate(turn, (value,))
 

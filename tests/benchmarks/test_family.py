@@ -18,7 +18,7 @@ from benchmarks.table import Table
 from benchmarks.tables.family import COLUMNS, FAMILIES, Family, FamilyRow, section
 from benchmarks.tables.schema import document_schema
 from benchmarks.training import Cell, Length, Place
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT_SEED
 from stlc.controller.run.run import Run
@@ -116,7 +116,7 @@ def test_from_training_to_the_page_and_again(
     policy = Run.open(run.path, overrides={"radius": "1.0m"}).policy
     states = policy.task.sample(20, seed=HELD_OUT_SEED, dtype=torch.float64)
     assert set(states[:, policy.task.system.names.index("radius")].tolist()) == {1.0}
-    good = satisfied(policy.plan_judged(states)[1].rho)
+    good = TOLERANCE.satisfied(policy.plan_judged(states)[1].rho)
     assert second["rows"][1]["accuracy"] == pytest.approx(float(good.double().mean()))
     page = (tmp_path / "results.md").read_text()
     assert "| 1 m | 2 steps | 0 |" in page

@@ -41,7 +41,7 @@ from benchmarks.training import (
     unpack,
 )
 from stlc.cli.framework.app import main
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.held_out import wilson
 from stlc.controller.parallel.jobs import Job, JobResult
 from stlc.controller.run.config import HELD_OUT_SEED
@@ -171,7 +171,7 @@ def test_a_finished_run_is_collected_and_then_kept(tmp_path: Path, monkeypatch: 
     assert first.results == second.results == (document,)
     assert Cell.of(document) == cell
     states = load("traffic").sample(30, seed=HELD_OUT_SEED, dtype=torch.float64)
-    good = satisfied(run.plan_judged(states)[1].rho)
+    good = TOLERANCE.satisfied(run.plan_judged(states)[1].rho)
     assert unpack(document["solved"], 30) == good.tolist()
     assert document["accuracy"] == pytest.approx(float(good.double().mean()))
     assert 0.0 <= document["training_accuracy"] <= 1.0

@@ -19,7 +19,7 @@ from stlc.compile.ir import typed
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_resolved, resolve_for
 from stlc.compile.semantics.switch import Hard, Tanh
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import VIOLATION, Objective, guided_objective, loss, paper_objective
 from stlc.diagnostics import SpecError
@@ -108,7 +108,7 @@ def test_plans_that_fail_a_formula_of_the_past_are_told_how_to_satisfy_it(
         outcome = loss(task, objective, x0, u)
         assert torch.isfinite(outcome).all()
         (slope,) = torch.autograd.grad(outcome.sum(), u)
-        failing = ~satisfied(task.judge(x0, u.detach()).rho)
+        failing = ~TOLERANCE.satisfied(task.judge(x0, u.detach()).rho)
         assert failing.any()
         if "historically (" not in formula:  # what failed before the first step is beyond all plans
             assert (slope[failing].sum((1, 2)) < 0).all(), "to push harder helps"

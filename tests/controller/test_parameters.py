@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stlc import native
 from stlc.compile.ir.discretize import Grid
 from stlc.compile.pipeline import compile_spec
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.evaluation.archive import save_trace_of
 from stlc.controller.evaluation.deployment import deploy
@@ -203,7 +203,7 @@ def test_trains_deploys_and_checks_a_family(tmp_path: Path) -> None:
     run_dir = open_folder(task, TrainConfig(), Launch(root=tmp_path, name="family"))
     run = train(task, TrainConfig(steps=120, batch=128, held_out=100), run_dir).run
     x0 = run.task.sample(300, seed=3, dtype=torch.float64)
-    good = satisfied(run.plan_judged(x0)[1].rho)
+    good = TOLERANCE.satisfied(run.plan_judged(x0)[1].rho)
     assert float(good.double().mean()) > 0.7
 
     setting = Setting(seeds=(0, 1), agents=8, steps=20)

@@ -17,7 +17,7 @@ from stlc.compile.backends.onnx.ops import ONNX
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.algebra import substitute
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.dynamics.model.rollout import Stepper
 from stlc.dynamics.model.step import ModelStep
 from stlc.export.onnx_graphs import columns_of, deciding, judged, judging, rollout
@@ -132,7 +132,7 @@ def test_changed_copies_are_judged_where_the_plan_of_some_agent_fails() -> None:
     assert {node.op for node in outputs["plan"].graph.nodes} >= {"If"}
     x = run.task.sample(60, seed=6, dtype=torch.float64)
     proposed = run.policy.continuation(x)
-    good = satisfied(run.task.judge(x, proposed).rho)
+    good = TOLERANCE.satisfied(run.task.judge(x, proposed).rho)
     assert set(good.tolist()) == {True, False}
     plans, judged = run.plan_judged(x)
     assert (plans != proposed)[~good].any()

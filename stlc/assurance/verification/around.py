@@ -17,7 +17,7 @@ from stlc.assurance.verification.boxes import Box, Mode
 from stlc.assurance.verification.forms import Floats
 from stlc.assurance.verification.judged import PROVED
 from stlc.assurance.verification.subject import VerificationSubject
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 FIRST = 8
 """Boxes along each coordinate that the search around a state begins with."""
@@ -81,7 +81,7 @@ class StateProver:
     def _around(self, mode: Mode, at: Floats) -> Around:
         """Search boxes around the states with coordinates `at`, (states, coordinates)."""
         x0 = self._plans.states(mode, at)
-        good = satisfied(self._plans.robustness(x0))
+        good = TOLERANCE.satisfied(self._plans.robustness(x0))
         found = Around(mode, len(at), int((~good).sum()), [])
         inside = np.clip(np.floor(at * FIRST), 0, FIRST - 1)
         active = [

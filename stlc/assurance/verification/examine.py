@@ -17,7 +17,7 @@ import torch
 
 from stlc.assurance.verification.around import narrowed
 from stlc.assurance.verification.judged import PROVED
-from stlc.compile.semantics.tolerance import violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.workers import CallWorkers, LostCall, results
 
 if TYPE_CHECKING:
@@ -200,9 +200,9 @@ class Examiner:
         if len(failing):
             tried = x0[torch.from_numpy(worst[failing] * len(boxes) + failing)]
             chosen = self._plans.robustness(tried)
-            refuted[failing] = violated(chosen)
+            refuted[failing] = TOLERANCE.violated(chosen)
             i = int(np.argmin(chosen))
-            if violated(chosen[i]):
+            if TOLERANCE.violated(chosen[i]):
                 state = dict(zip(self._plans.names, tried[i].tolist(), strict=True))
                 found.witness = Witness(state, float(chosen[i]))
         index = least.argmax(1)

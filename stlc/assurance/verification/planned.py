@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from stlc.assurance.verification.tubes import DEVIATIONS, TubeModel
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.search.missed import BetterPlanner, Missed
 from stlc.controller.search.planner import PlanResult
 from stlc.jsontext import Num
@@ -67,11 +67,11 @@ class PlanTubes:
             DEVIATIONS if model.truncated else None,
             () if loose is None else tuple(map(str, loose.numbers)),
             () if loose is None else tuple(loose.exact),
-            int(satisfied(low).sum()),
+            int(TOLERANCE.satisfied(low).sum()),
             (float(low.min()), float(high.max())),
             {
                 rule.name: GuaranteedRobustness(
-                    float(least.min()), float(most.max()), int(satisfied(least).sum())
+                    float(least.min()), float(most.max()), int(TOLERANCE.satisfied(least).sum())
                 )
                 for rule, least, most in each
             },

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting, Worlds
 from stlc.diagnostics import RunError
 
@@ -307,7 +307,7 @@ def _replaced(
         return None
     agents = worlds.size[0]
     new = due[due < agents]
-    rows = new[(decision.source[new] > 0) & ~satisfied(decision.policy_rho[new])]
+    rows = new[(decision.source[new] > 0) & ~TOLERANCE.satisfied(decision.policy_rho[new])]
     found = {}
     for name, plans in (("rejected", decision.proposed), ("taken", decision.plan)):
         steps = guard.task.horizon + 1

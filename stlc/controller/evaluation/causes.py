@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 import torch
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.executed import model_consistent
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import safety_task, solve
@@ -89,7 +89,11 @@ def losses(
     found: dict[int, Lost] = {}
     for each in broken:
         row, unsafe = each.row, any(name in safety for name in each.rules)
-        good = recording.safe[row] if unsafe else satisfied(torch.from_numpy(recording.rho[row])).numpy()
+        good = (
+            recording.safe[row]
+            if unsafe
+            else TOLERANCE.satisfied(torch.from_numpy(recording.rho[row])).numpy()
+        )
         times = [time for name, time in each.rules.items() if not unsafe or name in safety]
         located = [time for time in times if time is not None]
         last = min(round(min(located) / dt), recording.steps) if located else 0

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import Setting
 from stlc.controller.deployment.simulator import DeploymentRecording, Recorder, Watch, simulate
 from stlc.controller.evaluation.executed import Executed, judge_executed
@@ -186,7 +186,7 @@ def feasible_states(task: Task, recording: DeploymentRecording, count: int) -> N
     known = np.full(recording.rho.shape, math.nan)
     if count:
         known.ravel()[np.linspace(0, known.size - 1, min(count, known.size)).astype(int)] = 1.0
-    open_ = np.isfinite(known) & ~satisfied(recording.rho)
+    open_ = np.isfinite(known) & ~TOLERANCE.satisfied(recording.rho)
     known[open_] = solvable(task, torch.from_numpy(recording.states[:, :-1][open_])).numpy()
     return known
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stlc.compile.backends.array.graph import evaluate
 from stlc.compile.backends.array.numpy_ops import NUMPY
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.deployment.batched import SURPRISE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import viable as search_safe
@@ -91,8 +91,8 @@ def judge_executed(task: Task, recording: DeploymentRecording, *, viable: Mask |
     """
     starts = max(recording.steps + 1 - task.horizon, 0)
     margins = _margins_of_rules(task, recording)
-    rules = {name: satisfied(low) for name, (low, _) in margins.items()}
-    fails = {name: violated(high) for name, (_, high) in margins.items()}
+    rules = {name: TOLERANCE.satisfied(low) for name, (low, _) in margins.items()}
+    fails = {name: TOLERANCE.violated(high) for name, (_, high) in margins.items()}
     safety = tuple(rule.name for rule in task.compiled.safety)
     found = viable
     if found is None:
@@ -159,7 +159,7 @@ def _since(
         return np.full(rows, low)
     middle = (low + high) // 2
     prefix = {name: each[: middle + 1] for name, each in columns.items()}
-    early = ~satisfied(torch.from_numpy(_margin(rule, prefix, 1, "upper", stop=samples)[0])).numpy()
+    early = ~TOLERANCE.satisfied(torch.from_numpy(_margin(rule, prefix, 1, "upper", stop=samples)[0])).numpy()
     found = np.zeros(rows, dtype=np.int64)
     for part, bounds in ((early, (low, middle)), (~early, (middle + 1, high))):
         found[part] = _since(rule, {name: each[:, part] for name, each in columns.items()}, *bounds)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.run.config import HELD_OUT, HELD_OUT_SEED
 from stlc.controller.search.feasibility import solve
@@ -116,8 +116,8 @@ def score(
     """
     states = task.sample(n, seed=seed, dtype=torch.float64)
     states, plans, rho, each = _judged(policy, states, stop, report)
-    n, good = len(states), satisfied(rho)
-    shares = satisfied(each).double().mean(0)
+    n, good = len(states), TOLERANCE.satisfied(rho)
+    shares = TOLERANCE.satisfied(each).double().mean(0)
     generator = torch.Generator().manual_seed(HELD_OUT_SEED + 1)
     failing = (~good).nonzero()[:, 0]
     failing = failing[torch.randperm(len(failing), generator=generator)]
@@ -131,7 +131,7 @@ def score(
         found = solve(task, *given, 1, tries=KNOWN_FEASIBLE_TRIES, generator=generator, stop=stop).solved
         left = torch.nonzero(~found)[:, 0]
         if len(left) and task.native is not None and not stop():
-            found[left] = satisfied(solve(task, states[chunk[left]], stop=stop).rho)
+            found[left] = TOLERANCE.satisfied(solve(task, states[chunk[left]], stop=stop).rho)
         if number and stop():
             break
         known[chunk], searched[chunk] = found, True

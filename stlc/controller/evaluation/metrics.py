@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.stats import MeanInterval
 
 if TYPE_CHECKING:
@@ -258,8 +258,8 @@ def _of_seed(
 ) -> Iterator[tuple[str, float]]:
     names, safety = tuple(executed.rules), executed.safety
     seed = Seed(
-        followed=satisfied(recording.rho[own]),
-        proposed=satisfied(recording.policy_rho[own]),
+        followed=TOLERANCE.satisfied(recording.rho[own]),
+        proposed=TOLERANCE.satisfied(recording.policy_rho[own]),
         plan_safe=recording.safe[own],
         satisfied=executed.starts(names)[:, own],
         safe=executed.starts(safety)[:, own],

@@ -16,7 +16,7 @@ import numpy as np
 
 from stlc.compile.frontend.modules import file_of, library_of
 from stlc.compile.pipeline import compile_spec
-from stlc.compile.semantics.tolerance import status_of
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.causes import Cause, Lost, losses
 from stlc.controller.evaluation.executed import MOST_TIMED
 from stlc.controller.run.run import INDEX, read_library, save_library
@@ -290,7 +290,7 @@ def judge_runs_by_plans(executed: Executed, dt: float) -> RunVerdicts:
         dt: time step in seconds.
     """
     viable, fails = executed.viable, executed.fails
-    told = np.vectorize(status_of, otypes=["U12"])
+    told = np.vectorize(TOLERANCE.status, otypes=["U12"])
     rules = {
         name: told(fails[name].any(0), held.all(0) & (len(held) > 0)) for name, held in executed.rules.items()
     }

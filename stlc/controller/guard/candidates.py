@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.rows import Rows
 from stlc.runtime.prefixes import PrefixGrid
 
@@ -85,12 +85,12 @@ class Candidates(Rows):
     @property
     def satisfies(self) -> Tensor:
         """Mask of the plans that satisfy the specification phi, (…) booleans."""
-        return satisfied(self.rho)
+        return TOLERANCE.satisfied(self.rho)
 
     @property
     def is_safe(self) -> Tensor:
         """Mask of the plans that satisfy phi_safe (the requirements tagged `@safety`), (…) booleans."""
-        return satisfied(self.safe)
+        return TOLERANCE.satisfied(self.safe)
 
     @property
     def standing(self) -> Tensor:

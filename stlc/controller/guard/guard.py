@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import Candidates, Limits, finite
 from stlc.controller.guard.kind import GuardInputs
 from stlc.controller.guard.kinds.paper import GUARD as PAPER
@@ -142,7 +142,7 @@ class Guard:
             return decision
         taken = self.task.judge(x, decision.plan, states=False)  # without robustness margins
         policy_rho = self.task.judge(x, fresh, states=False).rho
-        return replace(decision, rho=taken.rho, safe=satisfied(taken.safe), policy_rho=policy_rho)
+        return replace(decision, rho=taken.rho, safe=TOLERANCE.satisfied(taken.safe), policy_rho=policy_rho)
 
     @torch.no_grad()
     def endangered(self, x: Tensor, previous: GuardDecision, steps: int | Tensor) -> Tensor:
@@ -160,7 +160,7 @@ class Guard:
         if not (self.kind.monitors and formulas):
             return torch.zeros(len(x), dtype=torch.bool)
         columns = self.strict.system.rollout_columns(x.to(torch.float64), previous.plan.to(torch.float64))
-        return ~satisfied(robustness_until(formulas, columns, steps))
+        return ~TOLERANCE.satisfied(robustness_until(formulas, columns, steps))
 
     @torch.no_grad()
     def prefer(self, options: Tensor, previous: GuardDecision | None = None) -> Tensor:
@@ -229,7 +229,7 @@ class Guard:
         better = self.strict.rank(rest) >= self.strict.rank(judged)
         if self.task.pending_goals.items:
             better |= self.task.pending_goals.deepened(rest.columns, TORCH)[0]
-        keep = (better & satisfied(rest.rho)).nonzero()[:, 0]
+        keep = (better & TOLERANCE.satisfied(rest.rho)).nonzero()[:, 0]
         before = Candidates(previous.plan, rest.rho, rest.safe, found.cost, previous.source, previous.t0)
         found.put(keep, before.of(keep))
         return found

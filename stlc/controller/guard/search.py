@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import REPAIRED, SAFEST, Candidates, Deadline, Limits, finite, grid_of
 from stlc.controller.guard.safe_prefix import robustness_until
 from stlc.controller.guard.stages import STAGES, Rejected, Setup
@@ -149,7 +149,7 @@ class RelaxedSearch(GuardSearch):
     def _best(self, x: Tensor, plan: Tensor, previous: Tensor | None) -> Candidates:
         previous = plan if previous is None else previous
         present = self.task.system.rollout_columns(x, plan)
-        lacking = ~satisfied(robustness_until(self._formulas, present, 0))
+        lacking = ~TOLERANCE.satisfied(robustness_until(self._formulas, present, 0))
         found = self._plain_found(x, plan, previous, lacking)
         far = (~lacking).nonzero()[:, 0]
         if len(far):

@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias, get_args
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.native import NativeStep
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.diagnostics import usage
@@ -50,7 +50,7 @@ def reward_at_end(reward: Reward, rho: Tensor) -> Tensor:
         case "task":
             return torch.zeros_like(rho)
         case "accuracy":
-            return SATISFIED * satisfied(rho).to(rho)
+            return SATISFIED * TOLERANCE.satisfied(rho).to(rho)
         case "robustness":
             return torch.nan_to_num(rho, nan=-MOST).clamp(-MOST, MOST)
 
@@ -81,7 +81,7 @@ class Transition:
     @property
     def satisfied(self) -> Tensor:
         """Mask of the episodes that ended and satisfy the specification, (N,)."""
-        return self.done & satisfied(self.rho)
+        return self.done & TOLERANCE.satisfied(self.rho)
 
 
 def observe(task: Task, states: Tensor, step: int) -> Tensor:

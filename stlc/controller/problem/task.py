@@ -20,7 +20,7 @@ from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import is_state, nodes
 from stlc.compile.pipeline import Compiled, CompiledRequirement, compile_spec
 from stlc.compile.semantics.switch import Hard, Switch
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.native import NativeGradient, NativeJudge, motion_of, reason
 from stlc.controller.problem.pending_goals import PendingGoals
 from stlc.dynamics.system import check_plans
@@ -412,7 +412,7 @@ class Task:
         factors = judged.requirements.new_tensor([rule.factor for rule in self.rules])
         missed = (-judged.requirements * factors).clamp(0.0, MOST_MISSED)
         lack = -torch.log1p(missed).sum(1)
-        lack = torch.where(satisfied(judged.safe), lack, lack - UNSAFE)
+        lack = torch.where(TOLERANCE.satisfied(judged.safe), lack, lack - UNSAFE)
         return torch.where(judged.rho >= 0.0, judged.rho, torch.where(judged.rho.isnan(), -torch.inf, lack))
 
     def performance(self, columns: Mapping[str, Tensor], rho: Tensor, u: Tensor) -> Tensor:

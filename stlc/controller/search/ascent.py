@@ -22,7 +22,7 @@ from torch import Tensor
 from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough
-from stlc.compile.semantics.tolerance import satisfied, weighed
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.kernel import ObjectiveSlopes
 from stlc.controller.search.starts import extremes
 
@@ -172,8 +172,8 @@ class GradientAscent:
         """
         rho = each.min(1)
         safe = each[:, self._safe].min(1) if self._safe else np.full_like(rho, np.inf)
-        below = np.where(satisfied(safe), rho, safe - APART)
-        value: Numbers = np.where(satisfied(rho), APART + rho, below)
+        below = np.where(TOLERANCE.satisfied(safe), rho, safe - APART)
+        value: Numbers = np.where(TOLERANCE.satisfied(rho), APART + rho, below)
         return value
 
     def _judged(self, x: Numbers, u: Numbers) -> tuple[Numbers, Pull]:
@@ -196,7 +196,9 @@ class GradientAscent:
             each, pull = self._differentiated(torch.from_numpy(x), torch.from_numpy(u))
         else:
             each, pull = native.judge.kernel.judge(x, u, threads=threads)[0], natively
-        found = np.stack([weighed(row, f, NUMPY) for row, f in zip(each.T, self._factors, strict=True)], 1)
+        found = np.stack(
+            [TOLERANCE.weighed(row, f, NUMPY) for row, f in zip(each.T, self._factors, strict=True)], 1
+        )
         found[np.isnan(found)] = -np.inf
         return found, pull
 

@@ -20,7 +20,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.ranges import bounds
 from stlc.compile.ir.traverse import map_children, numbers, subexpressions
-from stlc.compile.semantics.tolerance import TOLERANCE, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.feasibility import TARGET, solve
 from stlc.controller.search.missed import better_planner, missed
@@ -154,7 +154,9 @@ def _impossible(task: Task, rule: CompiledRequirement) -> bool:
 
     See `_starts` for these states.
     """
-    return all(violated(_most(rule.formula, _reached(task, x.tolist()))) for x in _starts(task).double())
+    return all(
+        TOLERANCE.violated(_most(rule.formula, _reached(task, x.tolist()))) for x in _starts(task).double()
+    )
 
 
 def _reached(task: Task, x: Sequence[float]) -> list[Mapping[str, Bounds]]:

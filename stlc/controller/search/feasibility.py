@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from stlc.compile.semantics.tolerance import satisfied, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.local_search import THOROUGH, Searcher, SearchResult
 from stlc.controller.search.starts import extremes
@@ -73,7 +73,7 @@ def solve(
     for number in range(passes):
         if number:
             start = library[torch.randint(len(library), (len(x0),), generator=generator)]
-        still = torch.nonzero(violated(best.rho)).squeeze(1)
+        still = torch.nonzero(TOLERANCE.violated(best.rho)).squeeze(1)
         if not len(still) or stop():
             break
         begun = x0[still].float(), start[still].float()
@@ -85,7 +85,7 @@ def solve(
 
 def solvable(task: Task, x0: Tensor) -> Tensor:
     """Mask of the states from which a search finds a satisfying plan: (B, n) -> (B,)."""
-    return satisfied(solve(task, x0).rho)
+    return TOLERANCE.satisfied(solve(task, x0).rho)
 
 
 def viable(task: Task, x0: Tensor) -> Tensor:

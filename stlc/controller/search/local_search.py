@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.backends.c.emit import LANES
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.rows import Rows
 from stlc.controller.problem.task import Task
@@ -68,7 +68,7 @@ class SearchResult(Rows):
         A robustness of exactly 0 counts as satisfied. For example, a requirement may allow a condition to
         fail for 5 steps. From a state that needs all 5 steps, even the best plan has robustness 0.
         """
-        return satisfied(self.rho)
+        return TOLERANCE.satisfied(self.rho)
 
 
 def remainders(task: Task, found: SearchResult, count: int) -> SearchResult:

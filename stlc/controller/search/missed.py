@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.search.planner import PlanBudget, plan
 from stlc.diagnostics import StlcError
@@ -63,7 +63,7 @@ def missed(task: Task, x0: Tensor, plans: Tensor) -> tuple[Missed, ...]:
         plans: the best plan known from each, (B, T, m).
     """
     each = task.judge(x0.double(), plans.double(), states=False).requirements
-    violated = ~satisfied(each)
+    violated = ~TOLERANCE.satisfied(each)
     found = [
         Missed(rule.name, int(failing.sum()), float(values[failing].max()))
         for rule, failing, values in zip(task.rules, violated.T, each.T, strict=True)
@@ -89,7 +89,7 @@ def better_planner(task: Task, x0: Tensor, tried: str, seconds: float) -> Better
             found = plan(task, states, name, budget=PlanBudget(limit))
         except StlcError:  # it cannot plan for this task, or its package is missing
             continue
-        good = int(satisfied(found.rho).sum())
+        good = int(TOLERANCE.satisfied(found.rho).sum())
         if good:
             return BetterPlanner(name, good, len(states), float(found.seconds.mean()))
     return None

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import value_of
 from stlc.controller.problem.rows import Rows
 from stlc.diagnostics import usage
@@ -79,7 +79,7 @@ class PlanResult(Rows):
     @property
     def satisfied(self) -> Tensor:
         """Mask of the initial states whose plan satisfies the specification, (B,)."""
-        return satisfied(self.rho)
+        return TOLERANCE.satisfied(self.rho)
 
     @property
     def tried(self) -> PlanResult:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from stlc.compile.semantics.switch import Hard
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 from stlc.controller.training.objective import Objective, rolled, without_lost
 from stlc.diagnostics import RunError, StlcError, SystemFileError
@@ -238,7 +238,7 @@ def check_mirror(task: Task) -> None:
     last = torch.stack([column[-1] for column in one.columns.values()], -1)
     moved = torch.stack([column[-1] for column in two.columns.values()], -1)
     _compare(task, task.system.names, moved, mirror.states(last), "where the image of a state gets to")
-    there_true, here_true = (satisfied(each.requirements).double() for each in (two, one))
+    there_true, here_true = (TOLERANCE.satisfied(each.requirements).double() for each in (two, one))
     _compare(task, names, there_true, here_true, "whether an image satisfies a requirement")
 
 

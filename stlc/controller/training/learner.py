@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
@@ -251,7 +251,7 @@ class Trainer(Learner):
         """
         x0 = self.supply.take(self.config.pool)
         plans, judged = BestOfKPolicy(self.task, self.network).plan_judged(x0)
-        good = satisfied(judged.rho)
+        good = TOLERANCE.satisfied(judged.rho)
         fresh = Validation.of(judged)
         accuracy = fresh.accuracy
         self.next_validation = self.step + self.config.every
@@ -301,7 +301,7 @@ class Trainer(Learner):
             return x0, plans
         kept = self.failures.drawn(self.config.pool // DRIVEN, self.generator)
         tried, judged = BestOfKPolicy(self.task, self.network).plan_judged(kept)
-        rows = (~satisfied(judged.rho)).nonzero()[:, 0][: max(self._effort[0] // DRIVEN, 1)]
+        rows = (~TOLERANCE.satisfied(judged.rho)).nonzero()[:, 0][: max(self._effort[0] // DRIVEN, 1)]
         self.failures.repairing = len(rows)
         return torch.cat((x0, kept[rows])), torch.cat((plans, tried[rows].to(plans)))
 
@@ -421,7 +421,7 @@ class Trainer(Learner):
             return first, torch.zeros_like(first, dtype=torch.bool)
         judged = self.task.judge(x0.repeat_interleave(count, 0), plans.flatten(0, 1))
         score = self.task.rank(judged, safety=False).view(batch, count)
-        return score.argmax(1), satisfied(judged.rho).view(batch, count).any(1)
+        return score.argmax(1), TOLERANCE.satisfied(judged.rho).view(batch, count).any(1)
 
     def _imitation(self, plans: Tensor, targets: Tensor, solved: Tensor) -> Tensor:
         """Imitation loss of the states for which a search has found a plan, ().
@@ -446,7 +446,7 @@ class Trainer(Learner):
         middle = 0.5 * (self.task.system.control_low + self.task.system.control_high)
         start = middle.to(self.device).expand(len(x0), self.task.horizon, -1)
         rho = self._searcher(math.inf).repair(x0, start, self.buffer.library, tries=tries).rho
-        reached = rho[satisfied(rho)]
+        reached = rho[TOLERANCE.satisfied(rho)]
         return _margin(reached) if reached.numel() else MARGIN_RANGE[0]
 
     def _begin_at_plans(self) -> float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.parallel.ddp import ALONE, Ranks
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.config import ResolvedConfig
@@ -115,8 +115,10 @@ class Validation:
     @classmethod
     def of(cls, judged: PlanVerdicts) -> Validation:
         """Make the result of a validation without search, from the verdicts `judged` on the plans."""
-        shares = satisfied(judged.requirements).double().mean(0)
-        return cls(float(satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares))
+        shares = TOLERANCE.satisfied(judged.requirements).double().mean(0)
+        return cls(
+            float(TOLERANCE.satisfied(judged.rho).double().mean()), tuple(float(share) for share in shares)
+        )
 
     def mean(self, ranks: Ranks) -> Validation:
         """Combine the results of all ranks: shares are averaged, counts are summed.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from stlc.compile.backends.torch.ops import TORCH
 from stlc.compile.semantics.switch import StraightThrough, Switch, Tanh
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import Task
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def loss(task: Task, objective: Objective, x0: Tensor, u: Tensor) -> Tensor:
     exact = rho
     if objective.smoothing is not None:
         exact = task.graph.overall(without_lost(task, task.graph.per_requirement_columns(columns, ops=TORCH)))
-    good = satisfied(exact.detach())
+    good = TOLERANCE.satisfied(exact.detach())
     cost = task.performance(columns, rho, u)
     gated = torch.where(good, cost, torch.zeros_like(cost))
     return objective.stl_weight * _shortfall(objective, rho) + objective.performance_weight * gated

@@ -43,7 +43,7 @@ from stlc.compile.ir.traverse import (
     operands,
     substitute_frozen,
 )
-from stlc.compile.semantics.tolerance import violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.monitor.cells import over_columns
 from stlc.monitor.values import Record, assume_missing_true, bounds
 from stlc.source import Span
@@ -386,8 +386,8 @@ class CauseFinder:
         if len(instants):
             span = range(int(instants[0]), int(instants[-1]) + 1)
             margins = self._margins(formula, wanted, span)[instants - span.start]
-            if violated(margins).any():
-                yield from self.violations(formula, instants[violated(margins)], wanted=wanted)
+            if TOLERANCE.violated(margins).any():
+                yield from self.violations(formula, instants[TOLERANCE.violated(margins)], wanted=wanted)
 
     def _lowered(self, formula: typed.Formula, wanted: bool) -> ir.Formula:
         """Return the formula with basic operators and intervals in samples, negated if `wanted` is False.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.ir.support import columns_in
-from stlc.compile.semantics.tolerance import StatusInScope, satisfied, status_of, violated
+from stlc.compile.semantics.tolerance import TOLERANCE, StatusInScope
 from stlc.monitor.online.history import ColumnHistory, Floats
 from stlc.monitor.online.recompute import GrowingBounds
 from stlc.monitor.online.tally import Asked
@@ -42,7 +42,7 @@ class Margin:
 
     def status(self, trace: int) -> StatusInScope:
         """Violated if violated at any window start of the trace, satisfied if at none and none is open."""
-        return status_of(bool(self.violated[trace]), not self.open[trace])
+        return TOLERANCE.status(bool(self.violated[trace]), not self.open[trace])
 
 
 @dataclass(slots=True)
@@ -79,7 +79,7 @@ class _Watched:
         shape = (len(starts), next(iter(env.values())).shape[1])
         found = bounds.live(env, range(starts.start - begin, starts.stop - begin))
         low, high = (np.broadcast_to(end, shape) for end in found)
-        fails, holds = violated(high), satisfied(low)
+        fails, holds = TOLERANCE.violated(high), TOLERANCE.satisfied(low)
         whole = max(min(bounds.settled(samples), samples - self.asked.lag), 0)  # with complete windows
         shown = max(whole - 1 - self.next, 0) if everywhere else 0
         undecided = np.logical_or.reduce(~fails & ~holds, axis=0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stlc.compile.pipeline import CompiledRequirement
-from stlc.compile.semantics.tolerance import TOLERANCE, Status, satisfied, status_of, violated
+from stlc.compile.semantics.tolerance import TOLERANCE, Status
 from stlc.monitor.online.history import Floats
 from stlc.monitor.values import Ends
 
@@ -54,7 +54,9 @@ class Asked:
     def judged(self, bounds: Floats) -> JudgedInstants:
         """Verdicts from bounds on the robustness and on that which decides, (instants, 4)."""
         low, high, least, most = bounds.T
-        return JudgedInstants(low, high, satisfied(least, self.tolerance), violated(most, self.tolerance))
+        return JudgedInstants(
+            low, high, TOLERANCE.satisfied(least, self.tolerance), TOLERANCE.violated(most, self.tolerance)
+        )
 
 
 class JudgedInstants(NamedTuple):
@@ -116,7 +118,7 @@ class RequirementSummary:
     @property
     def status(self) -> Status:
         """Violated if violated at any counted instant, satisfied if satisfied at all, else inconclusive."""
-        return status_of(self.fails > 0, 0 < self.instants == self.holds)
+        return TOLERANCE.status(self.fails > 0, 0 < self.instants == self.holds)
 
     @property
     def robustness(self) -> float:

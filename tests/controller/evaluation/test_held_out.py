@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.evaluation.held_out import save_states, score
 from stlc.controller.policies.policy import BestOfKPolicy, PlanNetwork
 from stlc.controller.problem.task import Task
@@ -27,7 +27,7 @@ def test_what_is_known_is_kept_state_by_state(car_task: Task, tmp_path: Path) ->
         policy = BestOfKPolicy(car_task, PlanNetwork(car_task, hidden=engine.hidden, plans=1))
     reports: list[str] = []
     found = score(car_task, policy, n=60, report=reports.append)
-    good = satisfied(found.rho)
+    good = TOLERANCE.satisfied(found.rho)
     assert reports == [
         "evaluation, 0 of 60 held-out starts",
         f"evaluation, search of 0 of {60 - int(good.sum())} failing starts",

@@ -6,7 +6,7 @@ from copy import deepcopy
 
 import torch
 
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.policies.policy import VARIATIONS, BestOfKPolicy, PlanNetwork, variations
 from stlc.controller.problem.task import Task
 
@@ -74,9 +74,9 @@ def test_the_best_variation_is_selected_where_every_plan_fails(car_task: Task) -
     x0 = car_task.sample(4000, seed=6, dtype=torch.float64)
     before, judged_before = plain.plan_judged(x0)
     after, judged = varied.plan_judged(x0)
-    good = satisfied(judged_before.rho)
+    good = TOLERANCE.satisfied(judged_before.rho)
     assert torch.equal(after[good], before[good])
-    assert (satisfied(judged.rho) & ~good).any()
+    assert (TOLERANCE.satisfied(judged.rho) & ~good).any()
     again = car_task.judge(x0, after)
     assert torch.equal(judged.rho, again.rho)
     assert torch.equal(judged.plans, after)

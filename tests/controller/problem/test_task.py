@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import stlc
 from stlc.compile.backends.torch.ops import TORCH
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.load import load_task
 from stlc.controller.problem.native import Effort
 from stlc.controller.problem.task import Task
@@ -63,10 +63,14 @@ def test_plans_and_recordings_have_one_verdict_whatever_the_scale(name: str, tmp
     recorded = Monitor(spec, dt=1, horizon=3).check({key: columns[key] for key in ("x", "f", "go")})
     wanted = name == "a weight"
     assert recorded.satisfied is wanted
-    assert satisfied(judged.rho).tolist() == satisfied(judged.requirements).all(1).tolist() == [wanted] * 4
+    assert (
+        TOLERANCE.satisfied(judged.rho).tolist()
+        == TOLERANCE.satisfied(judged.requirements).all(1).tolist()
+        == [wanted] * 4
+    )
     assert task.native is not None
     _, rho = task.native.local_search(x0, u, u[:0], Effort(1, 0.0, 1))
-    assert satisfied(rho).tolist() == [wanted] * 4
+    assert TOLERANCE.satisfied(rho).tolist() == [wanted] * 4
     assert bool((plan(task, x0, budget=PlanBudget(evaluations=100)).rho >= -1e-6).all()) is wanted
 
 
@@ -84,8 +88,8 @@ def test_a_plan_with_nan_is_violated_and_never_preferred(car_task: Task) -> None
 
 def test_satisfied_allows_for_rounding_but_not_for_more() -> None:
     exact = torch.tensor([0.0, -0.9e-6, -1.1e-6], dtype=torch.float64)
-    assert satisfied(exact).tolist() == [True, True, False]
-    assert satisfied(torch.tensor([-0.9e-5, -1.1e-5])).tolist() == [True, False]
+    assert TOLERANCE.satisfied(exact).tolist() == [True, True, False]
+    assert TOLERANCE.satisfied(torch.tensor([-0.9e-5, -1.1e-5])).tolist() == [True, False]
 
 
 @given(
@@ -96,7 +100,7 @@ def test_satisfying_plans_come_first_then_cheap_ones_then_robust_ones(
 ) -> None:
     rho, cost = torch.tensor(pairs, dtype=torch.float64).unbind(1)
     best = int(rank(rho, cost, None, TORCH).argmax())
-    good = satisfied(rho)
+    good = TOLERANCE.satisfied(rho)
     if good.any():
         assert good[best]
         assert cost[best] <= cost[good].min() + 1e-9

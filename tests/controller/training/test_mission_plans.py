@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from stlc.cli.framework.app import main
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.problem.task import PlanVerdicts, Task
 from stlc.controller.run.run import task_of_run
 from stlc.controller.training.config import TrainConfig, resolve_config
@@ -60,7 +60,7 @@ def test_a_few_plans_satisfy_from_most_starts(task: Task) -> None:
     begun = mission_plans(task, 2, torch.Generator().manual_seed(0))
     assert begun.best.shape == (2, 20, 1)
     x0 = task.sample(50, seed=1)
-    each = [satisfied(task.judge(x0, one.expand(50, -1, -1)).rho) for one in begun.best]
+    each = [TOLERANCE.satisfied(task.judge(x0, one.expand(50, -1, -1)).rho) for one in begun.best]
     assert float((each[0] | each[1]).double().mean()) > 0.8
 
 
@@ -68,7 +68,7 @@ def test_a_training_begins_with_plans_that_satisfy(task: Task) -> None:
     learner = trainer(task)
     x0 = task.sample(50, seed=1)
     _, judged = learner.policy.plan_judged(x0)
-    assert float(satisfied(judged.rho).double().mean()) > 0.5, "before the first step"
+    assert float(TOLERANCE.satisfied(judged.rho).double().mean()) > 0.5, "before the first step"
     assert len(learner.buffer) > 16, "and imitates what is left of all that were found"
     for _ in range(3):
         assert learner.advance() == learner.loss

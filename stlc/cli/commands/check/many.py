@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from stlc.cli.commands.check.text import WORDS, robustness_of
 from stlc.cli.framework.output import table
-from stlc.compile.semantics.tolerance import status_of
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.diagnostics import CODES, Diagnostic, MissingError, StlcError, usage
 from stlc.escape import operand, visible
 from stlc.files import require_folder, seen_at
@@ -146,7 +146,7 @@ def overall(outcomes: Sequence[Outcome]) -> Status:
     Files to which the specification does not apply do not count.
     """
     found = {outcome.status for outcome in outcomes if not outcome.errors}
-    return status_of("violated" in found, found - {"out of scope"} == {"satisfied"})
+    return TOLERANCE.status("violated" in found, found - {"out of scope"} == {"satisfied"})
 
 
 def all_outcomes(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from stlc.cli.framework.output import table
 from stlc.cli.framework.render import Paint, render_place
-from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.escape import operand, shell, visible
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def robustness_text(
     if abs(least) <= min(tolerance, TOLERANCE):
         return "boundary"
     value = in_unit(signed(least), unit)
-    return f"{value} (boundary)" if least < 0.0 and satisfied(least, tolerance) else value
+    return f"{value} (boundary)" if least < 0.0 and TOLERANCE.satisfied(least, tolerance) else value
 
 
 def in_unit(value: str, unit: str) -> str:

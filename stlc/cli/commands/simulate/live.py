@@ -17,7 +17,7 @@ from rich.text import Text
 from stlc.cli.commands.check.text import percent, signed
 from stlc.cli.framework.output import table
 from stlc.compile.ir.traverse import margin_unit
-from stlc.compile.semantics.tolerance import TOLERANCE, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.guard.candidates import SOURCES
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ class LiveView:
         for name, (value, agent, count) in texts.items():
             high = float(margins[name].high.min())
             text = Text(f"  {name:<{label}}  ")
-            text.append(self._bar(name, high, half), style="red" if violated(high) else "green")
+            text.append(self._bar(name, high, half), style="red" if TOLERANCE.violated(high) else "green")
             text.append(f"  {value:<{wide[0]}}  {agent:<{wide[1]}}")
             text.append(f"  {count}", style="red")
             text.rstrip()
@@ -213,7 +213,7 @@ class LiveView:
         units = (f"{column.name} {column.unit.text}".strip() for column in names)
         lines = [Text(line) for line in _fitting(cells, [*FIRST, *units], width).splitlines()]
         for line, row in zip(lines[1:], rows, strict=True):
-            line.stylize("red" if violated(least[row]) else "")
+            line.stylize("red" if TOLERANCE.violated(least[row]) else "")
         return lines
 
 

@@ -23,7 +23,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.defined import Undefined, undefined
 from stlc.compile.namespace import Array, Ops
 from stlc.compile.semantics.semantics import Exact, Semantics, semantics_of
-from stlc.compile.semantics.tolerance import overall
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.signature import Signature
 
 
@@ -259,7 +259,7 @@ class RobustnessGraph:
             return ops.full((each.shape[0],), math.inf, each)
         items = [rows[i : i + 1] for i in range(len(self.rules))]
         factors = (rule.factor for rule in self.rules)
-        return overall(items, factors, ops, semantics_of(self.semantics, smoothing))[0]
+        return TOLERANCE.overall(items, factors, ops, semantics_of(self.semantics, smoothing))[0]
 
     def per_requirement_columns(
         self, env: Mapping[str, Array], *, ops: Ops, smoothing: float | None = None

@@ -21,7 +21,7 @@ import torch
 
 from stlc.compile.backends.milp.encode import MARGIN, Demand, Encoding
 from stlc.compile.backends.milp.model import ZERO, Affine, Arrays, UnencodableError, constant
-from stlc.compile.semantics.tolerance import TOLERANCE, violated
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.search.local_search import Searcher
 from stlc.controller.search.starts import extremes
@@ -112,7 +112,7 @@ class Milp:
                 rho = search.offer(torch.tensor([row]), plan[None], evaluations=0)
                 if float(rho) >= min(budget.target, 0.0) - TOLERANCE:
                     return
-            elif found == IMPOSSIBLE and beyond > 0.0 and self.prove and violated(search.rho[row]):
+            elif found == IMPOSSIBLE and beyond > 0.0 and self.prove and TOLERANCE.violated(search.rho[row]):
                 proof, _ = self._solved(task, state, _Goal(0.0), limit, highs, tight=False)
                 search.infeasible[row] = proof == IMPOSSIBLE
                 if proof == IMPOSSIBLE:

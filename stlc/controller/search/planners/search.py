@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stlc.compile.semantics.tolerance import TOLERANCE, satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.options import bounded
 from stlc.controller.search.attempts import Attempts
 from stlc.controller.search.local_search import Searcher
@@ -93,7 +93,7 @@ class SearchPlanner:
                     search.states[rows], start, library, tries=count, stop=budget.stop
                 ).plans
                 search.offer(rows, found, evaluations=count)
-                solved = search.plans[rows][satisfied(search.rho[rows])]
+                solved = search.plans[rows][TOLERANCE.satisfied(search.rho[rows])]
                 library = torch.cat((solved, library))[: self.library]
             number, tries = number + 1, min(2 * tries, self.longest)
         orders.settle()

@@ -19,7 +19,7 @@ from stlc.compile.backends.array.numpy_ops import NUMPY
 from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined, rejoined, terms
 from stlc.compile.ir.support import columns_in
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 if TYPE_CHECKING:
     from stlc.signature import Column
@@ -79,7 +79,10 @@ class Landmarks:
             )
             if column is not None and column.low is not None and column.high is not None:
                 env = {column.name: np.linspace(column.low, column.high, VALUES)[None]}
-                held = [np.broadcast_to(satisfied(each[0]), VALUES) for each in evaluate(key, env, ops=NUMPY)]
+                held = [
+                    np.broadcast_to(TOLERANCE.satisfied(each[0]), VALUES)
+                    for each in evaluate(key, env, ops=NUMPY)
+                ]
                 self._apart[key] = not bool((held[0] & held[1]).any())
         return self._apart[key]
 

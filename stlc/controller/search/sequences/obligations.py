@@ -24,7 +24,7 @@ from stlc.compile.ir.normal_form import joined, normal
 from stlc.compile.ir.simplify import simplify
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import map_children, nodes
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,7 +70,7 @@ class Obligations:
             return self.first
         env = {name: np.array([[float(value)]]) for name, value in zip(self._names, state, strict=True)}
         bounds = evaluate(self._progressed, env, ops=NUMPY, end="lower", stop=self._horizon + 1)
-        met = tuple(bool(satisfied(np.broadcast_to(bound[0], 1))[0]) for bound in bounds)
+        met = tuple(bool(TOLERANCE.satisfied(np.broadcast_to(bound[0], 1))[0]) for bound in bounds)
         pending = (self._pending(response, env, clock) for response in self._responses)
         return (*self._known(clock, met), *(each for each in pending if each is not None))
 
@@ -94,7 +94,7 @@ class Obligations:
                 later = np.where(samples < answers, -part.value, part.value) if part.answers else part.value
                 whole[name] = np.where(samples == 0.0, now, later)
             judged = evaluate([response.form], whole, ops=NUMPY, end="truncate")[0]
-            return np.broadcast_to(satisfied(judged[0]), len(answers)).astype(np.bool_)
+            return np.broadcast_to(TOLERANCE.satisfied(judged[0]), len(answers)).astype(np.bool_)
 
         if good(np.array([np.inf]))[0]:
             return None

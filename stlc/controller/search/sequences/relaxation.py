@@ -29,7 +29,7 @@ from stlc.compile.ir.algebra import substitute
 from stlc.compile.ir.normal_form import joined, negate, rejoined, terms
 from stlc.compile.ir.support import columns_in
 from stlc.compile.ir.traverse import leaves, map_children, nodes, subexpressions
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 from stlc.controller.search.sequences.phases import levels
 from stlc.controller.search.sequences.residuals import YES, looks_ahead
 
@@ -200,7 +200,7 @@ class Relaxation:
                     known = {name: column[:, :1] for name, column in env.items()}
                     env[assign.name][0, i + 1] = _values([ir.Predicate(assign.value)], known)[0, 0]
         values = _values(self._literals, env)
-        met = satisfied(values).astype(np.bool_)
+        met = TOLERANCE.satisfied(values).astype(np.bool_)
         better = met[:, 1:] | (growing & (values[:, 1:] > values[:, :1]))
         return RelaxedState(self, values[:, 0], met[:, 0], better)
 
@@ -502,7 +502,7 @@ def _conjunctions(formula: ir.Formula) -> Iterator[ir.Formula]:
 def _folded(formula: ir.Formula) -> ir.Formula:
     """Replace a literal that reads no signal by its truth."""
     if isinstance(formula, ir.Predicate) and not columns_in(formula):
-        return ir.Truth(bool(satisfied(_values([formula], {"": np.zeros((1, 1))}))[0, 0]))
+        return ir.Truth(bool(TOLERANCE.satisfied(_values([formula], {"": np.zeros((1, 1))}))[0, 0]))
     return formula
 
 

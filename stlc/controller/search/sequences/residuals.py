@@ -22,7 +22,7 @@ from stlc.compile.ir import nodes as ir
 from stlc.compile.ir.normal_form import joined
 from stlc.compile.ir.support import history
 from stlc.compile.ir.traverse import map_children, nodes, operands
-from stlc.compile.semantics.tolerance import satisfied
+from stlc.compile.semantics.tolerance import TOLERANCE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -81,7 +81,7 @@ class Progression:
         signals = {"?": unknown}
         for name, value in zip(self._names.values(), values, strict=True):
             signals[name] = unknown.copy()
-            signals[name][:count] = np.where(satisfied(value), 1.0, -1.0).reshape(-1, 1)
+            signals[name][:count] = np.where(TOLERANCE.satisfied(value), 1.0, -1.0).reshape(-1, 1)
         bounds = evaluate(self._forms, signals, ops=NUMPY, count=self._steps + 1, end="truncate")
         known = {
             id(part): np.broadcast_to(each, shape) >= 0.0
